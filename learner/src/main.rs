@@ -1,0 +1,2 @@
+//! learner
+fn main() {}
