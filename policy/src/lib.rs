@@ -1,1 +1,3 @@
-//! policy
+//! What the weights mean.
+mod architecture;
+pub use architecture::Architecture;
