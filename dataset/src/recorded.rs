@@ -1,0 +1,89 @@
+//! A file as it was recorded, row by row, simulator states included.
+
+use std::path::Path;
+
+use crate::file::DatasetFile;
+use crate::{DatasetError, EnvironmentSpec};
+
+/// One recorded step, in the simulator's precision.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Row<'a> {
+    /// s, before the step.
+    pub observation: &'a [f64],
+    /// a, as it was applied.
+    pub action: &'a [f64],
+    /// s', after the step and before any reset.
+    pub next_observation: &'a [f64],
+    /// r.
+    pub reward: f64,
+    /// Whether s' ended the episode by the environment's own rule.
+    pub terminal: bool,
+    /// Whether the time limit cut the episode off after this step.
+    pub timeout: bool,
+    /// MuJoCo's positions before the step.
+    pub qpos: &'a [f64],
+    /// MuJoCo's velocities before the step.
+    pub qvel: &'a [f64],
+}
+
+/// All rows of a file that has `next_observations`, `infos/qpos` and `infos/qvel` besides the arrays to learn from.
+pub struct RecordedRows {
+    environment: &'static EnvironmentSpec,
+    observations: Vec<f64>,
+    actions: Vec<f64>,
+    next_observations: Vec<f64>,
+    rewards: Vec<f64>,
+    terminals: Vec<bool>,
+    timeouts: Vec<bool>,
+    qpos: Vec<f64>,
+    qvel: Vec<f64>,
+}
+
+impl RecordedRows {
+    /// Reads a file recorded in `environment`.
+    pub fn read(path: impl AsRef<Path>, environment: &'static EnvironmentSpec) -> Result<Self, DatasetError> {
+        let file = DatasetFile::open(path.as_ref())?;
+        Ok(Self {
+            environment,
+            observations: file.numbers("observations", environment.observation_dim)?,
+            actions: file.numbers("actions", environment.action_dim)?,
+            next_observations: file.numbers("next_observations", environment.observation_dim)?,
+            rewards: file.numbers("rewards", 1)?,
+            terminals: file.flags("terminals")?,
+            timeouts: file.flags("timeouts")?,
+            qpos: file.numbers("infos/qpos", environment.qpos_dim)?,
+            qvel: file.numbers("infos/qvel", environment.qvel_dim)?,
+        })
+    }
+
+    /// Number of rows.
+    pub fn len(&self) -> usize {
+        self.rewards.len()
+    }
+
+    /// Whether the file has no row.
+    pub fn is_empty(&self) -> bool {
+        self.rewards.is_empty()
+    }
+
+    /// Row `i`, which must be below [`len`](Self::len).
+    pub fn row(&self, i: usize) -> Row<'_> {
+        let EnvironmentSpec { observation_dim, action_dim, qpos_dim, qvel_dim, .. } = *self.environment;
+        let at = |width: usize| i * width..(i + 1) * width;
+        Row {
+            observation: &self.observations[at(observation_dim)],
+            action: &self.actions[at(action_dim)],
+            next_observation: &self.next_observations[at(observation_dim)],
+            reward: self.rewards[i],
+            terminal: self.terminals[i],
+            timeout: self.timeouts[i],
+            qpos: &self.qpos[at(qpos_dim)],
+            qvel: &self.qvel[at(qvel_dim)],
+        }
+    }
+
+    /// All rows in order.
+    pub fn iter(&self) -> impl Iterator<Item = Row<'_>> {
+        (0..self.len()).map(|i| self.row(i))
+    }
+}

@@ -1,0 +1,119 @@
+//! Mini-batches: a shuffled scan without replacement, reshuffled at the end of each pass.
+
+use rand::{Rng, SeedableRng};
+use rand_chacha::ChaCha8Rng;
+
+use crate::Transitions;
+
+/// B transitions, each array row by row. Reused from step to step; make the first one with `Batch::default()`.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct Batch {
+    /// s, B × o.
+    pub observations: Vec<f32>,
+    /// a, B × a.
+    pub actions: Vec<f32>,
+    /// r, B.
+    pub rewards: Vec<f32>,
+    /// s', B × o.
+    pub next_observations: Vec<f32>,
+    /// 0 where the episode terminated, else 1; B.
+    pub masks: Vec<f32>,
+    /// B.
+    pub size: usize,
+}
+
+impl Batch {
+    pub(crate) fn clear(&mut self) {
+        for array in
+            [&mut self.observations, &mut self.actions, &mut self.rewards, &mut self.next_observations, &mut self.masks]
+        {
+            array.clear();
+        }
+    }
+}
+
+/// Draws batches such that every transition comes once a pass, in an order that depends on the seed alone.
+/// A batch that reaches the end of a pass goes on with the next one.
+pub struct BatchSampler {
+    /// A permutation; the part before `position` is drawn already.
+    order: Vec<u32>,
+    position: usize,
+    indices: Vec<u32>,
+    generator: ChaCha8Rng,
+}
+
+impl BatchSampler {
+    /// A sampler of `batch_size` out of `len` transitions.
+    ///
+    /// # Panics
+    /// If `len` is 0.
+    pub fn new(len: usize, batch_size: usize, seed: u64) -> Self {
+        assert!(len > 0, "there is nothing to sample from");
+        Self {
+            order: (0..len as u32).collect(),
+            position: 0,
+            indices: vec![0; batch_size],
+            generator: ChaCha8Rng::seed_from_u64(seed),
+        }
+    }
+
+    /// Fills `batch` with the next `batch_size` transitions.
+    ///
+    /// # Panics
+    /// If `transitions` are fewer than the sampler was made for.
+    pub fn next(&mut self, transitions: &Transitions, batch: &mut Batch) {
+        for i in 0..self.indices.len() {
+            self.indices[i] = self.draw();
+        }
+        transitions.gather(&self.indices, batch);
+    }
+
+    /// One step of a Fisher–Yates shuffle, so that no step pays for a whole pass.
+    fn draw(&mut self) -> u32 {
+        if self.position == self.order.len() {
+            self.position = 0;
+        }
+        let chosen = self.generator.random_range(self.position..self.order.len());
+        self.order.swap(self.position, chosen);
+        self.position += 1;
+        self.order[self.position - 1]
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn passes(len: usize, seed: u64, draws: usize) -> Vec<u32> {
+        let mut sampler = BatchSampler::new(len, 1, seed);
+        (0..draws).map(|_| sampler.draw()).collect()
+    }
+
+    #[test]
+    fn every_pass_draws_everything_once_in_another_order() {
+        let draws = passes(100, 3, 300);
+        let mut seen = Vec::new();
+        for pass in draws.chunks(100) {
+            let mut sorted = pass.to_vec();
+            sorted.sort_unstable();
+            assert_eq!(sorted, (0..100).collect::<Vec<_>>());
+            assert_ne!(sorted, pass);
+            assert!(!seen.contains(&pass));
+            seen.push(pass);
+        }
+    }
+
+    #[test]
+    fn the_seed_alone_decides_the_order() {
+        assert_eq!(passes(50, 7, 120), passes(50, 7, 120));
+        assert_ne!(passes(50, 7, 120), passes(50, 8, 120));
+    }
+
+    #[test]
+    fn all_first_draws_are_equally_likely() {
+        let mut counts = [0; 10];
+        (0..10_000).for_each(|seed| counts[passes(10, seed, 1)[0] as usize] += 1);
+        // Binomial(10000, 0.1): standard deviation 30.
+        assert!(counts.iter().all(|count| (850..1150).contains(count)), "{counts:?}");
+    }
+}
