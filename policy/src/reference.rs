@@ -1,0 +1,110 @@
+//! The networks in candle's own tensors: the readable version, differentiable by candle's autograd and run on any of
+//! its devices. The fast version next door is tested against it.
+
+use crate::Schedule;
+use candle_core::{CpuStorage, CustomOp1, DType, Device, Layout, Result, Shape, Tensor};
+use std::collections::BTreeMap;
+
+/// Mish with a derivative that is finite everywhere (candle's own is NaN from 89 on).
+struct Mish;
+
+/// Mish and its slope by the definition, for both directions of the operator.
+fn mish_parts(x: &Tensor) -> Result<(Tensor, Tensor)> {
+    let x = x.flatten_all()?.to_vec1::<f32>()?;
+    let (mut y, mut slope) = (vec![0.0; x.len()], vec![0.0; x.len()]);
+    crate::mish_slope(&x, &mut y, &mut slope);
+    Ok((Tensor::from_vec(y, x.len(), &Device::Cpu)?, Tensor::from_vec(slope, x.len(), &Device::Cpu)?))
+}
+
+impl CustomOp1 for Mish {
+    fn name(&self) -> &'static str {
+        "mish"
+    }
+
+    fn cpu_fwd(&self, storage: &CpuStorage, layout: &Layout) -> Result<(CpuStorage, Shape)> {
+        let Some((from, to)) = layout.contiguous_offsets() else {
+            candle_core::bail!("mish needs a contiguous tensor");
+        };
+        let mut y = storage.as_slice::<f32>()?[from..to].to_vec();
+        crate::mish_in_place(&mut y);
+        Ok((CpuStorage::F32(y), layout.shape().clone()))
+    }
+
+    fn bwd(&self, x: &Tensor, _: &Tensor, gradient: &Tensor) -> Result<Option<Tensor>> {
+        let (_, slope) = mish_parts(x)?;
+        Ok(Some(gradient.mul(&slope.reshape(x.shape())?)?))
+    }
+}
+
+/// x·tanh(softplus(x)).
+pub fn mish(x: &Tensor) -> Result<Tensor> {
+    x.contiguous()?.apply_op1(Mish)
+}
+
+/// Named tensors of a network (see [`crate::Parameters`] for the names).
+pub type Tensors = BTreeMap<String, Tensor>;
+
+/// `x · kernel + bias`; a leading K on the weights is a batch dimension.
+fn linear(weights: &Tensors, name: &str, x: &Tensor) -> Result<Tensor> {
+    let get = |kind: &str| {
+        let name = format!("{name}.{kind}");
+        weights.get(&name).ok_or_else(|| candle_core::Error::CannotFindTensor { path: name }.bt())
+    };
+    let (kernel, bias) = (get("kernel")?, get("bias")?);
+    let bias = if bias.rank() == 2 { bias.unsqueeze(1)? } else { bias.clone() };
+    x.contiguous()?.broadcast_matmul(kernel)?.broadcast_add(&bias)
+}
+
+/// Linear layers `name.0 … name.{layers - 1}` with Mish between.
+fn mlp(weights: &Tensors, name: &str, layers: usize, x: &Tensor) -> Result<Tensor> {
+    let mut x = linear(weights, &format!("{name}.0"), x)?;
+    for layer in 1..layers {
+        x = linear(weights, &format!("{name}.{layer}"), &mish(&x)?)?;
+    }
+    Ok(x)
+}
+
+/// Sinusoids of t, `[B]` (f32) → `[B, 16]`: cosines, then sines, of t·exp(-k·ln(10000)/7).
+fn time_features(t: &Tensor) -> Result<Tensor> {
+    let frequencies: Vec<f32> = (0..8).map(|k| (-f64::from(k) * 10_000_f64.ln() / 7.0).exp() as f32).collect();
+    let angles = t.unsqueeze(1)?.broadcast_mul(&Tensor::new(frequencies, t.device())?.unsqueeze(0)?)?;
+    Tensor::cat(&[angles.cos()?, angles.sin()?], 1)
+}
+
+/// ε_θ(a^t, s, t): `actions [B, a]`, `observations [B, o]`, `t [B]` → `[B, a]`.
+pub fn noise(weights: &Tensors, observations: &Tensor, actions: &Tensor, t: &Tensor) -> Result<Tensor> {
+    let time = mlp(weights, "actor.time", 2, &time_features(&t.to_dtype(DType::F32)?)?)?;
+    mlp(weights, "actor.trunk", 4, &Tensor::cat(&[observations, actions, &time], 1)?)
+}
+
+/// Q_k(s, a): `observations [B, o]`, `actions [B, a]` → `[K, B]`.
+pub fn values(weights: &Tensors, observations: &Tensor, actions: &Tensor) -> Result<Tensor> {
+    let input = Tensor::cat(&[observations, actions], 1)?.unsqueeze(0)?;
+    mlp(weights, "critic", 4, &input)?.squeeze(2)
+}
+
+/// Draws actions by the reverse process: `observations [B, o]`, `draws [T, B, a]` → `[B, a]`.
+pub fn sample(schedule: &Schedule, weights: &Tensors, observations: &Tensor, draws: &Tensor) -> Result<Tensor> {
+    let mut actions = draws.get(0)?;
+    let mut alpha_bar_before: Vec<f64> = vec![1.0];
+    alpha_bar_before.extend(schedule.alpha_bar.iter().map(|x| f64::from(*x)));
+    for t in (1..=schedule.steps()).rev() {
+        let (alpha_bar, before) = (alpha_bar_before[t], alpha_bar_before[t - 1]);
+        let beta = f64::from(schedule.beta[t - 1]);
+        let steps = Tensor::full(t as f32, actions.dim(0)?, actions.device())?;
+        let epsilon = noise(weights, observations, &actions, &steps)?;
+        let clean = ((&actions - (epsilon * (1.0 - alpha_bar).sqrt())?)? / alpha_bar.sqrt())?.clamp(-1f32, 1f32)?;
+        let from_clean = before.sqrt() * beta / (1.0 - alpha_bar);
+        let from_noisy = (1.0 - beta).sqrt() * (1.0 - before) / (1.0 - alpha_bar);
+        actions = ((clean * from_clean)? + (actions * from_noisy)?)?;
+        if t > 1 {
+            actions = (actions + (draws.get(schedule.steps() - t + 1)? * beta.sqrt())?)?;
+        }
+    }
+    Ok(actions)
+}
+
+/// Loads a safetensors file's tensors onto a device.
+pub fn load(bytes: &[u8], device: &Device) -> Result<Tensors> {
+    Ok(candle_core::safetensors::load_buffer(bytes, device)?.into_iter().collect())
+}
