@@ -1,2 +1,2 @@
-//! evaluator
+//! `evaluator`: see `evaluator --help`.
 fn main() {}

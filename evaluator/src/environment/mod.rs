@@ -1,0 +1,77 @@
+//! Environments: what a policy acts in.
+//!
+//! One file per task. A task's name, sizes, time limit and score references are the dataset crate's
+//! [`EnvironmentSpec`](quad_dataset::environment::EnvironmentSpec); here is how it moves.
+
+mod hopper;
+mod physics;
+
+pub use hopper::Hopper;
+
+use quad_dataset::environment::EnvironmentSpec;
+use thiserror::Error;
+
+/// The stream that initial states are drawn from, among those of an episode's seed.
+const RESET_STREAM: u64 = 1;
+
+/// What one step of an environment gave.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Step {
+    /// The reward of this step.
+    pub reward: f64,
+    /// The task ended the episode here: there is no future to bootstrap from.
+    pub terminated: bool,
+    /// The time limit was reached here. Independent of `terminated`, as in Gymnasium: both may be true.
+    pub truncated: bool,
+}
+
+/// One simulated task, with the semantics of D4RL's locomotion-v2 files (Gymnasium's "-v4").
+///
+/// Positions `qpos`, velocities `qvel` and observations are MuJoCo's own `f64`; a policy's door rounds them to `f32`.
+pub trait Environment: Send {
+    /// Starts an episode: the initial state's noise is drawn from a stream of `seed`'s own, so an episode is a
+    /// function of its seed and its actions alone.
+    fn reset(&mut self, seed: u64);
+
+    /// Starts an episode in a given state (`nq` positions, `nv` velocities).
+    fn set_state(&mut self, qpos: &[f64], qvel: &[f64]);
+
+    /// Applies `action` (`action_dim` values, clipped to [-1, 1]) for one control period.
+    fn step(&mut self, action: &[f32]) -> Step;
+
+    /// The current observation, `observation_dim` values.
+    fn observation(&self) -> &[f64];
+
+    /// The current generalised positions.
+    fn qpos(&self) -> &[f64];
+
+    /// The current generalised velocities.
+    fn qvel(&self) -> &[f64];
+}
+
+/// Makes an environment. Those of one name share one compiled model, so the second costs little.
+pub fn make(spec: &EnvironmentSpec) -> Result<Box<dyn Environment>, EnvironmentError> {
+    match spec.name {
+        "hopper" => Ok(Box::new(Hopper::new(spec.max_episode_steps)?)),
+        other => Err(EnvironmentError::NotSimulated(other.to_owned())),
+    }
+}
+
+/// Why an environment could not be made.
+#[derive(Debug, Error)]
+pub enum EnvironmentError {
+    /// The name is known to the dataset crate, but this evaluator has no simulation of it.
+    #[error("this evaluator cannot simulate the environment \"{0}\"")]
+    NotSimulated(String),
+    /// MuJoCo refused the embedded model: the library is not the version this was built for.
+    #[error("MuJoCo could not compile the model of \"{environment}\": {reason}")]
+    Model {
+        /// Which environment's model.
+        environment: &'static str,
+        /// MuJoCo's own words.
+        reason: String,
+    },
+    /// MuJoCo could not allocate the state of a simulation.
+    #[error("MuJoCo could not allocate the state of a simulation: {0}")]
+    Allocation(String),
+}

@@ -1,0 +1,113 @@
+//! What an evaluator tells Prometheus; docs/metrics.md explains each.
+
+use prometheus::{Counter, Histogram, HistogramOpts, IntCounter, IntCounterVec, IntGauge, Opts, Registry};
+
+/// How a job ended.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum JobOutcome {
+    /// Its scores were acknowledged.
+    Scored,
+    /// It was given up: this evaluator is leaving, or the learner refused the scores or never came back.
+    Abandoned,
+    /// Its weights or its environment could not be used.
+    Failed,
+}
+
+impl JobOutcome {
+    const ALL: [JobOutcome; 3] = [JobOutcome::Scored, JobOutcome::Abandoned, JobOutcome::Failed];
+
+    fn label(self) -> &'static str {
+        match self {
+            JobOutcome::Scored => "scored",
+            JobOutcome::Abandoned => "abandoned",
+            JobOutcome::Failed => "failed",
+        }
+    }
+}
+
+/// The metrics of one evaluator process, in a registry of their own.
+#[derive(Clone)]
+pub struct Metrics {
+    /// What `/metrics` shows.
+    pub registry: Registry,
+    /// Episodes finished, also those of jobs that were given up.
+    pub episodes: IntCounter,
+    /// Environment steps taken.
+    pub environment_steps: IntCounter,
+    /// Snapshots received whole and verified.
+    pub snapshots_received: IntCounter,
+    /// Normalised score of each scored episode.
+    pub episode_score: Histogram,
+    /// Seconds from a job's hand-out to the end of its last episode.
+    pub job_duration: Histogram,
+    /// Seconds spent choosing actions.
+    pub select_seconds: Counter,
+    /// Seconds spent in the physics.
+    pub physics_seconds: Counter,
+    /// Runs that are being served.
+    pub runs: IntGauge,
+    jobs: IntCounterVec,
+    rejected_messages: IntCounterVec,
+}
+
+impl Metrics {
+    /// Registers every metric, and the process's own (`process_…`).
+    pub fn new() -> prometheus::Result<Metrics> {
+        let registry = Registry::new();
+        let metrics = Metrics {
+            episodes: IntCounter::new("quad_evaluator_episodes_total", "Episodes finished")?,
+            environment_steps: IntCounter::new("quad_evaluator_environment_steps_total", "Environment steps taken")?,
+            snapshots_received: IntCounter::new(
+                "quad_evaluator_snapshots_received_total",
+                "Weight snapshots received whole and verified",
+            )?,
+            episode_score: Histogram::with_opts(
+                // 100 is an expert by the normalisation; the fine buckets are where training starts.
+                HistogramOpts::new("quad_evaluator_episode_score", "Normalised score of each scored episode")
+                    .buckets(vec![1.0, 2.0, 5.0, 10.0, 20.0, 30.0, 40.0, 50.0, 60.0, 70.0, 80.0, 90.0, 100.0, 110.0]),
+            )?,
+            job_duration: Histogram::with_opts(
+                HistogramOpts::new(
+                    "quad_evaluator_job_duration_seconds",
+                    "Time from a job's hand-out to the end of its last episode",
+                )
+                .buckets(vec![0.1, 0.25, 0.5, 1.0, 2.5, 5.0, 10.0, 25.0, 50.0, 100.0, 250.0]),
+            )?,
+            select_seconds: Counter::new("quad_evaluator_select_seconds_total", "Time spent choosing actions")?,
+            physics_seconds: Counter::new("quad_evaluator_physics_seconds_total", "Time spent in the physics")?,
+            runs: IntGauge::new("quad_evaluator_runs", "Runs that are being served")?,
+            jobs: IntCounterVec::new(Opts::new("quad_evaluator_jobs_total", "Jobs by how they ended"), &["outcome"])?,
+            rejected_messages: IntCounterVec::new(
+                Opts::new("quad_evaluator_rejected_messages_total", "Messages from the wire that were not used, by reason"),
+                &["reason"],
+            )?,
+            registry,
+        };
+        for outcome in JobOutcome::ALL {
+            metrics.jobs.with_label_values(&[outcome.label()]);
+        }
+        let registry = &metrics.registry;
+        registry.register(Box::new(metrics.episodes.clone()))?;
+        registry.register(Box::new(metrics.environment_steps.clone()))?;
+        registry.register(Box::new(metrics.snapshots_received.clone()))?;
+        registry.register(Box::new(metrics.episode_score.clone()))?;
+        registry.register(Box::new(metrics.job_duration.clone()))?;
+        registry.register(Box::new(metrics.select_seconds.clone()))?;
+        registry.register(Box::new(metrics.physics_seconds.clone()))?;
+        registry.register(Box::new(metrics.runs.clone()))?;
+        registry.register(Box::new(metrics.jobs.clone()))?;
+        registry.register(Box::new(metrics.rejected_messages.clone()))?;
+        registry.register(Box::new(prometheus::process_collector::ProcessCollector::for_self()))?;
+        Ok(metrics)
+    }
+
+    /// Counts a job that is over.
+    pub fn job(&self, outcome: JobOutcome) {
+        self.jobs.with_label_values(&[outcome.label()]).inc();
+    }
+
+    /// Counts a message that was not used. Reasons come from a fixed list, so that nobody can make labels up.
+    pub fn rejected(&self, reason: &'static str) {
+        self.rejected_messages.with_label_values(&[reason]).inc();
+    }
+}

@@ -1,0 +1,160 @@
+//! Episodes of one job, run as one batch.
+
+use std::time::{Duration, Instant};
+
+use quad_dataset::environment::EnvironmentSpec;
+use rayon::prelude::*;
+
+use crate::environment::{self, Environment, EnvironmentError};
+
+/// A batch of episodes that advance together: one policy call and one control period per [`step`](Rollout::step).
+///
+/// Episodes that ended leave the batch, so the policy only ever sees live ones. An episode's outcome is a function of
+/// its seed and the policy, whatever else is in the batch, as long as the policy treats its rows independently. For that,
+/// each episode carries its own `N`: what the policy draws its noise from.
+pub struct Rollout<N> {
+    spec: &'static EnvironmentSpec,
+    live: Vec<Episode>,
+    /// Row i belongs to `live[i]`, as in the next two.
+    noise: Vec<N>,
+    /// live × observation_dim
+    observations: Vec<f32>,
+    /// live × action_dim
+    actions: Vec<f32>,
+    outcomes: Vec<EpisodeOutcome>,
+    environment_steps: u64,
+    select_time: Duration,
+    physics_time: Duration,
+}
+
+struct Episode {
+    environment: Box<dyn Environment>,
+    index: usize,
+    seed: u64,
+    episode_return: f64,
+    length: u32,
+    ended: bool,
+}
+
+/// What one episode came to.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct EpisodeOutcome {
+    /// The episode's place among the seeds the rollout was made from.
+    pub index: usize,
+    /// The seed of its initial state and of the policy's noise.
+    pub seed: u64,
+    /// Sum of its rewards, undiscounted.
+    pub episode_return: f64,
+    /// Its number of steps.
+    pub length: u32,
+    /// D4RL's normalised score, 100 · (return - min) / (max - min).
+    pub score: f64,
+}
+
+impl<N> Rollout<N> {
+    /// Resets one environment per seed; `noise` makes each episode's noise out of its seed.
+    pub fn new(
+        spec: &'static EnvironmentSpec,
+        seeds: &[u64],
+        noise: impl FnMut(u64) -> N,
+    ) -> Result<Self, EnvironmentError> {
+        let mut live = Vec::with_capacity(seeds.len());
+        for (index, &seed) in seeds.iter().enumerate() {
+            let mut environment = environment::make(spec)?;
+            environment.reset(seed);
+            live.push(Episode { environment, index, seed, episode_return: 0.0, length: 0, ended: false });
+        }
+        Ok(Self {
+            spec,
+            live,
+            noise: seeds.iter().copied().map(noise).collect(),
+            observations: Vec::with_capacity(seeds.len() * spec.observation_dim),
+            actions: Vec::with_capacity(seeds.len() * spec.action_dim),
+            outcomes: Vec::with_capacity(seeds.len()),
+            environment_steps: 0,
+            select_time: Duration::ZERO,
+            physics_time: Duration::ZERO,
+        })
+    }
+
+    /// Advances every live episode by one control period.
+    ///
+    /// `select` is called once, with n × observation_dim observations, the noise of the same n episodes, and the
+    /// n × action_dim actions it is to fill in.
+    pub fn step(&mut self, select: impl FnOnce(&[f32], &mut [N], &mut [f32])) {
+        if self.live.is_empty() {
+            return;
+        }
+        let start = Instant::now();
+        self.observations.clear();
+        for episode in &self.live {
+            self.observations.extend(episode.environment.observation().iter().map(|&value| value as f32));
+        }
+        self.actions.resize(self.live.len() * self.spec.action_dim, 0.0);
+        select(&self.observations, &mut self.noise, &mut self.actions);
+        let selected = Instant::now();
+        self.select_time += selected - start;
+
+        let actions = self.actions.chunks_exact(self.spec.action_dim);
+        if rayon::current_num_threads() > 1 && self.live.len() > 1 {
+            let actions = self.actions.par_chunks_exact(self.spec.action_dim);
+            self.live.par_iter_mut().zip(actions).for_each(|(episode, action)| episode.step(action));
+        } else {
+            self.live.iter_mut().zip(actions).for_each(|(episode, action)| episode.step(action));
+        }
+        self.environment_steps += self.live.len() as u64;
+        self.collect_ended();
+        self.physics_time += selected.elapsed();
+    }
+
+    fn collect_ended(&mut self) {
+        for row in (0..self.live.len()).rev() {
+            if self.live[row].ended {
+                let Episode { index, seed, episode_return, length, .. } = self.live.swap_remove(row);
+                self.noise.swap_remove(row);
+                let score = self.spec.normalised_score(episode_return);
+                self.outcomes.push(EpisodeOutcome { index, seed, episode_return, length, score });
+            }
+        }
+    }
+
+    /// Whether every episode has ended.
+    pub fn is_done(&self) -> bool {
+        self.live.is_empty()
+    }
+
+    /// Episodes that have ended.
+    pub fn episodes_done(&self) -> usize {
+        self.outcomes.len()
+    }
+
+    /// Steps taken so far, summed over the episodes.
+    pub fn environment_steps(&self) -> u64 {
+        self.environment_steps
+    }
+
+    /// Time spent in the policy so far.
+    pub fn select_time(&self) -> Duration {
+        self.select_time
+    }
+
+    /// Time spent in the simulations so far.
+    pub fn physics_time(&self) -> Duration {
+        self.physics_time
+    }
+
+    /// The outcomes of the episodes that have ended, in the order of the seeds.
+    pub fn into_outcomes(mut self) -> Vec<EpisodeOutcome> {
+        self.outcomes.sort_unstable_by_key(|outcome| outcome.index);
+        self.outcomes
+    }
+}
+
+impl Episode {
+    fn step(&mut self, action: &[f32]) {
+        let step = self.environment.step(action);
+        self.episode_return += step.reward;
+        self.length += 1;
+        self.ended = step.terminated || step.truncated;
+    }
+}

@@ -1,0 +1,146 @@
+//! From a snapshot on the wire to a policy that may be rolled out.
+
+use std::sync::{Arc, Mutex, PoisonError};
+
+use quad_dataset::environment;
+use quad_policy::{Architecture, PolicyError, TargetPolicy};
+use quad_protocol::{Hash, Job, Name, Schema, Snapshot, decode, keys};
+use tokio::sync::Notify;
+use tokio::task::JoinSet;
+use tracing::warn;
+use zenoh::Session;
+use zenoh::handlers::RingChannel;
+
+use crate::metrics::Metrics;
+
+/// Most denoising steps that are believed; the tensors' shapes do not bound them.
+const MAX_DIFFUSION_STEPS: u32 = 1_000;
+
+/// Why a snapshot does not fit the job it came for.
+#[derive(Debug, thiserror::Error)]
+pub enum WeightsError {
+    /// It is another one.
+    #[error("the job names {field} {wanted}, the snapshot is of {found}")]
+    Other {
+        /// What differs.
+        field: &'static str,
+        /// What the job says.
+        wanted: String,
+        /// What the snapshot says.
+        found: String,
+    },
+    /// Its numbers cannot be those of a policy for the environment.
+    #[error("the snapshot's {field} is {found}, but must be {wanted}")]
+    Schema {
+        /// Name within the schema.
+        field: &'static str,
+        /// What it is.
+        found: u32,
+        /// What it may be.
+        wanted: String,
+    },
+    /// This evaluator does not know the environment.
+    #[error("no environment {0} here")]
+    Environment(String),
+    /// Its tensors are not the schema's.
+    #[error(transparent)]
+    Policy(#[from] PolicyError),
+}
+
+impl WeightsError {
+    /// The reason as a metric's label.
+    pub fn label(&self) -> &'static str {
+        match self {
+            WeightsError::Other { .. } => "other_snapshot",
+            WeightsError::Schema { .. } | WeightsError::Environment(_) => "schema",
+            WeightsError::Policy(_) => "tensors",
+        }
+    }
+}
+
+/// Builds the policy of `snapshot` if it is exactly the one that `job` names. Its hash was verified by the codec.
+pub fn policy_for(job: &Job, snapshot: &Snapshot) -> Result<TargetPolicy, WeightsError> {
+    same("run", &job.run, &snapshot.run)?;
+    same("epoch", &job.epoch, &snapshot.epoch)?;
+    same("step", &job.step, &snapshot.step)?;
+    same("hash", &job.weights, &snapshot.hash)?;
+    same("environment", &job.environment, &snapshot.schema.environment)?;
+    Ok(TargetPolicy::from_safetensors(architecture(&snapshot.schema)?, &snapshot.tensors)?)
+}
+
+fn same<T: PartialEq + ToString>(field: &'static str, wanted: &T, found: &T) -> Result<(), WeightsError> {
+    if wanted == found {
+        return Ok(());
+    }
+    Err(WeightsError::Other { field, wanted: wanted.to_string(), found: found.to_string() })
+}
+
+/// The shapes that `schema` promises, if they suit its environment.
+fn architecture(schema: &Schema) -> Result<Architecture, WeightsError> {
+    let spec = environment::find(&schema.environment)
+        .map_err(|_| WeightsError::Environment(schema.environment.clone()))?;
+    let exactly = |field, found: u32, wanted: usize| {
+        let fits = found as usize == wanted;
+        if fits { Ok(wanted) } else { Err(WeightsError::Schema { field, found, wanted: wanted.to_string() }) }
+    };
+    let at_most = |field, found: u32, most: u32| {
+        let fits = (1..=most).contains(&found);
+        if fits { Ok(found as usize) } else { Err(WeightsError::Schema { field, found, wanted: format!("1..={most}") }) }
+    };
+    Ok(Architecture {
+        observation_dim: exactly("observation_dim", schema.observation_dim, spec.observation_dim)?,
+        action_dim: exactly("action_dim", schema.action_dim, spec.action_dim)?,
+        // The two below are bounded by the tensors themselves: their shapes must match.
+        hidden: at_most("hidden", schema.hidden, u16::MAX.into())?,
+        critics: at_most("critics", schema.critics, u16::MAX.into())?,
+        diffusion_steps: at_most("diffusion_steps", schema.diffusion_steps, MAX_DIFFUSION_STEPS)?,
+    })
+}
+
+/// The newest good snapshot that one run's learner published while this evaluator listened.
+pub struct NewestWeights {
+    newest: Arc<Mutex<Option<Arc<Snapshot>>>>,
+    // Aborted with the cache; owns the subscriber.
+    _listener: JoinSet<()>,
+}
+
+impl NewestWeights {
+    /// Listens to `quad/<run>/weights`; `arrived` is told of each good snapshot.
+    pub async fn listen(
+        session: &Session,
+        run: Name,
+        metrics: Metrics,
+        arrived: Arc<Notify>,
+    ) -> zenoh::Result<NewestWeights> {
+        // Newest wins: a queue would hold snapshots nobody wants, and a full one stops the whole session.
+        let subscriber = session.declare_subscriber(keys::weights(&run)).with(RingChannel::new(1)).await?;
+        let newest = Arc::new(Mutex::new(None));
+        let cache = newest.clone();
+        let mut listener = JoinSet::new();
+        listener.spawn(async move {
+            while let Ok(sample) = subscriber.recv_async().await {
+                // Hashing megabytes is work for a thread of its own, not for the runtime's.
+                let decoded = tokio::task::spawn_blocking(move || decode::<Snapshot>(&sample.payload().to_bytes()));
+                match decoded.await {
+                    Ok(Ok(snapshot)) => {
+                        metrics.snapshots_received.inc();
+                        *cache.lock().unwrap_or_else(PoisonError::into_inner) = Some(Arc::new(snapshot));
+                        arrived.notify_one();
+                    }
+                    Ok(Err(error)) => {
+                        metrics.rejected(error.label());
+                        warn!(%run, "ignored what was published as weights: {error}");
+                    }
+                    Err(error) => warn!(%run, "ignored what was published as weights: {error}"),
+                }
+            }
+        });
+        Ok(NewestWeights { newest, _listener: listener })
+    }
+
+    /// The snapshot with this hash, if it is the newest.
+    pub fn get(&self, hash: &Hash) -> Option<Arc<Snapshot>> {
+        let newest = self.newest.lock().unwrap_or_else(PoisonError::into_inner);
+        newest.as_ref().filter(|snapshot| snapshot.hash == *hash).cloned()
+    }
+}
