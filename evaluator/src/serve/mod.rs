@@ -1,0 +1,110 @@
+//! `evaluator serve`: finds runs, measures the weights they publish, delivers the scores.
+//!
+//! # Layout
+//!
+//! In reading order:
+//!
+//! - `discovery`: which runs are there.
+//! - `worker`: whose turn it is, and what a turn consists of.
+//! - `run`: one run, as its learner is spoken to; `query`: how a question is put.
+//! - `weights`: from a snapshot on the wire to a policy.
+//! - `job`: all episodes of a job, as one batch.
+//!
+//! An evaluator keeps nothing that must last: killed at any point, it costs its learner a lease.
+
+mod discovery;
+mod job;
+mod query;
+mod run;
+mod weights;
+mod worker;
+
+use std::net::SocketAddr;
+use std::time::Duration;
+
+use anyhow::Context;
+use clap::Args;
+use quad_protocol::Name;
+use rand::Rng;
+use tracing::info;
+
+use crate::metrics::Metrics;
+use discovery::Discovery;
+use worker::Worker;
+
+const AFTER_HELP: &str = "\
+Runs are found by themselves, also those that start later; several are served in turn. Stop it at any time
+(Ctrl-C or SIGTERM): what it was at is handed to another evaluator.
+
+Examples:
+  evaluator serve                                       the learner of this machine
+  evaluator serve --connect tcp/learner.example:7447    a learner or router elsewhere
+  evaluator serve --metrics 127.0.0.1:9101              with http://127.0.0.1:9101/metrics
+
+RAYON_NUM_THREADS bounds the processor cores that are used; without it, all are.";
+
+/// Measure the weights that learners publish, until told to stop
+#[derive(Args, Debug)]
+#[command(after_help = AFTER_HELP)]
+pub struct ServeArgs {
+    /// Zenoh endpoint of a learner or a router; may be given several times
+    #[arg(long, value_name = "ENDPOINT", default_value = "tcp/127.0.0.1:7447")]
+    connect: Vec<String>,
+    /// Where to serve /metrics and /healthz; port 0 takes a free one
+    #[arg(long, value_name = "ADDR:PORT")]
+    metrics: Option<SocketAddr>,
+    /// Name in scores and metrics, unique among the evaluators of a run [default: HOST-PID-RANDOM]
+    #[arg(long, value_parser = |text: &str| Name::new(text))]
+    name: Option<Name>,
+}
+
+/// What a process waits for its last thread and its farewells to the network when told to stop.
+const LEAVE: Duration = Duration::from_secs(1);
+
+/// Serves until SIGINT or SIGTERM.
+pub fn serve(args: ServeArgs) -> anyhow::Result<()> {
+    // Two threads for the network; episodes run on their own.
+    let runtime = tokio::runtime::Builder::new_multi_thread()
+        .worker_threads(2)
+        .enable_all()
+        .build()
+        .context("cannot start the asynchronous runtime")?;
+    let result = runtime.block_on(serve_until_stopped(args));
+    runtime.shutdown_timeout(LEAVE);
+    result
+}
+
+async fn serve_until_stopped(args: ServeArgs) -> anyhow::Result<()> {
+    let stop = quad_service::shutdown_signal();
+    let metrics = Metrics::new().context("cannot register the metrics")?;
+    let name = args.name.map_or_else(unique_name, Ok)?;
+    info!(evaluator = %name, "ready to serve");
+    // Serves for as long as it is held.
+    let _server = match args.metrics {
+        Some(address) => {
+            let server = quad_service::serve_metrics(address, metrics.registry.clone()).await?;
+            info!("metrics at http://{}/metrics", server.address);
+            Some(server)
+        }
+        None => None,
+    };
+    let mut discovery = Discovery::start(args.connect);
+    let worker = Worker::new(name, metrics.clone(), discovery.runs());
+    let result = tokio::select! {
+        () = stop => Ok(()),
+        error = worker.run() => Err(error),
+        error = discovery.failed() => Err(error),
+    };
+    let (episodes, steps) = (metrics.episodes.get(), metrics.environment_steps.get());
+    info!(episodes, steps, "leaving");
+    result
+}
+
+/// Host and process for people, a random part because containers share both.
+fn unique_name() -> anyhow::Result<Name> {
+    let host = std::fs::read_to_string("/proc/sys/kernel/hostname").unwrap_or_default();
+    let host: String = host.chars().filter(|c| c.is_ascii_alphanumeric() || *c == '-').take(40).collect();
+    let host = if host.is_empty() { "evaluator" } else { &host };
+    let random: u16 = rand::rng().random();
+    Name::new(format!("{host}-{}-{random:04x}", std::process::id())).context("cannot make up a name for this evaluator")
+}
