@@ -1,0 +1,228 @@
+//! Files that are not what they should be: always a typed error that names file, array and row, never a panic.
+
+use std::fs;
+use std::path::{Path, PathBuf};
+
+use hdf5::H5Type;
+use ndarray::ArrayViewD;
+use quad_dataset::{DatasetError, ReadOptions, RecordedRows, RewardRule, Transitions};
+use rand::{Rng, SeedableRng};
+use rand_chacha::ChaCha8Rng;
+use tempfile::{TempDir, tempdir};
+
+use crate::hopper;
+
+const ROWS: usize = 20;
+
+/// A good file, to be spoiled in one place.
+struct Subject {
+    folder: TempDir,
+}
+
+impl Subject {
+    fn new() -> Self {
+        let this = Self { folder: tempdir().unwrap() };
+        let file = hdf5::File::create(this.path()).unwrap();
+        put(&file, "observations", &[ROWS, 11], &[0.5f32; ROWS * 11]);
+        put(&file, "actions", &[ROWS, 3], &[0.5f32; ROWS * 3]);
+        put(&file, "rewards", &[ROWS], &[1.0f32; ROWS]);
+        put(&file, "terminals", &[ROWS], &std::array::from_fn::<_, ROWS, _>(|i| i == 4));
+        put(&file, "timeouts", &[ROWS], &[false; ROWS]);
+        this
+    }
+
+    fn path(&self) -> PathBuf {
+        self.folder.path().join("subject.hdf5")
+    }
+
+    fn replace<T: H5Type>(&self, array: &str, shape: &[usize], data: &[T]) {
+        let file = hdf5::File::open_rw(self.path()).unwrap();
+        file.unlink(array).unwrap();
+        put(&file, array, shape, data);
+    }
+
+    fn read(&self, reward: RewardRule) -> Result<Transitions, DatasetError> {
+        Transitions::read(self.path(), &ReadOptions { environment: hopper(), reward })
+    }
+
+    /// The error's text after the file's path, which every error starts with.
+    fn error(&self) -> String {
+        let error = self.read(RewardRule::AsIs).err().expect("the file is broken");
+        let text = error.to_string();
+        let path = format!("{}: ", self.path().display());
+        text.strip_prefix(&path).unwrap_or_else(|| panic!("{text} does not start with {path}")).to_owned()
+    }
+}
+
+fn put<T: H5Type>(file: &hdf5::File, array: &str, shape: &[usize], data: &[T]) {
+    let view = ArrayViewD::from_shape(shape, data).unwrap();
+    file.new_dataset_builder().with_data(view).create(array).unwrap();
+}
+
+#[test]
+fn the_subject_itself_is_whole() {
+    assert_eq!(Subject::new().read(RewardRule::Locomotion).unwrap().len(), ROWS - 1);
+}
+
+#[test]
+fn a_missing_file() {
+    let error = Transitions::read("/nowhere/x.hdf5", &ReadOptions { environment: hopper(), reward: RewardRule::AsIs });
+    assert!(matches!(error.err(), Some(DatasetError::Io { path, .. }) if path == Path::new("/nowhere/x.hdf5")));
+}
+
+#[test]
+fn not_hdf5_at_all() {
+    let subject = Subject::new();
+    let mut noise = vec![0; 5000];
+    ChaCha8Rng::seed_from_u64(1).fill(&mut noise[..]);
+    for content in [&noise[..], b"", b"\x89HDF\r\n\x1a\n"] {
+        fs::write(subject.path(), content).unwrap();
+        assert_eq!(subject.error(), "not an HDF5 file, or a damaged or incomplete one");
+    }
+}
+
+#[test]
+fn truncated_anywhere() {
+    let subject = Subject::new();
+    let whole = fs::read(subject.path()).unwrap();
+    for length in (0..whole.len()).step_by(97) {
+        fs::write(subject.path(), &whole[..length]).unwrap();
+        assert!(matches!(subject.read(RewardRule::AsIs), Err(DatasetError::NotHdf5 { .. })), "{length} bytes");
+    }
+}
+
+#[test]
+fn flipped_bytes_never_panic() {
+    let subject = Subject::new();
+    let whole = fs::read(subject.path()).unwrap();
+    let mut generator = ChaCha8Rng::seed_from_u64(2);
+    let mut errors = 0;
+    for _ in 0..300 {
+        let mut bytes = whole.clone();
+        for _ in 0..8 {
+            let position = generator.random_range(0..bytes.len());
+            bytes[position] = generator.random();
+        }
+        fs::write(subject.path(), bytes).unwrap();
+        errors += usize::from(subject.read(RewardRule::AsIs).is_err());
+    }
+    assert!((1..300).contains(&errors), "{errors} of 300 damaged files were refused");
+}
+
+#[test]
+fn a_missing_array() {
+    for array in ["observations", "actions", "rewards", "terminals"] {
+        let subject = Subject::new();
+        hdf5::File::open_rw(subject.path()).unwrap().unlink(array).unwrap();
+        assert_eq!(subject.error(), format!("array `{array}` is missing"));
+    }
+    let error = RecordedRows::read(Subject::new().path(), hopper()).err().unwrap();
+    assert!(matches!(error, DatasetError::Missing { array: "next_observations", .. }));
+}
+
+#[test]
+fn a_group_in_an_arrays_place() {
+    let subject = Subject::new();
+    let file = hdf5::File::open_rw(subject.path()).unwrap();
+    file.unlink("rewards").unwrap();
+    file.create_group("rewards").unwrap();
+    drop(file);
+    assert_eq!(subject.error(), "array `rewards` cannot be read");
+}
+
+#[test]
+fn another_environments_sizes() {
+    let subject = Subject::new();
+    subject.replace("observations", &[ROWS, 17], &[0.5f32; ROWS * 17]);
+    assert_eq!(subject.error(), "array `observations` has shape [20, 17], but must have [20, 11]");
+    let subject = Subject::new();
+    subject.replace("actions", &[ROWS, 6], &[0.5f32; ROWS * 6]);
+    assert_eq!(subject.error(), "array `actions` has shape [20, 6], but must have [20, 3]");
+}
+
+#[test]
+fn arrays_of_different_lengths() {
+    let subject = Subject::new();
+    subject.replace("rewards", &[ROWS - 1], &[0.5f32; ROWS - 1]);
+    assert_eq!(subject.error(), "array `rewards` has shape [19], but must have [20, 1]");
+    let subject = Subject::new();
+    subject.replace("terminals", &[ROWS, 2], &[false; ROWS * 2]);
+    assert_eq!(subject.error(), "array `terminals` has shape [20, 2], but must have [20, 1]");
+}
+
+#[test]
+fn numbers_that_are_not_finite() {
+    let mut data = [0.5f32; ROWS * 11];
+    data[7 * 11 + 3] = f32::NAN;
+    let subject = Subject::new();
+    subject.replace("observations", &[ROWS, 11], &data);
+    assert_eq!(subject.error(), "array `observations`, row 7: NaN is not a finite float32");
+
+    let mut data = [0.5f64; ROWS];
+    data[19] = 1e39;
+    let subject = Subject::new();
+    subject.replace("rewards", &[ROWS], &data);
+    assert_eq!(subject.error(), "array `rewards`, row 19: inf is not a finite float32");
+}
+
+#[test]
+fn elements_of_another_type() {
+    let subject = Subject::new();
+    subject.replace("actions", &[ROWS, 3], &[1i32; ROWS * 3]);
+    assert_eq!(subject.error(), "array `actions` holds int32, but must hold float32 or float64");
+    let subject = Subject::new();
+    subject.replace("terminals", &[ROWS], &[0f32; ROWS]);
+    let expected = "array `terminals` holds float32, but must hold booleans (h5py's enum, or an integer type)";
+    assert_eq!(subject.error(), expected);
+}
+
+#[test]
+fn flags_that_are_neither_0_nor_1() {
+    let mut data = [0i32; ROWS];
+    for (value, shown) in [(2, 2), (-1, -1), (256, 127)] {
+        data[3] = value;
+        let subject = Subject::new();
+        subject.replace("timeouts", &[ROWS], &data);
+        assert_eq!(subject.error(), format!("array `timeouts`, row 3: {shown} is neither 0 nor 1"));
+    }
+}
+
+#[test]
+fn no_rows_and_no_transitions() {
+    let subject = Subject::new();
+    subject.replace::<f32>("observations", &[0, 11], &[]);
+    assert_eq!(subject.error(), "array `actions` has shape [20, 3], but must have [0, 3]");
+    subject.replace::<f32>("actions", &[0, 3], &[]);
+    subject.replace::<f32>("rewards", &[0], &[]);
+    subject.replace::<bool>("terminals", &[0], &[]);
+    subject.replace::<bool>("timeouts", &[0], &[]);
+    assert_eq!(subject.error(), "0 rows, of which none makes a transition");
+
+    let subject = Subject::new();
+    subject.replace("timeouts", &[ROWS], &[true; ROWS]);
+    assert_eq!(subject.error(), "20 rows, of which none makes a transition");
+}
+
+#[test]
+fn a_size_that_no_such_file_can_hold() {
+    let subject = Subject::new();
+    let file = hdf5::File::open_rw(subject.path()).unwrap();
+    file.unlink("observations").unwrap();
+    let shape = (1usize << 50, 11);
+    file.new_dataset::<f32>().chunk((1024, 11)).shape(shape).create("observations").unwrap();
+    drop(file);
+    let bytes = fs::metadata(subject.path()).unwrap().len();
+    let shape = [1usize << 50, 11];
+    assert_eq!(
+        subject.error(),
+        format!("array `observations` claims the shape {shape:?}, more than a file of {bytes} bytes can hold")
+    );
+}
+
+#[test]
+fn returns_without_any_spread() {
+    let subject = Subject::new();
+    subject.replace("rewards", &[ROWS], &[0f32; ROWS]);
+    assert!(matches!(subject.read(RewardRule::Locomotion), Err(DatasetError::SameReturns { .. })));
+    assert!(subject.read(RewardRule::AsIs).is_ok());
+}

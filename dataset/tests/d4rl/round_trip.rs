@@ -1,0 +1,111 @@
+//! What the writer writes is what the readers read.
+
+use std::fs;
+
+use quad_dataset::{D4rlWriter, DatasetError, Metadata, RecordedRows, Row};
+use tempfile::tempdir;
+
+use crate::{hopper, peers};
+
+/// More than two chunks, and not a whole number of them.
+const ROWS: usize = 10_000;
+
+const METADATA: Metadata = Metadata { algorithm: "formula", iteration: 12, seed: 34 };
+
+/// Numbers that float32 holds exactly; `peers.py check-written` has the same formulas.
+struct OwnedRow([Vec<f64>; 5]);
+
+impl OwnedRow {
+    fn new(i: usize) -> Self {
+        let list = |n: usize, value: &dyn Fn(f64) -> f64| (0..n).map(|j| value(j as f64)).collect::<Vec<f64>>();
+        let i = i as f64;
+        Self([
+            list(11, &|j| i + j / 16.0),
+            list(3, &|j| ((i * 3.0 + j) % 7.0 - 3.0) / 4.0),
+            list(11, &|j| i + 1.0 + j / 16.0),
+            list(6, &|j| -i - j / 16.0),
+            list(6, &|j| j - i / 32.0),
+        ])
+    }
+
+    fn row(&self, i: usize) -> Row<'_> {
+        let [observation, action, next_observation, qpos, qvel] = &self.0;
+        let (reward, terminal, timeout) = (i as f64 / 8.0, i % 50 == 49, i % 70 == 69);
+        Row { observation, action, next_observation, reward, terminal, timeout, qpos, qvel }
+    }
+}
+
+fn write(path: &std::path::Path) {
+    let mut writer = D4rlWriter::create(path, hopper()).unwrap();
+    for i in 0..ROWS {
+        writer.push(&OwnedRow::new(i).row(i)).unwrap();
+    }
+    assert_eq!(writer.rows(), ROWS);
+    writer.finish(&METADATA).unwrap();
+}
+
+#[test]
+fn the_reader_reads_every_row_bit_for_bit() {
+    let folder = tempdir().unwrap();
+    let path = folder.path().join("new/folder/rows.hdf5");
+    write(&path);
+    let recorded = RecordedRows::read(&path, hopper()).unwrap();
+    assert_eq!(recorded.len(), ROWS);
+    for (i, row) in recorded.iter().enumerate() {
+        assert_eq!(row, OwnedRow::new(i).row(i), "row {i}");
+    }
+}
+
+#[test]
+fn h5py_reads_the_layout_of_d4rl() {
+    let folder = tempdir().unwrap();
+    let path = folder.path().join("rows.hdf5");
+    write(&path);
+    peers(&["check-written", path.to_str().unwrap(), &ROWS.to_string()]);
+}
+
+#[test]
+fn the_file_has_its_name_only_when_it_is_finished() {
+    let folder = tempdir().unwrap();
+    let (path, partial) = (folder.path().join("rows.hdf5"), folder.path().join("rows.hdf5.partial"));
+    fs::write(&path, "an older file").unwrap();
+    fs::write(&partial, "what an interrupted run left").unwrap();
+
+    let mut writer = D4rlWriter::create(&path, hopper()).unwrap();
+    writer.push(&OwnedRow::new(0).row(0)).unwrap();
+    assert_eq!(fs::read_to_string(&path).unwrap(), "an older file");
+    drop(writer);
+    assert_eq!(fs::read_to_string(&path).unwrap(), "an older file");
+    assert!(partial.exists());
+
+    let mut writer = D4rlWriter::create(&path, hopper()).unwrap();
+    writer.push(&OwnedRow::new(0).row(0)).unwrap();
+    writer.finish(&METADATA).unwrap();
+    assert_eq!(RecordedRows::read(&path, hopper()).unwrap().len(), 1);
+    assert!(!partial.exists());
+}
+
+#[test]
+fn a_row_that_would_spoil_the_file_is_refused_as_a_whole() {
+    let folder = tempdir().unwrap();
+    let path = folder.path().join("rows.hdf5");
+    let mut writer = D4rlWriter::create(&path, hopper()).unwrap();
+    let good = OwnedRow::new(0);
+    writer.push(&good.row(0)).unwrap();
+
+    let short = Row { action: &[0.0; 2], ..good.row(0) };
+    let error = writer.push(&short).unwrap_err();
+    assert!(
+        error.to_string().ends_with("row 1 cannot be written: `actions` has 2 numbers, but must have 3"),
+        "{error}"
+    );
+    for value in [f64::NAN, f64::INFINITY, 1e39] {
+        let row = Row { qvel: &[0.0, 0.0, value, 0.0, 0.0, 0.0], ..good.row(0) };
+        assert!(matches!(writer.push(&row), Err(DatasetError::BadRow { array: "infos/qvel", row: 1, .. })));
+    }
+
+    writer.finish(&METADATA).unwrap();
+    let recorded = RecordedRows::read(&path, hopper()).unwrap();
+    assert_eq!(recorded.len(), 1);
+    assert_eq!(recorded.row(0), good.row(0));
+}
