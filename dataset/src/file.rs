@@ -1,4 +1,7 @@
 //! Arrays of an HDF5 file, each checked for presence, type, shape, size and finite values before anybody uses it.
+//!
+//! Damage to HDF5's own structures is libhdf5's to find, and its 1.10 does not survive all of it: a dataset is to come
+//! from a place that is trusted.
 
 use std::fs;
 use std::path::{Path, PathBuf};
