@@ -1,1 +1,2 @@
-//! learner
+//! The learner.
+pub mod agent;
