@@ -1,1 +1,34 @@
-//! tests
+//! Helpers of the whole-system tests, which run the real `learner` and `evaluator` as processes.
+//!
+//! # Layout
+//!
+//! In reading order:
+//!
+//! - [`process`]: start a program, signal it, wait for it, read what it said.
+//! - [`system`]: a scratch folder with a tiny dataset and preset; learners and evaluators that use them.
+//! - [`router`]: a Zenoh router in the test's own process.
+//! - [`http`]: fetch a page, read a metric.
+//! - [`peers`]: programs that are not ours; where one is missing, a test is skipped or fails.
+//!
+//! A helper that cannot do its work panics, and so fails its test.
+#![allow(clippy::unwrap_used, clippy::expect_used)]
+
+pub mod http;
+pub mod peers;
+pub mod process;
+pub mod router;
+pub mod system;
+
+use std::time::{Duration, Instant};
+
+/// Polls until `condition` gives something; panics after `patience`.
+pub fn eventually<T>(what: &str, patience: Duration, mut condition: impl FnMut() -> Option<T>) -> T {
+    let deadline = Instant::now() + patience;
+    loop {
+        if let Some(value) = condition() {
+            return value;
+        }
+        assert!(Instant::now() < deadline, "after {patience:?} still not: {what}");
+        std::thread::sleep(Duration::from_millis(20));
+    }
+}

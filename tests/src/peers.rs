@@ -1,0 +1,47 @@
+//! Programs that are not ours: Python with packages, Prometheus.
+
+use std::path::{Path, PathBuf};
+use std::process::Command;
+
+/// Whether a missing peer fails a test (`deploy/test.sh` says so) or skips it.
+fn missing(what: &str, remedy: &str) {
+    assert!(std::env::var_os("QUAD_REQUIRE_PEERS").is_none(), "{what} is missing; {remedy}");
+    eprintln!("skipped, because {what} is missing; {remedy}");
+}
+
+/// A Python that can import `packages`, or `None` if the test is to be skipped.
+pub fn python(packages: &[&str]) -> Option<PathBuf> {
+    let venv = Path::new(env!("CARGO_MANIFEST_DIR")).join("../.deps/venv/bin/python");
+    let python = std::env::var_os("QUAD_PYTHON").map_or(venv, PathBuf::from);
+    let imports = format!("import {}", packages.join(", "));
+    match Command::new(&python).args(["-c", &imports]).output() {
+        Ok(output) if output.status.success() => Some(python),
+        _ => {
+            missing(
+                &format!("{} with {}", python.display(), packages.join(", ")),
+                "make it with deploy/setup.sh --tests, or name another by QUAD_PYTHON",
+            );
+            None
+        }
+    }
+}
+
+/// Runs a script of tests/peers; gives what it printed.
+pub fn run_python(python: &Path, script: &str, arguments: &[&Path]) -> String {
+    let script = Path::new(env!("CARGO_MANIFEST_DIR")).join("peers").join(script);
+    let output = Command::new(python).arg(&script).args(arguments).output().expect("Python was found before");
+    let errors = String::from_utf8_lossy(&output.stderr);
+    assert!(output.status.success(), "{} ended with {}:\n{errors}", script.display(), output.status);
+    String::from_utf8_lossy(&output.stdout).into_owned()
+}
+
+/// Whether programs of Debian's package `prometheus` are there; if not, the test is to be skipped.
+pub fn has_prometheus() -> bool {
+    let found = ["prometheus", "promtool"]
+        .iter()
+        .all(|program| Command::new(program).arg("--version").output().is_ok_and(|output| output.status.success()));
+    if !found {
+        missing("Prometheus", "install it with: apt-get install --no-install-recommends prometheus");
+    }
+    found
+}

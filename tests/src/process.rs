@@ -1,0 +1,100 @@
+//! Programs under test.
+
+use std::fs::{self, File};
+use std::path::{Path, PathBuf};
+use std::process::{Child, Command, ExitStatus, Stdio};
+use std::time::{Duration, Instant};
+
+use crate::eventually;
+
+/// Where cargo put one of our programs: beside this test's own executable.
+pub fn binary(name: &str) -> PathBuf {
+    let test = std::env::current_exe().expect("a test knows its own executable");
+    // target/release/deps/test-123 → target/release/name
+    let folder = test.parent().and_then(Path::parent).expect("a test lies two folders below target/");
+    let path = folder.join(name);
+    assert!(path.exists(), "{} is missing; build it with: cargo build --release --bins", path.display());
+    path
+}
+
+/// A running program, killed when dropped. Its output goes to files; a failing test prints their ends.
+pub struct Process {
+    name: String,
+    child: Child,
+    log: PathBuf,
+    out: PathBuf,
+}
+
+impl Process {
+    /// Starts `command` with its output in `folder`, in files called after `name`.
+    pub fn start(name: &str, folder: &Path, mut command: Command) -> Process {
+        let (log, out) = (folder.join(format!("{name}.log")), folder.join(format!("{name}.out")));
+        let file = |path: &Path| File::create(path).expect("the scratch folder is writable");
+        command.stdin(Stdio::null()).stdout(file(&out)).stderr(file(&log));
+        let child = command.spawn().unwrap_or_else(|error| panic!("cannot start {command:?}: {error}"));
+        Process { name: name.to_owned(), child, log, out }
+    }
+
+    /// What it wrote to stderr so far.
+    pub fn log(&self) -> String {
+        fs::read_to_string(&self.log).unwrap_or_default()
+    }
+
+    /// What it wrote to stdout so far.
+    pub fn out(&self) -> String {
+        fs::read_to_string(&self.out).unwrap_or_default()
+    }
+
+    /// Waits for a line in its log that contains `text`, and gives the line.
+    pub fn wait_for_log(&self, text: &str, patience: Duration) -> String {
+        let what = format!("{:?} in the log of {}", text, self.name);
+        eventually(&what, patience, || self.log().lines().find(|line| line.contains(text)).map(str::to_owned))
+    }
+
+    /// Sends a signal by its name, e.g. `TERM` or `KILL`.
+    pub fn signal(&self, signal: &str) {
+        // The shell's own `kill`: a slim Debian has no program of that name.
+        let command = format!("kill -{signal} {}", self.child.id());
+        let status = Command::new("sh").args(["-c", &command]).status().expect("there is a shell");
+        assert!(status.success(), "{command}: {status}");
+    }
+
+    /// Kills it at once, as a power cut would.
+    pub fn kill(&mut self) {
+        self.child.kill().expect("a child can be killed");
+        self.child.wait().expect("a child can be waited for");
+    }
+
+    /// Whether it runs.
+    pub fn is_running(&mut self) -> bool {
+        self.child.try_wait().expect("a child can be waited for").is_none()
+    }
+
+    /// Waits for its end.
+    pub fn wait(&mut self, patience: Duration) -> ExitStatus {
+        let what = format!("{} ended", self.name);
+        eventually(&what, patience, || self.child.try_wait().expect("a child can be waited for"))
+    }
+
+    /// Tells it to leave; how long that took, and how it ended.
+    pub fn terminate(&mut self, patience: Duration) -> (Duration, ExitStatus) {
+        let start = Instant::now();
+        self.signal("TERM");
+        let status = self.wait(patience);
+        (start.elapsed(), status)
+    }
+}
+
+impl Drop for Process {
+    fn drop(&mut self) {
+        self.child.kill().ok();
+        self.child.wait().ok();
+        if std::thread::panicking() {
+            for (kind, text) in [("stderr", self.log()), ("stdout", self.out())] {
+                let lines: Vec<_> = text.lines().collect();
+                let end = &lines[lines.len().saturating_sub(40)..];
+                eprintln!("--- {} {kind}, last {} of {} lines\n{}", self.name, end.len(), lines.len(), end.join("\n"));
+            }
+        }
+    }
+}

@@ -1,0 +1,78 @@
+//! What scripts rely on: exit codes, hints, help.
+#![allow(clippy::unwrap_used, clippy::expect_used)]
+
+use std::process::{Command, Output};
+use std::time::Duration;
+
+use quad_tests::process::binary;
+use quad_tests::system::{Scratch, Setting};
+
+fn run(program: &str, arguments: &[&str]) -> Output {
+    Command::new(binary(program)).args(arguments).output().unwrap()
+}
+
+#[test]
+fn help_says_what_there_is() {
+    for (program, arguments, words) in [
+        ("learner", &["--help"][..], &["train", "report"][..]),
+        (
+            "learner",
+            &["train", "--help"],
+            &["--preset", "--dataset", "--run-dir", "--guidance", "--listen", "--connect"],
+        ),
+        ("evaluator", &["--help"], &["serve", "collect", "verify-dataset"]),
+        ("evaluator", &["serve", "--help"], &["--connect", "--metrics", "tcp/127.0.0.1:7447"]),
+    ] {
+        let output = run(program, arguments);
+        let text = String::from_utf8_lossy(&output.stdout);
+        assert_eq!(output.status.code(), Some(0), "{program} {arguments:?}");
+        for word in words {
+            assert!(text.contains(word), "{word} is not in {program} {arguments:?}:\n{text}");
+        }
+    }
+}
+
+#[test]
+fn a_wrong_command_line_exits_with_2() {
+    for (program, arguments) in [
+        ("learner", &[][..]),
+        ("learner", &["train"]),
+        ("learner", &["train", "--preset", "nobody-has-this", "--dataset", "x"]),
+        ("learner", &["train", "--preset", "hopper-demo", "--dataset", "x", "--guidance", "sac"]),
+        ("evaluator", &[]),
+        ("evaluator", &["serve", "--name", "not a name"]),
+        ("evaluator", &["serve", "--metrics", "everywhere"]),
+        ("evaluator", &["serve", "--connect", "127.0.0.1:7447"]),
+        ("evaluator", &["collect", "--env", "hopper"]),
+    ] {
+        let output = run(program, arguments);
+        let text = String::from_utf8_lossy(&output.stderr);
+        assert_eq!(output.status.code(), Some(2), "{program} {arguments:?}: {text}");
+    }
+}
+
+#[test]
+fn a_missing_dataset_fails_with_a_hint() {
+    let folder = tempfile::tempdir().unwrap();
+    let (run_dir, dataset) = (folder.path().join("run"), folder.path().join("missing.hdf5"));
+    let (run_dir, dataset) = (run_dir.to_str().unwrap(), dataset.to_str().unwrap());
+    for (program, arguments) in [
+        ("learner", &["train", "--preset", "hopper-demo", "--dataset", dataset, "--run-dir", run_dir][..]),
+        ("evaluator", &["verify-dataset", dataset]),
+    ] {
+        let output = run(program, arguments);
+        let text = String::from_utf8_lossy(&output.stderr);
+        assert_eq!(output.status.code(), Some(1), "{program} {arguments:?}: {text}");
+        assert!(text.contains(dataset) && text.contains("hint:"), "{program} {arguments:?}: {text}");
+    }
+}
+
+#[test]
+fn a_learner_without_evaluations_waits_for_nobody() {
+    let scratch = Scratch::new();
+    let mut learner = scratch.learner_with("alone", Setting::default(), &["--eval-interval", "0"]);
+    let status = learner.process.wait(Duration::from_secs(30));
+    assert!(status.success(), "the learner ended with {status}");
+    assert!(learner.scores().is_empty());
+    assert!(learner.snapshot(Setting::default().steps).exists(), "the last snapshot is kept");
+}
