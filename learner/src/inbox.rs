@@ -1,0 +1,102 @@
+//! How messages from Zenoh's threads reach the thread that owns the state. A callback that worked or waited would hold
+//! up every other key of the session, so it only puts the message here, and what does not fit is turned away.
+
+use std::sync::Arc;
+use std::sync::atomic::{AtomicUsize, Ordering};
+use std::sync::mpsc::{self, Receiver, RecvTimeoutError, Sender};
+use std::time::Duration;
+
+/// Messages from the wire that may wait. Together with `MOST_BYTES` it bounds what strangers can make the learner hold.
+const MOST_WAITING: usize = 256;
+/// Largest payload of a message to the learner; a score report of a job is a few hundred bytes.
+pub const MOST_BYTES: usize = 256 * 1024;
+
+/// The sending side. Clones share the bound.
+#[derive(Debug)]
+pub struct Inbox<T> {
+    sender: Sender<Envelope<T>>,
+    waiting: Arc<AtomicUsize>,
+}
+
+// Not derived, because that would ask for `T: Clone`.
+impl<T> Clone for Inbox<T> {
+    fn clone(&self) -> Self {
+        Self { sender: self.sender.clone(), waiting: self.waiting.clone() }
+    }
+}
+
+/// The receiving side.
+#[derive(Debug)]
+pub struct Messages<T> {
+    receiver: Receiver<Envelope<T>>,
+    waiting: Arc<AtomicUsize>,
+}
+
+#[derive(Debug)]
+struct Envelope<T> {
+    message: T,
+    from_wire: bool,
+}
+
+/// A queue whose wire side is bounded.
+pub fn inbox<T>() -> (Inbox<T>, Messages<T>) {
+    let (sender, receiver) = mpsc::channel();
+    let waiting = Arc::new(AtomicUsize::new(0));
+    (Inbox { sender, waiting: waiting.clone() }, Messages { receiver, waiting })
+}
+
+impl<T> Inbox<T> {
+    /// From inside this process: always accepted, never blocks. After the receiver's end it does nothing.
+    pub fn send(&self, message: T) {
+        self.sender.send(Envelope { message, from_wire: false }).ok();
+    }
+
+    /// From the wire: given back if too many wait already. Never blocks.
+    pub fn offer(&self, message: T) -> Result<(), T> {
+        if self.waiting.fetch_add(1, Ordering::Relaxed) >= MOST_WAITING {
+            self.waiting.fetch_sub(1, Ordering::Relaxed);
+            return Err(message);
+        }
+        self.sender.send(Envelope { message, from_wire: true }).map_err(|unsent| unsent.0.message)
+    }
+}
+
+impl<T> Messages<T> {
+    /// The next message, or `None` after `timeout`, or `Disconnected` when nobody can send any more.
+    pub fn next(&self, timeout: Duration) -> Result<Option<T>, Disconnected> {
+        match self.receiver.recv_timeout(timeout) {
+            Ok(envelope) => {
+                if envelope.from_wire {
+                    self.waiting.fetch_sub(1, Ordering::Relaxed);
+                }
+                Ok(Some(envelope.message))
+            }
+            Err(RecvTimeoutError::Timeout) => Ok(None),
+            Err(RecvTimeoutError::Disconnected) => Err(Disconnected),
+        }
+    }
+}
+
+/// Nobody can send any more.
+#[derive(Debug, PartialEq, Eq)]
+pub struct Disconnected;
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn strangers_cannot_fill_the_queue_but_the_process_gets_through() {
+        let (inbox, messages) = inbox();
+        let accepted = (0..MOST_WAITING + 10).filter(|&n| inbox.offer(n).is_ok()).count();
+        assert_eq!(accepted, MOST_WAITING);
+        inbox.send(7777);
+        let received: Vec<_> = std::iter::from_fn(|| messages.next(Duration::ZERO).unwrap()).collect();
+        assert_eq!(received.len(), MOST_WAITING + 1);
+        assert_eq!(received.last(), Some(&7777));
+        assert!(inbox.offer(1).is_ok(), "there is room again");
+        drop(inbox);
+        assert_eq!(messages.next(Duration::ZERO), Ok(Some(1)));
+        assert_eq!(messages.next(Duration::ZERO), Err(Disconnected));
+    }
+}
