@@ -1,0 +1,87 @@
+#!/usr/bin/env bash
+# The demonstration: from a file of mediocre Hopper data to a policy that hops, by a learner and two evaluators over Zenoh.
+#
+# Sets up what is missing, builds, records the dataset if it is not there, trains, and ends with the run's table and
+# learning curve. Run again, it skips what is done. Ctrl-C stops everything.
+set -euo pipefail
+cd "$(dirname "$0")/.."
+
+PRESET=hopper-demo
+DATASET=data/hopper-demo.hdf5
+RUN=runs/hopper-demo
+EVALUATORS=2
+BIN=target/release
+
+say() { echo "demo: $*" >&2; }
+die() { say "$*"; exit 1; }
+
+deploy/setup.sh
+cargo build --release --locked --package quad-learner --package quad-evaluator
+
+mkdir -p data runs
+exec 9>runs/.demo.lock
+flock --nonblock 9 || die "a demonstration is running in this clone already"
+
+if [ ! -e "$DATASET" ]; then
+  say "recording $DATASET"
+  $BIN/evaluator collect --env hopper --out "$DATASET"
+fi
+
+if [ -e "$RUN/complete" ]; then
+  $BIN/learner report "$RUN"
+  echo "learning curve: $RUN/learning_curve.svg"
+  echo "run folder: $RUN"
+  say "this run is complete; for another one, move $RUN away and run this again"
+  exit
+fi
+if [ -e "$RUN" ]; then
+  aside=$RUN.interrupted-$(date +%Y%m%d-%H%M%S)
+  mv "$RUN" "$aside"
+  say "an earlier run did not reach its end: it is now $aside, and a new one begins"
+fi
+mkdir "$RUN"
+
+learner=
+evaluators=()
+names=()
+
+# Ends what still runs; also when this script is interrupted at any point.
+stop() {
+  local running
+  trap '' INT TERM
+  mapfile -t running < <(jobs -rp)
+  [ ${#running[@]} -eq 0 ] || kill -TERM "${running[@]}" 2>/dev/null || true
+  wait
+}
+trap stop EXIT
+trap 'exit 130' INT
+trap 'exit 143' TERM
+
+# Ports are chosen by the system; endpoints.json says which.
+$BIN/learner train --preset $PRESET --dataset $DATASET --run-dir "$RUN" --listen tcp/127.0.0.1:0 9>&- &
+learner=$!
+until [ -e "$RUN/endpoints.json" ]; do
+  kill -0 $learner 2>/dev/null || wait $learner
+  sleep 0.1
+done
+endpoint=$(grep -o 'tcp/[^"]*' "$RUN/endpoints.json" | head -n 1)
+
+for ((i = 1; i <= EVALUATORS; i++)); do
+  $BIN/evaluator serve --name "evaluator-$i" --connect "$endpoint" >"$RUN/evaluator-$i.log" 2>&1 9>&- &
+  evaluators+=($!)
+  names[$!]=evaluator-$i
+done
+say "evaluators write to $RUN/evaluator-*.log"
+
+while true; do
+  status=0
+  wait -n -p ended "$learner" "${evaluators[@]}" || status=$?
+  [ "$ended" != "$learner" ] || break
+  say "${names[$ended]} ended with status $status; see $RUN/${names[$ended]}.log"
+  unset "names[$ended]"
+  evaluators=("${!names[@]}")
+  [ ${#evaluators[@]} -gt 0 ] || die "no evaluator is left"
+done
+
+[ $status -ne 0 ] || touch "$RUN/complete"
+exit $status
