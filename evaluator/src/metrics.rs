@@ -78,7 +78,10 @@ impl Metrics {
             runs: IntGauge::new("quad_evaluator_runs", "Runs that are being served")?,
             jobs: IntCounterVec::new(Opts::new("quad_evaluator_jobs_total", "Jobs by how they ended"), &["outcome"])?,
             rejected_messages: IntCounterVec::new(
-                Opts::new("quad_evaluator_rejected_messages_total", "Messages from the wire that were not used, by reason"),
+                Opts::new(
+                    "quad_evaluator_rejected_messages_total",
+                    "Messages from the wire that were not used, by reason",
+                ),
                 &["reason"],
             )?,
             registry,

@@ -13,7 +13,7 @@ use crate::metrics::{JobOutcome, Metrics};
 use crate::rollout::{EpisodeOutcome, Rollout};
 
 /// Most rows (episodes × candidates) of one network call; they bound an evaluator's memory. The paper's job has 100.
-const MAX_ROWS: usize = 16_384;
+const MAX_ROWS: usize = 65_536;
 
 /// Why a job is not run.
 #[derive(Debug, thiserror::Error)]

@@ -48,7 +48,7 @@ RAYON_NUM_THREADS bounds the processor cores that are used; without it, all are.
 #[command(after_help = AFTER_HELP)]
 pub struct ServeArgs {
     /// Zenoh endpoint of a learner or a router; may be given several times
-    #[arg(long, value_name = "ENDPOINT", default_value = "tcp/127.0.0.1:7447")]
+    #[arg(long, value_name = "ENDPOINT", default_value = "tcp/127.0.0.1:7447", value_parser = parse_endpoint)]
     connect: Vec<String>,
     /// Where to serve /metrics and /healthz; port 0 takes a free one
     #[arg(long, value_name = "ADDR:PORT")]
@@ -98,6 +98,13 @@ async fn serve_until_stopped(args: ServeArgs) -> anyhow::Result<()> {
     let (episodes, steps) = (metrics.episodes.get(), metrics.environment_steps.get());
     info!(episodes, steps, "leaving");
     result
+}
+
+fn parse_endpoint(text: &str) -> Result<String, String> {
+    match text.parse::<zenoh::config::EndPoint>() {
+        Ok(_) => Ok(text.to_owned()),
+        Err(_) => Err("write it like Zenoh does, e.g. tcp/127.0.0.1:7447".to_owned()),
+    }
 }
 
 /// Host and process for people, a random part because containers share both.

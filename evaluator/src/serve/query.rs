@@ -60,7 +60,11 @@ pub async fn ask<A: Message>(
             },
             Err(error) => {
                 let text = error.payload().to_bytes();
-                warn!(key, "the learner answered with an error: {}", String::from_utf8_lossy(&text[..text.len().min(200)]));
+                warn!(
+                    key,
+                    "the learner answered with an error: {}",
+                    String::from_utf8_lossy(&text[..text.len().min(200)])
+                );
             }
         }
     }

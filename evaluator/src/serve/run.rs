@@ -110,7 +110,7 @@ impl RunClient {
 
     /// The snapshot that `job` names: as it was published, or asked for where that was missed.
     pub async fn snapshot(&self, job: &Job) -> Result<Arc<Snapshot>, AskError> {
-        if let Some(snapshot) = self.weights.get(&job.weights) {
+        if let Some(snapshot) = self.weights.get(job) {
             return Ok(snapshot);
         }
         let key = keys::weights_at(&self.run, job.step);

@@ -4,7 +4,7 @@ use std::sync::{Arc, Mutex, PoisonError};
 
 use quad_dataset::environment;
 use quad_policy::{Architecture, PolicyError, TargetPolicy};
-use quad_protocol::{Hash, Job, Name, Schema, Snapshot, decode, keys};
+use quad_protocol::{Job, Name, Schema, Snapshot, decode, keys};
 use tokio::sync::Notify;
 use tokio::task::JoinSet;
 use tracing::warn;
@@ -77,15 +77,19 @@ fn same<T: PartialEq + ToString>(field: &'static str, wanted: &T, found: &T) -> 
 
 /// The shapes that `schema` promises, if they suit its environment.
 fn architecture(schema: &Schema) -> Result<Architecture, WeightsError> {
-    let spec = environment::find(&schema.environment)
-        .map_err(|_| WeightsError::Environment(schema.environment.clone()))?;
+    let spec =
+        environment::find(&schema.environment).map_err(|_| WeightsError::Environment(schema.environment.clone()))?;
     let exactly = |field, found: u32, wanted: usize| {
         let fits = found as usize == wanted;
         if fits { Ok(wanted) } else { Err(WeightsError::Schema { field, found, wanted: wanted.to_string() }) }
     };
     let at_most = |field, found: u32, most: u32| {
         let fits = (1..=most).contains(&found);
-        if fits { Ok(found as usize) } else { Err(WeightsError::Schema { field, found, wanted: format!("1..={most}") }) }
+        if fits {
+            Ok(found as usize)
+        } else {
+            Err(WeightsError::Schema { field, found, wanted: format!("1..={most}") })
+        }
     };
     Ok(Architecture {
         observation_dim: exactly("observation_dim", schema.observation_dim, spec.observation_dim)?,
@@ -138,9 +142,11 @@ impl NewestWeights {
         Ok(NewestWeights { newest, _listener: listener })
     }
 
-    /// The snapshot with this hash, if it is the newest.
-    pub fn get(&self, hash: &Hash) -> Option<Arc<Snapshot>> {
-        let newest = self.newest.lock().unwrap_or_else(PoisonError::into_inner);
-        newest.as_ref().filter(|snapshot| snapshot.hash == *hash).cloned()
+    /// The snapshot that `job` names, if it is the newest. Of another life of the learner it is another one.
+    pub fn get(&self, job: &Job) -> Option<Arc<Snapshot>> {
+        let named = |snapshot: &&Arc<Snapshot>| {
+            (snapshot.epoch, snapshot.step, snapshot.hash) == (job.epoch, job.step, job.weights)
+        };
+        self.newest.lock().unwrap_or_else(PoisonError::into_inner).as_ref().filter(named).cloned()
     }
 }

@@ -58,7 +58,8 @@ impl Worker {
         loop {
             self.follow_discovery().await;
             let now = Instant::now();
-            let due = |key: &&RunKey| self.is_there(key) && self.runs.get(*key).is_some_and(|run| run.ready_at() <= now);
+            let due =
+                |key: &&RunKey| self.is_there(key) && self.runs.get(*key).is_some_and(|run| run.ready_at() <= now);
             match self.turns.iter().find(due).cloned() {
                 Some(key) => self.turn(key).await,
                 None => {
