@@ -199,7 +199,8 @@ impl Agent {
         let (critic_loss, critic_gradient_norm) = self.update_critics(batch, noise, decay);
         let actor = self.update_actor(batch, noise, decay);
         self.state.step += 1;
-        if self.state.step.is_multiple_of(self.config.actor_ema_every) && self.state.step > self.config.actor_ema_start {
+        if self.state.step.is_multiple_of(self.config.actor_ema_every) && self.state.step > self.config.actor_ema_start
+        {
             ema(&mut self.state.target.actor, &self.state.online.actor, self.config.ema_rate);
         }
         let targets = &self.seen.targets;
@@ -331,8 +332,7 @@ impl Agent {
         seen.values.resize(critics * rows, 0.0);
         let data = StateActions { observations, actions: &batch.actions, repeat: 1 };
         self.critics.values(&state.target.critics, data, &mut seen.values);
-        let mean_over_critics =
-            |i: usize| seen.values.iter().skip(i).step_by(rows).sum::<f32>() / critics as f32;
+        let mean_over_critics = |i: usize| seen.values.iter().skip(i).step_by(rows).sum::<f32>() / critics as f32;
         seen.q_scale = (0..rows).map(|i| mean_over_critics(i).abs()).sum::<f32>() / rows as f32 + 1e-6;
 
         seen.action_gradients.resize(critics * rows * action_dim, 0.0);

@@ -29,13 +29,7 @@ impl NoiseSource {
     pub fn new(config: &AgentConfig, action_dim: usize, seed: u64) -> Self {
         let mut generator = ChaCha8Rng::seed_from_u64(seed);
         generator.set_stream(2);
-        Self {
-            generator,
-            batch: config.batch_size,
-            samples: config.samples,
-            steps: config.diffusion_steps,
-            action_dim,
-        }
+        Self { generator, batch: config.batch_size, samples: config.samples, steps: config.diffusion_steps, action_dim }
     }
 
     /// Draws for the next update.
