@@ -42,15 +42,13 @@ fi
 mkdir "$RUN"
 
 learner=
-evaluators=()
-names=()
+evaluators=() # process ids
+names=()      # by process id
 
-# Ends what still runs; also when this script is interrupted at any point.
+# Ends what still runs, also when this script is interrupted.
 stop() {
-  local running
   trap '' INT TERM
-  mapfile -t running < <(jobs -rp)
-  [ ${#running[@]} -eq 0 ] || kill -TERM "${running[@]}" 2>/dev/null || true
+  kill -TERM $learner "${evaluators[@]}" 2>/dev/null || true
   wait
 }
 trap stop EXIT
@@ -83,5 +81,8 @@ while true; do
   [ ${#evaluators[@]} -gt 0 ] || die "no evaluator is left"
 done
 
-[ $status -ne 0 ] || touch "$RUN/complete"
-exit $status
+if [ "$status" -ne 0 ]; then
+  say "the learner ended with status $status; run this again to begin anew"
+  exit "$status"
+fi
+touch "$RUN/complete"
