@@ -1,1 +1,32 @@
-//! protocol
+//! What crosses the wire between a learner and its evaluators.
+//!
+//! # Layout
+//!
+//! In reading order:
+//!
+//! - `name`: what runs and evaluators may be called; `hash`: how weights are identified.
+//! - [`keys`]: where on Zenoh each message is found.
+//! - `snapshot`: weights, from the learner to evaluators.
+//! - `job`: an evaluator asks for work and gets some.
+//! - `progress`: an evaluator tells how far it is.
+//! - `score`: an evaluator delivers, the learner acknowledges and tells everybody.
+//! - `codec`: messages to bytes and back; the only place that knows the encoding.
+//!
+//! Nothing here knows what the weights mean or how episodes are simulated.
+
+mod codec;
+mod hash;
+mod job;
+pub mod keys;
+mod name;
+mod progress;
+mod score;
+mod snapshot;
+
+pub use codec::{CodecError, Message, PROTOCOL_VERSION, decode, encode};
+pub use hash::{Hash, InvalidHash};
+pub use job::{Job, JobReply, JobRequest};
+pub use name::{InvalidName, Name};
+pub use progress::Progress;
+pub use score::{EpisodeScore, RecordedScores, ScoreReply, ScoreReport};
+pub use snapshot::{Schema, Snapshot};

@@ -1,0 +1,220 @@
+//! Messages to bytes and back; the only place that knows the encoding.
+//!
+//! A frame is the four bytes `QUAD`, the protocol version (u16), the message's kind (u8) and its fields in order of
+//! declaration, without padding: integers and floats little-endian at their own width, texts and lists with their
+//! length (u64) before them, an enumeration with its variant's index (u32) before its fields. (It is bincode with
+//! fixed-width integers.)
+//!
+//! Bytes may come from anybody: whatever they are, [`decode`] gives a message that keeps all rules or a typed error.
+//! A frame of up to 1 MiB never makes it allocate more than 4 MiB at once, a larger one never more than 64 MiB.
+
+use bincode::config::{Configuration, Fixint, LittleEndian};
+use bincode::de::Decoder;
+use bincode::enc::Encoder;
+use bincode::error::{DecodeError, EncodeError};
+
+pub(crate) use bincode::{Decode, Encode};
+
+use crate::{Hash, JobReply, JobRequest, Name, Progress, RecordedScores, ScoreReply, ScoreReport, Snapshot};
+
+/// Version of keys, messages and encoding. Frames of another version are refused.
+pub const PROTOCOL_VERSION: u16 = 1;
+
+const MAGIC: &[u8; 4] = b"QUAD";
+const HEADER_LENGTH: usize = MAGIC.len() + size_of::<u16>() + size_of::<u8>();
+
+/// Largest frame without tensors: tens of thousands of episodes fit.
+const SMALL: usize = 1 << 20;
+/// Largest frame with tensors; the paper's networks take a tenth of it.
+const LARGE: usize = 64 << 20;
+/// Most bytes that one byte of a small frame may honestly take in memory: an empty text in a list has 24 for its 8.
+const MEMORY_PER_WIRE_BYTE: usize = 4;
+
+const FIXED: Configuration<LittleEndian, Fixint> = bincode::config::standard().with_fixed_int_encoding();
+
+/// What can be sent: a frame of a kind of its own.
+pub trait Message: Encode + Decode<()> {
+    /// Identifies the message within a frame.
+    const KIND: u8;
+    /// Largest frame, bytes.
+    const LIMIT: usize = SMALL;
+
+    /// What the encoding alone does not ensure.
+    fn verify(&self) -> Result<(), CodecError> {
+        Ok(())
+    }
+}
+
+impl Message for Snapshot {
+    const KIND: u8 = 1;
+    const LIMIT: usize = LARGE;
+
+    fn verify(&self) -> Result<(), CodecError> {
+        let found = Hash::of(&self.tensors);
+        if found == self.hash { Ok(()) } else { Err(CodecError::Hash { claimed: self.hash, found }) }
+    }
+}
+
+impl Message for JobRequest {
+    const KIND: u8 = 2;
+}
+
+impl Message for JobReply {
+    const KIND: u8 = 3;
+}
+
+impl Message for ScoreReport {
+    const KIND: u8 = 4;
+}
+
+impl Message for ScoreReply {
+    const KIND: u8 = 5;
+}
+
+impl Message for RecordedScores {
+    const KIND: u8 = 6;
+}
+
+impl Message for Progress {
+    const KIND: u8 = 7;
+}
+
+/// Why bytes are not the expected message, or a message cannot be sent.
+#[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
+pub enum CodecError {
+    /// The bytes do not start like a frame.
+    #[error("this is no QUAD message")]
+    NotQuad,
+    /// The sender speaks another version.
+    #[error("the message has protocol version {theirs}, this program speaks {ours}: update the older of the two")]
+    Version {
+        /// Version of the message.
+        theirs: u16,
+        /// Version of this program.
+        ours: u16,
+    },
+    /// It is another message.
+    #[error("the message is of kind {found}, kind {expected} belongs here")]
+    Kind {
+        /// Kind of the message.
+        found: u8,
+        /// Kind that was expected.
+        expected: u8,
+    },
+    /// The end is missing.
+    #[error("the message is cut off")]
+    Truncated,
+    /// It is larger than any honest message of its kind.
+    #[error("the message has {length} bytes, at most {limit} are allowed")]
+    Oversized {
+        /// Length of the frame, bytes.
+        length: usize,
+        /// Largest frame of this kind, bytes.
+        limit: usize,
+    },
+    /// Something follows the message.
+    #[error("{0} bytes follow the message")]
+    Trailing(usize),
+    /// A field has a value that it cannot have.
+    #[error("the message is malformed: {0}")]
+    Malformed(String),
+    /// The tensors are not those that the hash was made of.
+    #[error("the tensors have the hash {found}, not {claimed} as the message says")]
+    Hash {
+        /// What the message says.
+        claimed: Hash,
+        /// What its tensors give.
+        found: Hash,
+    },
+}
+
+impl CodecError {
+    /// The variant, as a metric's label.
+    pub fn label(&self) -> &'static str {
+        match self {
+            CodecError::NotQuad => "not_quad",
+            CodecError::Version { .. } => "version",
+            CodecError::Kind { .. } => "kind",
+            CodecError::Truncated => "truncated",
+            CodecError::Oversized { .. } => "oversized",
+            CodecError::Trailing(_) => "trailing",
+            CodecError::Malformed(_) => "malformed",
+            CodecError::Hash { .. } => "hash",
+        }
+    }
+}
+
+/// The frame of `message`.
+///
+/// # Errors
+///
+/// [`CodecError::Oversized`]: nobody would accept the frame.
+pub fn encode<M: Message>(message: &M) -> Result<Vec<u8>, CodecError> {
+    let frame = bincode::encode_to_vec((MAGIC, PROTOCOL_VERSION, M::KIND, message), FIXED)
+        .map_err(|error| CodecError::Malformed(error.to_string()))?;
+    if frame.len() > M::LIMIT {
+        return Err(CodecError::Oversized { length: frame.len(), limit: M::LIMIT });
+    }
+    Ok(frame)
+}
+
+/// The message in `frame`, verified: its version, kind, length, every field, and a snapshot's hash.
+///
+/// # Errors
+///
+/// Any [`CodecError`], the first that is found.
+pub fn decode<M: Message>(frame: &[u8]) -> Result<M, CodecError> {
+    let Some((header, body)) = frame.split_first_chunk::<HEADER_LENGTH>() else {
+        let cut = &MAGIC[..frame.len().min(MAGIC.len())];
+        return Err(if frame.starts_with(cut) { CodecError::Truncated } else { CodecError::NotQuad });
+    };
+    let [magic @ .., version_low, version_high, kind] = header;
+    let version = u16::from_le_bytes([*version_low, *version_high]);
+    if magic != MAGIC {
+        return Err(CodecError::NotQuad);
+    }
+    if version != PROTOCOL_VERSION {
+        return Err(CodecError::Version { theirs: version, ours: PROTOCOL_VERSION });
+    }
+    if *kind != M::KIND {
+        return Err(CodecError::Kind { found: *kind, expected: M::KIND });
+    }
+    if frame.len() > M::LIMIT {
+        return Err(CodecError::Oversized { length: frame.len(), limit: M::LIMIT });
+    }
+    // Bincode allocates what a length field claims before it reads; the limit bounds that.
+    let (message, length) = if frame.len() <= SMALL {
+        bincode::decode_from_slice::<M, _>(body, FIXED.with_limit::<{ SMALL * MEMORY_PER_WIRE_BYTE }>())
+    } else {
+        bincode::decode_from_slice::<M, _>(body, FIXED.with_limit::<LARGE>())
+    }
+    .map_err(body_error)?;
+    if length < body.len() {
+        return Err(CodecError::Trailing(body.len() - length));
+    }
+    message.verify()?;
+    Ok(message)
+}
+
+fn body_error(error: DecodeError) -> CodecError {
+    match error {
+        // The limits are never below what the frame's own bytes can hold, so more was claimed than there is.
+        DecodeError::UnexpectedEnd { .. } | DecodeError::LimitExceeded => CodecError::Truncated,
+        DecodeError::OtherString(text) => CodecError::Malformed(text),
+        other => CodecError::Malformed(other.to_string()),
+    }
+}
+
+impl Encode for Name {
+    fn encode<E: Encoder>(&self, encoder: &mut E) -> Result<(), EncodeError> {
+        self.as_str().encode(encoder)
+    }
+}
+
+impl<Context> Decode<Context> for Name {
+    fn decode<D: Decoder<Context = Context>>(decoder: &mut D) -> Result<Name, DecodeError> {
+        Name::new(String::decode(decoder)?).map_err(|error| DecodeError::OtherString(error.to_string()))
+    }
+}
+
+bincode::impl_borrow_decode!(Name);

@@ -1,0 +1,128 @@
+//! Where on Zenoh each message is found: everything of a run lies under `quad/<run>/`.
+//!
+//! | key | verb | message |
+//! |---|---|---|
+//! | `quad/<run>/weights` | learner publishes | [`Snapshot`](crate::Snapshot) |
+//! | `quad/<run>/weights/<step>` | learner answers | nothing → [`Snapshot`](crate::Snapshot) |
+//! | `quad/<run>/jobs` | learner answers | [`JobRequest`](crate::JobRequest) → [`JobReply`](crate::JobReply) |
+//! | `quad/<run>/scores` | learner answers | [`ScoreReport`](crate::ScoreReport) → [`ScoreReply`](crate::ScoreReply) |
+//! | `quad/<run>/scores/<step>` | learner publishes | [`RecordedScores`](crate::RecordedScores) |
+//! | `quad/<run>/progress/<evaluator>` | evaluator publishes | [`Progress`](crate::Progress) |
+//! | `quad/<run>/live/learner` | learner's liveliness token | |
+//! | `quad/<run>/live/evaluator/<evaluator>` | evaluator's liveliness token | |
+
+use crate::Name;
+
+/// Key expression of the liveliness tokens of all runs' learners.
+pub const ALL_LEARNERS: &str = "quad/*/live/learner";
+
+/// The newest weights, as they are published.
+pub fn weights(run: &Name) -> String {
+    format!("quad/{run}/weights")
+}
+
+/// The weights after `step` gradient steps, for whoever asks.
+pub fn weights_at(run: &Name, step: u64) -> String {
+    format!("quad/{run}/weights/{step}")
+}
+
+/// Key expression of [`weights_at`] any step.
+pub fn weights_at_any_step(run: &Name) -> String {
+    format!("quad/{run}/weights/*")
+}
+
+/// Where evaluators ask for work.
+pub fn jobs(run: &Name) -> String {
+    format!("quad/{run}/jobs")
+}
+
+/// Where evaluators deliver scores.
+pub fn scores(run: &Name) -> String {
+    format!("quad/{run}/scores")
+}
+
+/// Scores of the weights after `step` gradient steps, as they are recorded.
+pub fn scores_at(run: &Name, step: u64) -> String {
+    format!("quad/{run}/scores/{step}")
+}
+
+/// How far one evaluator is.
+pub fn progress(run: &Name, evaluator: &Name) -> String {
+    format!("quad/{run}/progress/{evaluator}")
+}
+
+/// Key expression of the [`progress`] of all evaluators.
+pub fn all_progress(run: &Name) -> String {
+    format!("quad/{run}/progress/*")
+}
+
+/// The learner's liveliness token.
+pub fn live_learner(run: &Name) -> String {
+    format!("quad/{run}/live/learner")
+}
+
+/// An evaluator's liveliness token.
+pub fn live_evaluator(run: &Name, evaluator: &Name) -> String {
+    format!("quad/{run}/live/evaluator/{evaluator}")
+}
+
+/// Key expression of the tokens of all evaluators of a run.
+pub fn all_evaluators(run: &Name) -> String {
+    format!("quad/{run}/live/evaluator/*")
+}
+
+/// The run that `key` belongs to; `None` if it is no key of ours.
+pub fn run_of(key: &str) -> Option<Name> {
+    let (run, _) = key.strip_prefix("quad/")?.split_once('/')?;
+    Name::new(run).ok()
+}
+
+/// The evaluator that a progress or liveliness `key` belongs to.
+pub fn evaluator_of(key: &str) -> Option<Name> {
+    let run = run_of(key)?;
+    let rest = key.strip_prefix("quad/")?.strip_prefix(run.as_str())?;
+    let evaluator = rest.strip_prefix("/progress/").or_else(|| rest.strip_prefix("/live/evaluator/"))?;
+    Name::new(evaluator).ok()
+}
+
+/// The step that a key of [`weights_at`] or [`scores_at`] names.
+pub fn step_of(key: &str) -> Option<u64> {
+    let run = run_of(key)?;
+    let rest = key.strip_prefix("quad/")?.strip_prefix(run.as_str())?;
+    let step = rest.strip_prefix("/weights/").or_else(|| rest.strip_prefix("/scores/"))?;
+    step.parse().ok()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn keys_give_back_what_they_were_made_of() {
+        let (run, evaluator) = (Name::new("run-1").unwrap(), Name::new("box.7").unwrap());
+        for key in [weights(&run), jobs(&run), scores(&run), live_learner(&run)] {
+            assert_eq!(run_of(&key), Some(run.clone()), "{key}");
+            assert_eq!((evaluator_of(&key), step_of(&key)), (None, None), "{key}");
+        }
+        for key in [weights_at(&run, 10_000), scores_at(&run, 10_000)] {
+            assert_eq!((run_of(&key), step_of(&key)), (Some(run.clone()), Some(10_000)), "{key}");
+        }
+        for key in [progress(&run, &evaluator), live_evaluator(&run, &evaluator)] {
+            assert_eq!((run_of(&key), evaluator_of(&key)), (Some(run.clone()), Some(evaluator.clone())), "{key}");
+        }
+    }
+
+    #[test]
+    fn strangers_keys_give_nothing() {
+        for key in ["", "quad", "quad/", "quad//live", "quad/a b/live/learner", "quad/*/live/learner", "other/run/jobs"]
+        {
+            assert_eq!(run_of(key), None, "{key}");
+        }
+        for key in ["quad/run/live/evaluator/", "quad/run/live/evaluator/a/b", "quad/run/progress/*", "quad/run/x/e"] {
+            assert_eq!(evaluator_of(key), None, "{key}");
+        }
+        for key in ["quad/run/weights/", "quad/run/weights/x", "quad/run/weights/-1", "quad/run/jobs/1"] {
+            assert_eq!(step_of(key), None, "{key}");
+        }
+    }
+}

@@ -1,0 +1,75 @@
+//! What runs and evaluators may be called.
+
+use std::fmt;
+use std::str::FromStr;
+
+/// Name of a run or of an evaluator: 1 to 64 ASCII letters, digits, dots, dashes and underscores.
+///
+/// It fits into a Zenoh key, a file name and a metric's label without quoting.
+#[derive(Clone, Debug, PartialEq, Eq, PartialOrd, Ord, Hash)]
+pub struct Name(String);
+
+/// The text cannot be a [`Name`].
+#[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
+pub enum InvalidName {
+    /// It is empty or too long.
+    #[error("a name has 1 to {max} characters, not {0}", max = Name::MAX_LENGTH)]
+    Length(usize),
+    /// It has a character that is not allowed.
+    #[error("a name has only letters, digits, '.', '-' and '_', not {0:?}")]
+    Character(char),
+}
+
+impl Name {
+    /// Most characters of a name.
+    pub const MAX_LENGTH: usize = 64;
+
+    /// Checks `text` and makes it a name.
+    pub fn new(text: impl Into<String>) -> Result<Name, InvalidName> {
+        let text = text.into();
+        let allowed = |c: char| c.is_ascii_alphanumeric() || matches!(c, '.' | '-' | '_');
+        if let Some(other) = text.chars().find(|&c| !allowed(c)) {
+            return Err(InvalidName::Character(other));
+        }
+        if !(1..=Self::MAX_LENGTH).contains(&text.len()) {
+            return Err(InvalidName::Length(text.len()));
+        }
+        Ok(Name(text))
+    }
+
+    /// The name as text.
+    pub fn as_str(&self) -> &str {
+        &self.0
+    }
+}
+
+impl fmt::Display for Name {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.write_str(&self.0)
+    }
+}
+
+impl FromStr for Name {
+    type Err = InvalidName;
+
+    fn from_str(text: &str) -> Result<Name, InvalidName> {
+        Name::new(text)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn what_a_name_may_be() {
+        for text in ["a", "hopper-medium-replay-v2", "Run_1.b", &"x".repeat(64)] {
+            assert_eq!(Name::new(text).unwrap().as_str(), text);
+        }
+        assert_eq!(Name::new(""), Err(InvalidName::Length(0)));
+        assert_eq!(Name::new("x".repeat(65)), Err(InvalidName::Length(65)));
+        for character in ['/', '*', '$', ' ', '#', '?', '@', 'é', '\n', '\0'] {
+            assert_eq!(Name::new(format!("a{character}b")), Err(InvalidName::Character(character)));
+        }
+    }
+}

@@ -1,0 +1,68 @@
+//! An evaluator delivers, the learner acknowledges and tells everybody.
+
+use crate::codec::{Decode, Encode};
+use crate::{Hash, Name};
+
+/// The result of one episode.
+#[derive(Clone, Copy, Debug, PartialEq, Encode, Decode)]
+pub struct EpisodeScore {
+    /// Seed of the episode.
+    pub seed: u64,
+    /// Sum of its rewards.
+    pub episode_return: f64,
+    /// Its environment steps.
+    pub length: u32,
+    /// D4RL's normalised score: 100 · (return − random) / (expert − random).
+    pub score: f64,
+}
+
+/// An evaluator delivers the episodes of a job.
+#[derive(Clone, Debug, PartialEq, Encode, Decode)]
+pub struct ScoreReport {
+    /// Who delivers.
+    pub evaluator: Name,
+    /// The run.
+    pub run: Name,
+    /// The life of its learner that handed the job out.
+    pub epoch: u64,
+    /// The job.
+    pub job: u64,
+    /// Gradient step of the snapshot.
+    pub step: u64,
+    /// Hash of the snapshot's tensors.
+    pub weights: Hash,
+    /// The episodes.
+    pub episodes: Vec<EpisodeScore>,
+}
+
+/// The learner's answer to a [`ScoreReport`].
+#[derive(Clone, Debug, PartialEq, Eq, Encode, Decode)]
+pub enum ScoreReply {
+    /// They are on the learner's disk.
+    Recorded {
+        /// Episodes that were not known before.
+        new: u32,
+        /// Episodes that were delivered before; they count once.
+        duplicates: u32,
+    },
+    /// They are of no use; do not send them again.
+    Refused {
+        /// Why, for people.
+        reason: String,
+    },
+}
+
+/// What the learner has written down, for whoever wants to watch.
+#[derive(Clone, Debug, PartialEq, Encode, Decode)]
+pub struct RecordedScores {
+    /// The run.
+    pub run: Name,
+    /// Gradient step of the snapshot.
+    pub step: u64,
+    /// Hash of the snapshot's tensors.
+    pub weights: Hash,
+    /// Who measured.
+    pub evaluator: Name,
+    /// The episodes.
+    pub episodes: Vec<EpisodeScore>,
+}
