@@ -6,6 +6,9 @@ use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;
 use rand_distr::{Distribution, StandardNormal};
 
+/// The stream, among those of an episode's seed, that action noise is drawn from.
+const ACTION_STREAM: u64 = 2;
+
 /// The noise that one episode's actions are drawn from. A stream for each episode: its result does not depend on which
 /// other episodes shared a batch with it.
 pub struct ActionNoise(ChaCha8Rng);
@@ -14,7 +17,7 @@ impl ActionNoise {
     /// The stream of an episode's seed, apart from any other use of that seed.
     pub fn new(episode_seed: u64) -> Self {
         let mut generator = ChaCha8Rng::seed_from_u64(episode_seed);
-        generator.set_stream(1);
+        generator.set_stream(ACTION_STREAM);
         Self(generator)
     }
 
@@ -61,7 +64,7 @@ impl TargetPolicy {
     ///
     /// `observations` is `n × observation_dim`, `actions` (written) `n × action_dim`; `noise` has the stream of each
     /// state's episode. With one candidate the critics are not asked.
-    pub fn select(&self, observations: &[f32], candidates: usize, noise: &mut [&mut ActionNoise], actions: &mut [f32]) {
+    pub fn select(&self, observations: &[f32], candidates: usize, noise: &mut [ActionNoise], actions: &mut [f32]) {
         let (n, a, steps) = (noise.len(), self.architecture().action_dim, self.architecture().diffusion_steps);
         let row = candidates * a;
         let mut draws = vec![0.0; steps * n * row];

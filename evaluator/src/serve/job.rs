@@ -133,8 +133,7 @@ fn roll_out(
         let times = [rollout.select_time(), rollout.physics_time()];
         let done = rollout.episodes_done();
         rollout.step(|observations, noise, actions| {
-            let mut noise: Vec<&mut ActionNoise> = noise.iter_mut().collect();
-            policy.select(observations, candidates, &mut noise, actions);
+            policy.select(observations, candidates, noise, actions);
         });
         metrics.environment_steps.inc_by(rollout.environment_steps() - steps);
         metrics.select_seconds.inc_by((rollout.select_time() - times[0]).as_secs_f64());
