@@ -14,6 +14,9 @@ use thiserror::Error;
 /// The stream that initial states are drawn from, among those of an episode's seed.
 const RESET_STREAM: u64 = 1;
 
+/// The environments this evaluator can simulate, by name.
+pub const ENVIRONMENTS: [&str; 1] = ["hopper"];
+
 /// What one step of an environment gave.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Step {
@@ -48,6 +51,9 @@ pub trait Environment: Send {
     /// The current generalised velocities.
     fn qvel(&self) -> &[f64];
 }
+
+/// The environments that [`make`] makes.
+pub const ENVIRONMENTS: [&str; 1] = ["hopper"];
 
 /// Makes an environment. Those of one name share one compiled model, so the second costs little.
 pub fn make(spec: &EnvironmentSpec) -> Result<Box<dyn Environment>, EnvironmentError> {
