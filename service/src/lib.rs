@@ -1,1 +1,23 @@
-//! service
+//! What learner and evaluator share as services.
+//!
+//! # Layout
+//!
+//! In reading order, which is the order of a process's life:
+//!
+//! - `logging`: where log lines go.
+//! - `session`: the connection to the others, over Zenoh.
+//! - `metrics_server`: `/metrics` and `/healthz`.
+//! - `shutdown`: when to leave.
+//! - `exit`: what a person is told when it went wrong, and the exit code.
+
+mod exit;
+mod logging;
+mod metrics_server;
+mod session;
+mod shutdown;
+
+pub use exit::{Hint, run_main};
+pub use logging::init_logging;
+pub use metrics_server::{BindError, MetricsServer, serve_metrics};
+pub use session::{Endpoints, SessionError, open_session, reachable_at};
+pub use shutdown::shutdown_signal;

@@ -1,0 +1,107 @@
+//! What a person is told when it went wrong, and the exit code.
+
+use std::fmt;
+use std::io::{self, Write};
+use std::process::ExitCode;
+
+/// Adds advice to an error: what to do about it, on a line of its own.
+pub trait Hint<T> {
+    /// If this is an error, `hint` is shown below it. An error that has a hint already keeps that one, which is from
+    /// closer to the cause.
+    fn hint(self, hint: impl fmt::Display) -> anyhow::Result<T>;
+}
+
+impl<T, E: Into<anyhow::Error>> Hint<T> for Result<T, E> {
+    fn hint(self, hint: impl fmt::Display) -> anyhow::Result<T> {
+        self.map_err(|error| {
+            let error = error.into();
+            if error.is::<Hinted>() { error } else { Hinted { error, hint: hint.to_string() }.into() }
+        })
+    }
+}
+
+/// An error with advice; everything else is the error's own.
+#[derive(Debug)]
+struct Hinted {
+    error: anyhow::Error,
+    hint: String,
+}
+
+impl fmt::Display for Hinted {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        self.error.fmt(f)
+    }
+}
+
+impl std::error::Error for Hinted {
+    fn source(&self) -> Option<&(dyn std::error::Error + 'static)> {
+        self.error.source()
+    }
+}
+
+/// Runs `main`. An error is printed to stderr with its causes and hints; the exit code is then 1, otherwise 0.
+///
+/// (A wrong command line is 2, which clap sees to.)
+pub fn run_main(main: impl FnOnce() -> anyhow::Result<()>) -> ExitCode {
+    match main() {
+        Ok(()) => ExitCode::SUCCESS,
+        Err(error) => {
+            // With stderr closed, the exit code is all that can be said.
+            print(&error, &mut io::stderr().lock()).ok();
+            ExitCode::FAILURE
+        }
+    }
+}
+
+fn print(error: &anyhow::Error, to: &mut impl Write) -> io::Result<()> {
+    let mut last = String::new();
+    for (depth, cause) in error.chain().enumerate() {
+        let text = cause.to_string();
+        // Some errors quote their cause.
+        if depth == 0 {
+            writeln!(to, "error: {text}")?;
+        } else if !last.contains(&text) {
+            writeln!(to, "  because: {text}")?;
+        }
+        last = text;
+    }
+    for hinted in error.chain().filter_map(|cause| cause.downcast_ref::<Hinted>()) {
+        writeln!(to, "hint: {}", hinted.hint)?;
+    }
+    Ok(())
+}
+
+#[cfg(test)]
+mod tests {
+    use anyhow::{Context, anyhow};
+
+    use super::*;
+
+    fn printed<T>(result: anyhow::Result<T>) -> String {
+        let mut text = Vec::new();
+        print(&result.err().unwrap(), &mut text).unwrap();
+        String::from_utf8(text).unwrap()
+    }
+
+    #[test]
+    fn causes_and_the_hint_closest_to_them() {
+        let cause: Result<(), io::Error> = Err(io::Error::other("no such file"));
+        let result = cause.context("cannot read a.hdf5").hint("record it first").hint("try again");
+        let text =
+            "error: cannot learn\n  because: cannot read a.hdf5\n  because: no such file\nhint: record it first\n";
+        assert_eq!(printed(result.context("cannot learn")), text);
+    }
+
+    #[test]
+    fn a_quoted_cause_is_not_repeated() {
+        let cause = io::Error::other("in use");
+        let result: anyhow::Result<()> = Err(cause).with_context(|| "cannot listen: in use");
+        assert_eq!(printed(result), "error: cannot listen: in use\n");
+    }
+
+    #[test]
+    fn exit_codes() {
+        assert_eq!(run_main(|| Ok(())), ExitCode::SUCCESS);
+        assert_eq!(run_main(|| Err(anyhow!("an error that a test made"))), ExitCode::FAILURE);
+    }
+}

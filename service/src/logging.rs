@@ -1,0 +1,22 @@
+//! Where log lines go.
+
+use std::io::IsTerminal;
+
+use tracing_subscriber::EnvFilter;
+
+/// Without RUST_LOG: our own progress, and Zenoh's complaints (`zenoh` is the prefix of all of its crates).
+const DEFAULT_FILTER: &str = "info,zenoh=warn";
+
+/// Sends log lines to stderr, coloured on a terminal; the environment variable RUST_LOG chooses which.
+///
+/// To be called once, first thing in `main`; further calls do nothing.
+pub fn init_logging() {
+    let filter = EnvFilter::try_from_default_env().unwrap_or_else(|_| EnvFilter::new(DEFAULT_FILTER));
+    tracing_subscriber::fmt()
+        .with_env_filter(filter)
+        .with_target(false)
+        .with_writer(std::io::stderr)
+        .with_ansi(std::io::stderr().is_terminal())
+        .try_init()
+        .ok();
+}

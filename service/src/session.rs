@@ -1,0 +1,129 @@
+//! The connection to the others, over Zenoh.
+
+use std::time::Duration;
+
+use serde_json::{Value, json};
+use zenoh::{Config, Session};
+
+/// A node that is frozen, or cut off without a word, counts as gone after so long. (One that ends or is killed is
+/// noticed at once.) Half of Zenoh's default; still several missed signs of life on a machine that is busy training.
+const LEASE: Duration = Duration::from_secs(5);
+/// Largest message that is taken in, bytes: the largest snapshot that may be sent (64 MiB) and what Zenoh adds.
+const MAX_MESSAGE_SIZE: u64 = 65 << 20;
+/// First and longest pause between two tries to connect. A learner or router that comes back should not be waited for
+/// longer than it takes to notice.
+const RETRY: [Duration; 2] = [Duration::from_millis(250), Duration::from_secs(2)];
+/// A session asks itself what it listens at, so there is no network in between.
+const SELF_QUERY_TIMEOUT: Duration = Duration::from_secs(5);
+
+/// Where a session meets the others, as Zenoh's endpoints: `tcp/127.0.0.1:7447`.
+///
+/// There is no scouting: nobody is found that was not named. A session that listens is a peer, to which others connect
+/// directly; one that does not is a client of the peer or router that it connects to.
+#[derive(Clone, Debug, Default, PartialEq, Eq)]
+pub struct Endpoints {
+    /// Listen here. Port 0 takes a free one; [`reachable_at`] tells which.
+    pub listen: Vec<String>,
+    /// Connect to these. A client keeps one connection: to talk to several meeting points, open a session for each.
+    pub connect: Vec<String>,
+}
+
+/// There is no session, or it does not answer.
+#[derive(Debug, thiserror::Error)]
+pub enum SessionError {
+    /// Nothing to listen at and nothing to connect to.
+    #[error("no endpoint to listen at or to connect to")]
+    NoEndpoint,
+    /// Not an endpoint, or nothing that can be listened at.
+    #[error("cannot use the Zenoh endpoint {endpoints}: {source}")]
+    Endpoint {
+        /// The endpoints.
+        endpoints: String,
+        /// Zenoh's own words.
+        source: zenoh::Error,
+    },
+    /// The session does not tell which endpoints it has bound.
+    #[error("the Zenoh session does not tell where it listens")]
+    Unknown,
+}
+
+/// Opens a session. Needs a multi-thread tokio runtime.
+///
+/// A session that listens is there at once. A client is there as soon as it has a connection: it waits for a meeting
+/// point that has not started yet, however long, and later connects again whenever the connection is lost.
+pub async fn open_session(endpoints: &Endpoints) -> Result<Session, SessionError> {
+    if endpoints.listen.is_empty() && endpoints.connect.is_empty() {
+        return Err(SessionError::NoEndpoint);
+    }
+    let wrong = |source| SessionError::Endpoint {
+        endpoints: [&endpoints.listen[..], &endpoints.connect[..]].concat().join(", "),
+        source,
+    };
+    zenoh::open(config(endpoints).map_err(wrong)?).await.map_err(wrong)
+}
+
+fn config(endpoints: &Endpoints) -> zenoh::Result<Config> {
+    let mode = if endpoints.listen.is_empty() { "client" } else { "peer" };
+    let retry = RETRY.map(|pause| pause.as_millis() as u64);
+    let settings = [
+        ("mode", json!(mode)),
+        ("listen/endpoints", json!(endpoints.listen)),
+        ("connect/endpoints", json!(endpoints.connect)),
+        // Wait for whoever is not there yet. A client would give up at once otherwise.
+        ("connect/timeout_ms", json!(-1)),
+        ("connect/exit_on_failure", json!(false)),
+        ("connect/retry", json!({ "period_init_ms": retry[0], "period_max_ms": retry[1] })),
+        ("scouting/multicast/enabled", json!(false)),
+        ("scouting/gossip/enabled", json!(false)),
+        ("transport/link/tx/lease", json!(LEASE.as_millis() as u64)),
+        ("transport/link/rx/max_message_size", json!(MAX_MESSAGE_SIZE)),
+        // The only stable way to learn a port that the system chose. Others could read the configuration there, so it
+        // is closed where it is not needed.
+        ("adminspace/enabled", json!(endpoints.listen.iter().any(|endpoint| leaves_port_open(endpoint)))),
+    ];
+    let mut config = Config::default();
+    for (key, value) in settings {
+        config.insert_json5(key, &value.to_string())?;
+    }
+    Ok(config)
+}
+
+/// Whether the system is to choose the endpoint's port. Options may follow the address: `tcp/127.0.0.1:0#iface=lo`.
+fn leaves_port_open(endpoint: &str) -> bool {
+    endpoint.split(['?', '#']).next().is_some_and(|address| address.ends_with(":0"))
+}
+
+/// Where others meet `session`, which was opened with `endpoints`: what it listens at, with the ports that the system
+/// chose, or, if it does not listen, what it connects to.
+pub async fn reachable_at(session: &Session, endpoints: &Endpoints) -> Result<Vec<String>, SessionError> {
+    if endpoints.listen.is_empty() {
+        return Ok(endpoints.connect.clone());
+    }
+    if !endpoints.listen.iter().any(|endpoint| leaves_port_open(endpoint)) {
+        return Ok(endpoints.listen.clone());
+    }
+    let about_itself = format!("@/{}/peer", session.zid());
+    let wrong = |source| SessionError::Endpoint { endpoints: endpoints.listen.join(", "), source };
+    let replies = session.get(about_itself).timeout(SELF_QUERY_TIMEOUT).await.map_err(wrong)?;
+    let reply = replies.recv_async().await.map_err(|_| SessionError::Unknown)?;
+    let sample = reply.result().map_err(|_| SessionError::Unknown)?;
+    let description: Value = serde_json::from_slice(&sample.payload().to_bytes()).map_err(|_| SessionError::Unknown)?;
+    let locators = description["locators"].as_array().into_iter().flatten().filter_map(Value::as_str);
+    let bound: Vec<String> = locators.map(str::to_owned).collect();
+    if bound.is_empty() { Err(SessionError::Unknown) } else { Ok(bound) }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn which_ports_the_system_chooses() {
+        for endpoint in ["tcp/127.0.0.1:0", "tcp/[::1]:0", "tcp/0.0.0.0:0#iface=lo", "tcp/127.0.0.1:0?prio=1-7"] {
+            assert!(leaves_port_open(endpoint), "{endpoint}");
+        }
+        for endpoint in ["tcp/127.0.0.1:7447", "tcp/learner:10", "tcp/[::0]:7447", "tcp/127.0.0.1:7447#iface=e:0"] {
+            assert!(!leaves_port_open(endpoint), "{endpoint}");
+        }
+    }
+}
