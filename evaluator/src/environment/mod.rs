@@ -14,9 +14,6 @@ use thiserror::Error;
 /// The stream that initial states are drawn from, among those of an episode's seed.
 const RESET_STREAM: u64 = 1;
 
-/// The environments this evaluator can simulate, by name.
-pub const ENVIRONMENTS: [&str; 1] = ["hopper"];
-
 /// What one step of an environment gave.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Step {
