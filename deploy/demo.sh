@@ -65,7 +65,8 @@ done
 endpoint=$(grep -o 'tcp/[^"]*' "$RUN/endpoints.json" | head -n 1)
 
 for ((i = 1; i <= EVALUATORS; i++)); do
-  $BIN/evaluator serve --name "evaluator-$i" --connect "$endpoint" >"$RUN/evaluator-$i.log" 2>&1 9>&- &
+  $BIN/evaluator serve --name "evaluator-$i" --connect "$endpoint" --metrics 127.0.0.1:0 \
+    >"$RUN/evaluator-$i.log" 2>&1 9>&- &
   evaluators+=($!)
   names[$!]=evaluator-$i
 done

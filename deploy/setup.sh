@@ -49,6 +49,7 @@ install_packages() {
   fi
   if [ -n "$TESTS" ]; then
     python3 -c 'import ensurepip, venv' >/dev/null 2>&1 || missing+=(python3-venv)
+    have shellcheck || missing+=(shellcheck)
   fi
   [ ${#missing[@]} -gt 0 ] || return 0
 

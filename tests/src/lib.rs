@@ -9,13 +9,16 @@
 //! - [`router`]: a Zenoh router in the test's own process.
 //! - [`http`]: fetch a page, read a metric.
 //! - [`peers`]: programs that are not ours; where one is missing, a test is skipped or fails.
+//! - [`prometheus`]: one to start, and what to ask any; [`dashboard`]: what Grafana's panels ask it.
 //!
 //! A helper that cannot do its work panics, and so fails its test.
 #![allow(clippy::unwrap_used, clippy::expect_used)]
 
+pub mod dashboard;
 pub mod http;
 pub mod peers;
 pub mod process;
+pub mod prometheus;
 pub mod router;
 pub mod system;
 

@@ -7,8 +7,8 @@ use std::process::{Command, Stdio};
 use std::time::Duration;
 
 use quad_tests::process::{Process, binary};
-use quad_tests::system::{Scratch, Setting, free_port};
-use quad_tests::{eventually, http, peers};
+use quad_tests::system::{Scratch, Setting};
+use quad_tests::{eventually, http, peers, prometheus};
 use serde_json::Value;
 
 const PATIENCE: Duration = Duration::from_secs(60);
@@ -86,34 +86,17 @@ fn prometheus_scrapes_both_and_answers_for_the_score() {
     let _hidden = scratch.evaluator_with("hidden", &["--connect", &learner.endpoint()]);
     let pages = [learner.metrics(), evaluator.metrics()];
 
-    let (port, configuration) = (free_port(), scratch.path().join("prometheus.yml"));
-    let targets = format!(
-        "scrape_configs:\n- job_name: quad\n  scrape_interval: 500ms\n  scrape_timeout: 500ms\n  \
-         static_configs:\n  - targets: [\"{}\", \"{}\"]\n",
-        pages[0], pages[1]
-    );
-    fs::write(&configuration, targets).unwrap();
-    let address = format!("127.0.0.1:{port}");
-    let mut command = Command::new("prometheus");
-    command.arg(format!("--config.file={}", configuration.display()));
-    command.arg(format!("--storage.tsdb.path={}", scratch.path().join("tsdb").display()));
-    command.arg(format!("--web.listen-address={address}"));
-    let _prometheus = Process::start("prometheus", scratch.path(), command);
-    let query = |expression: &str| -> Option<f64> {
-        let (_, body) = http::get(&address, &format!("/api/v1/query?query={expression}"))?;
-        let answer: Value = serde_json::from_str(&body).ok()?;
-        answer["data"]["result"][0]["value"][1].as_str()?.parse().ok()
-    };
-    // Braces, quotes and brackets of PromQL, as a URL carries them.
-    let score = eventually("Prometheus knows the score", PATIENCE, || query("quad_learner_evaluation_score"));
+    let (_process, prometheus) = prometheus::start(&scratch, &[("quad", &pages)]);
+    let score =
+        eventually("Prometheus knows the score", PATIENCE, || prometheus.value("quad_learner_evaluation_score"));
     assert!((-10.0..150.0).contains(&score), "{score}");
     for expression in [
         "quad_evaluator_episodes_total",
-        "quad_learner_evaluator_episodes%7Bevaluator=%22seen%22%7D",
-        "quad_learner_evaluator_episodes%7Bevaluator=%22hidden%22%7D",
-        "quad_learner_evaluator_environment_steps%7Bevaluator=%22hidden%22%7D",
+        r#"quad_learner_evaluator_episodes{evaluator="seen"}"#,
+        r#"quad_learner_evaluator_episodes{evaluator="hidden"}"#,
+        r#"quad_learner_evaluator_environment_steps{evaluator="hidden"}"#,
     ] {
-        eventually(expression, PATIENCE, || query(expression).filter(|value| *value > 0.0));
+        eventually(expression, PATIENCE, || prometheus.value(expression).filter(|value| *value > 0.0));
     }
 
     for address in &pages {

@@ -1,0 +1,58 @@
+//! Prometheus: one to start, and what to ask any.
+
+use std::fs;
+use std::process::Command;
+
+use serde_json::Value;
+
+use crate::http;
+use crate::process::Process;
+use crate::system::{Scratch, free_port};
+
+/// A Prometheus somewhere.
+pub struct Prometheus {
+    /// Where it answers, e.g. `127.0.0.1:9090`.
+    pub address: String,
+}
+
+/// Starts Debian's Prometheus, which scrapes the pages of each job twice a second.
+pub fn start(scratch: &Scratch, jobs: &[(&str, &[String])]) -> (Process, Prometheus) {
+    let configuration = scratch.path().join("prometheus.yml");
+    let mut text = "scrape_configs:\n".to_owned();
+    for (job, pages) in jobs {
+        text.push_str(&format!("- job_name: {job}\n  scrape_interval: 500ms\n  scrape_timeout: 500ms\n"));
+        text.push_str(&format!("  static_configs:\n  - targets: {pages:?}\n"));
+    }
+    fs::write(&configuration, text).expect("the scratch folder is writable");
+    let address = format!("127.0.0.1:{}", free_port());
+    let mut command = Command::new("prometheus");
+    command.arg(format!("--config.file={}", configuration.display()));
+    command.arg(format!("--storage.tsdb.path={}", scratch.path().join("tsdb").display()));
+    command.arg(format!("--web.listen-address={address}"));
+    (Process::start("prometheus", scratch.path(), command), Prometheus { address })
+}
+
+impl Prometheus {
+    /// The values of an expression now, one for each series that has a finite one; nothing where nobody answers.
+    pub fn query(&self, expression: &str) -> Option<Vec<f64>> {
+        let (_, body) = http::get(&self.address, &format!("/api/v1/query?query={}", percent_encoded(expression)))?;
+        let answer: Value = serde_json::from_str(&body).ok()?;
+        assert_eq!(answer["status"], "success", "{expression}: {answer}");
+        let series = answer["data"]["result"].as_array()?;
+        let values = series.iter().filter_map(|one| one["value"][1].as_str()?.parse().ok());
+        Some(values.filter(|value: &f64| value.is_finite()).collect())
+    }
+
+    /// The value of an expression now, if it has one.
+    pub fn value(&self, expression: &str) -> Option<f64> {
+        self.query(expression)?.first().copied()
+    }
+}
+
+fn percent_encoded(text: &str) -> String {
+    let encode = |byte: u8| match byte {
+        b'a'..=b'z' | b'A'..=b'Z' | b'0'..=b'9' | b'_' => char::from(byte).to_string(),
+        _ => format!("%{byte:02X}"),
+    };
+    text.bytes().map(encode).collect()
+}
