@@ -51,8 +51,6 @@ pub struct TrainArgs {
     /// Folder of this run; its last part names the run [default: runs/PRESET-GUIDANCE-seedSEED]
     #[arg(long, value_name = "DIR")]
     pub run_dir: Option<PathBuf>,
-    #[command(flatten)]
-    overrides: OverrideArgs,
     /// Listen for evaluators here, e.g. tcp/127.0.0.1:7447, or tcp/0.0.0.0:7447 for other machines
     /// [default: tcp/127.0.0.1:7447; any free port with --eval-interval 0]
     #[arg(long, value_name = "ENDPOINT", value_parser = parse_endpoint, conflicts_with = "connect")]
@@ -63,6 +61,8 @@ pub struct TrainArgs {
     /// Serve /metrics and /healthz here; port 0 takes a free one (see DIR/endpoints.json)
     #[arg(long, value_name = "ADDR:PORT", default_value = "127.0.0.1:0")]
     pub metrics: SocketAddr,
+    #[command(flatten)]
+    overrides: OverrideArgs,
 }
 
 /// Flags that take the place of a preset's value.
@@ -83,7 +83,7 @@ struct OverrideArgs {
     seed: Option<u64>,
     /// What pulls the policy away from the data: quad (Q-gradients weighted by the critics' agreement),
     /// dac (Q-gradients as they are) or none (behaviour cloning)
-    #[arg(long, value_name = "quad|dac|none", value_parser = guidance_parser())]
+    #[arg(long, value_name = "quad|dac|none", value_parser = guidance_parser(), hide_possible_values = true)]
     guidance: Option<Guidance>,
     /// Actions sampled per next state for the critics' target
     #[arg(long, value_name = "N", value_parser = clap::value_parser!(u64).range(1..))]

@@ -197,6 +197,21 @@ impl Experiment {
         set(&mut self.agent.samples, overrides.samples);
     }
 
+    /// The figures that tell runs apart, in one line.
+    pub fn summary(&self) -> String {
+        let Self { steps, eval_interval, episodes, candidates, seed, agent, .. } = self;
+        let AgentConfig { hidden, critics, batch_size, samples, .. } = agent;
+        let guidance = guidance_name(agent.guidance);
+        let evaluations = match eval_interval {
+            0 => "no evaluations".to_owned(),
+            _ => format!("{episodes} episodes with {candidates} candidates every {eval_interval}"),
+        };
+        format!(
+            "guidance {guidance}, seed {seed}, {steps} steps of batch {batch_size}, {samples} samples, {critics} critics, \
+             {hidden} wide; {evaluations}"
+        )
+    }
+
     fn validate(&self) -> Result<(), ConfigError> {
         let range = |field, value: u64, least: u64, most: u64| {
             if (least..=most).contains(&value) {

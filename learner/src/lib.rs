@@ -1,6 +1,33 @@
-//! The learner.
+//! The learner: data in, gradient steps, snapshots out, scores in. Owns the run's truth on disk.
+//!
+//! # Layout
+//! In reading order:
+//!
+//! - [`cli`] is what can be typed, [`config`] what it resolves to: a preset with flags on top, validated once.
+//! - [`run`] goes from the command line to the exit; [`conduct`] is the main loop in between.
+//! - [`threads`] starts the threads that do the work: [`train`] (nothing but gradient steps, with [`agent`]),
+//!   [`weights`] (keeps and publishes snapshots) and [`hub`] (hands out jobs, takes scores in).
+//! - [`scoreboard`] is the hub's state without any I/O; [`seeds`] says which episodes an evaluation has.
+//! - [`wire`] declares everything on Zenoh; its callbacks fill an [`inbox`]; [`notice`] is what threads tell the loop.
+//! - [`run_dir`] is the folder of a run, [`metrics`] what Prometheus asks, [`display`] what a person sees meanwhile.
+//! - [`report`] and [`plot`] say at the end what was achieved.
+
 pub mod agent;
 pub mod cli;
+pub mod conduct;
 pub mod config;
+pub mod display;
+pub mod hub;
 pub mod inbox;
+pub mod metrics;
+pub mod notice;
+pub mod plot;
+pub mod report;
+pub mod run;
+pub mod run_dir;
+pub mod scoreboard;
 pub mod seeds;
+pub mod threads;
+pub mod train;
+pub mod weights;
+pub mod wire;

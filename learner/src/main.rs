@@ -1,2 +1,12 @@
-//! learner
-fn main() {}
+//! `learner`: see `learner --help`.
+
+use std::process::ExitCode;
+
+use clap::Parser;
+use quad_learner::cli::Cli;
+
+fn main() -> ExitCode {
+    let cli = Cli::parse();
+    quad_service::init_logging();
+    quad_service::run_main(|| quad_learner::run::run(&cli))
+}

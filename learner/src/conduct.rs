@@ -1,0 +1,210 @@
+//! The main loop of a run: brings the network up beside the threads, shows what happens, decides when it is over.
+
+use std::pin::Pin;
+use std::time::{Duration, Instant};
+
+use anyhow::anyhow;
+use quad_protocol::Name;
+use quad_service::Endpoints;
+use tokio::sync::mpsc::UnboundedReceiver;
+use tokio::time::{MissedTickBehavior, interval, timeout};
+use zenoh::Session;
+
+use crate::display::Display;
+use crate::metrics::Metrics;
+use crate::notice::Notice;
+use crate::report::Spread;
+use crate::run_dir::{RunDir, RunEndpoints};
+use crate::threads::Threads;
+use crate::train::Outcome;
+use crate::wire::Wire;
+
+/// Listening takes milliseconds; whoever needs longer is waiting for a router, and training does not.
+const SESSION_PATIENCE: Duration = Duration::from_secs(1);
+/// So long nobody is there to evaluate before a person is told what to do.
+const EVALUATOR_PATIENCE: Duration = Duration::from_secs(10);
+/// A goodbye to a network that hangs is not waited for longer.
+const CLOSE_PATIENCE: Duration = Duration::from_secs(5);
+
+/// A Zenoh session that may still wait for a router.
+pub type Opening = Pin<Box<dyn Future<Output = anyhow::Result<Session>> + Send>>;
+
+/// Starts to open the session. What cannot work, like listening at a port in use, is an error at once.
+pub async fn open_network(endpoints: &Endpoints) -> anyhow::Result<Opening> {
+    let endpoints = endpoints.clone();
+    let mut opening: Opening = Box::pin(async move { Ok(quad_service::open_session(&endpoints).await?) });
+    match timeout(SESSION_PATIENCE, &mut opening).await {
+        Ok(session) => Ok(Box::pin(std::future::ready(Ok(session?)))),
+        Err(_) => Ok(opening),
+    }
+}
+
+/// How a run ended.
+#[derive(Debug)]
+pub enum Ending {
+    /// Trained, and every score is there.
+    Complete,
+    /// Somebody asked to stop.
+    Interrupted,
+    /// It could not go on.
+    Failed(anyhow::Error),
+}
+
+/// What the loop watches over.
+pub struct Conductor {
+    /// Name of the run.
+    pub run: Name,
+    /// Its folder.
+    pub run_dir: RunDir,
+    /// Its metrics.
+    pub metrics: Metrics,
+    /// Where its metrics are served.
+    pub metrics_address: String,
+    /// Where it listens or connects, as it was asked to.
+    pub endpoints: Endpoints,
+    /// Where evaluators find it; empty until the session is there.
+    pub reachable_at: Vec<String>,
+    /// What its threads tell.
+    pub notices: UnboundedReceiver<Notice>,
+    /// Its threads.
+    pub threads: Threads,
+    /// What a person sees.
+    pub display: Display,
+}
+
+impl Conductor {
+    /// Runs until the end, then ends the threads and the session.
+    pub async fn conduct(mut self, opening: Opening) -> anyhow::Result<Ending> {
+        let mut wire = None;
+        let ending = self.watch(opening, &mut wire).await;
+        self.display.finish();
+        tokio::task::spawn_blocking(|| self.threads.join()).await??;
+        if let Some(wire) = wire {
+            // An evaluator that misses the goodbye notices the lost connection.
+            timeout(CLOSE_PATIENCE, wire.close()).await.ok();
+        }
+        Ok(ending)
+    }
+
+    async fn watch(&mut self, mut opening: Opening, wire: &mut Option<Wire>) -> Ending {
+        let mut shutdown = std::pin::pin!(quad_service::shutdown_signal());
+        let mut ticker = interval(self.display.interval());
+        ticker.set_missed_tick_behavior(MissedTickBehavior::Skip);
+        let (mut training, mut settled, mut interrupted) = (true, false, false);
+        let mut waiting = Waiting::default();
+        while training || !settled {
+            tokio::select! {
+                session = &mut opening, if wire.is_none() => match self.go_online(session).await {
+                    Ok(online) => *wire = Some(online),
+                    Err(error) => return Ending::Failed(error),
+                },
+                trained = &mut self.threads.trained, if training => {
+                    training = false;
+                    match trained {
+                        Ok(Ok(Outcome::Completed)) => self.training_completed(),
+                        Ok(Ok(Outcome::Stopped { .. })) => return Ending::Interrupted,
+                        Ok(Err(error)) => return Ending::Failed(error),
+                        Err(_) => return Ending::Failed(anyhow!("the training thread panicked")),
+                    }
+                }
+                Some(notice) = self.notices.recv() => match notice {
+                    Notice::Settled => settled = true,
+                    Notice::Failed(error) => return Ending::Failed(error),
+                    notice => self.tell(notice),
+                },
+                _ = ticker.tick() => {
+                    self.display.tick(Instant::now());
+                    if !training && waiting.is_too_long(self.metrics.evaluators.present.get() > 0) {
+                        self.display.say(&self.advice());
+                    }
+                }
+                () = &mut shutdown, if !interrupted => {
+                    interrupted = true;
+                    if !training {
+                        return Ending::Interrupted;
+                    }
+                    self.display.say("stopping after this gradient step");
+                    self.threads.stop_training();
+                }
+            }
+        }
+        Ending::Complete
+    }
+
+    async fn go_online(&mut self, session: anyhow::Result<Session>) -> anyhow::Result<Wire> {
+        let session = session?;
+        self.reachable_at = quad_service::reachable_at(&session, &self.endpoints).await?;
+        let endpoints = RunEndpoints { zenoh: self.reachable_at.clone(), metrics: self.metrics_address.clone() };
+        let ready = || Ok(self.run_dir.write_endpoints(&endpoints)?);
+        let (hub, weights) = (&self.threads.hub, &self.threads.weights);
+        let wire = Wire::declare(session, &self.run, hub, weights, &self.metrics, ready).await?;
+        let (zenoh, metrics) = (endpoints.zenoh.join(", "), &endpoints.metrics);
+        self.display.say(&format!("run {} is at {zenoh}, its metrics at http://{metrics}/metrics", self.run));
+        Ok(wire)
+    }
+
+    fn training_completed(&self) {
+        let pending = self.metrics.evaluation.episodes_pending.get();
+        let present = self.metrics.evaluators.present.get();
+        let text = match pending {
+            0 => "training is done".to_owned(),
+            _ => {
+                format!("training is done; waiting for the scores of {pending} episodes ({present} evaluators present)")
+            }
+        };
+        self.display.say(&text);
+    }
+
+    fn tell(&mut self, notice: Notice) {
+        let text = match notice {
+            Notice::Published { step } => format!("step {step}: snapshot handed to evaluation"),
+            Notice::EvaluatorJoined(name) => format!("evaluator {name} is here"),
+            Notice::EvaluatorLeft(name, 0) => format!("evaluator {name} has left"),
+            Notice::EvaluatorLeft(name, jobs) => {
+                format!("evaluator {name} has left; its {jobs} unfinished jobs go to others")
+            }
+            Notice::JobsExpired(jobs) => format!("{jobs} jobs made no progress; they go to others"),
+            Notice::Evaluated { step, scores } => {
+                let values: Vec<_> = scores.iter().map(|score| score.score).collect();
+                let Some(Spread { mean, std }) = Spread::of(&values) else { return };
+                self.display.scored(step, mean);
+                let std = std.map(|std| format!(" ± {std:.2}")).unwrap_or_default();
+                format!("step {step}: score {mean:.2}{std} over {} episodes", values.len())
+            }
+            Notice::Settled | Notice::Failed(_) => return,
+        };
+        self.display.say(&text);
+    }
+
+    fn advice(&self) -> String {
+        match &self.reachable_at[..] {
+            [] => {
+                format!("no router has answered at {} yet; the scores wait for it", self.endpoints.connect.join(", "))
+            }
+            [endpoint, ..] => format!("no evaluator is here; start one with: evaluator serve --connect {endpoint}"),
+        }
+    }
+}
+
+/// How long no evaluator was there.
+#[derive(Default)]
+struct Waiting {
+    since: Option<Instant>,
+    said: bool,
+}
+
+impl Waiting {
+    /// True once, each time that it becomes too long.
+    fn is_too_long(&mut self, somebody_there: bool) -> bool {
+        if somebody_there {
+            *self = Self::default();
+            return false;
+        }
+        let since = *self.since.get_or_insert_with(Instant::now);
+        if self.said || since.elapsed() < EVALUATOR_PATIENCE {
+            return false;
+        }
+        self.said = true;
+        true
+    }
+}

@@ -1,0 +1,323 @@
+//! The thread that owns the scoreboard: hands out jobs, takes scores in, watches who is there. One thread, so no locks;
+//! all of its messages are small, so none keeps another waiting for long.
+
+use std::collections::{BTreeMap, BTreeSet};
+use std::time::{Duration, Instant};
+
+use quad_protocol::{
+    CodecError, Hash, JobReply, JobRequest, Message, Name, Progress, RecordedScores, ScoreReply, ScoreReport, decode,
+    encode, keys,
+};
+use tokio::sync::mpsc::UnboundedSender;
+use tracing::{debug, error};
+use zenoh::bytes::ZBytes;
+use zenoh::qos::CongestionControl;
+use zenoh::query::Query;
+use zenoh::sample::{Sample, SampleKind};
+use zenoh::{Session, Wait};
+
+use crate::inbox::Messages;
+use crate::metrics::Metrics;
+use crate::notice::Notice;
+use crate::run_dir::{Log, RunDirError, ScoreLine};
+use crate::scoreboard::{Refusal, Scoreboard};
+use crate::seeds::episode_seeds;
+
+/// How often leases are looked at.
+const TICK: Duration = Duration::from_millis(250);
+/// After so long without a word, a gone evaluator's metrics are dropped.
+const FORGET_AFTER: Duration = Duration::from_secs(600);
+/// Evaluators that the learner keeps apart by name; far above any pool, so only a flood of made-up names meets it.
+const MOST_EVALUATORS: usize = 1024;
+
+/// What the thread is told.
+#[derive(Debug)]
+pub enum Event {
+    /// A snapshot is ready to be evaluated.
+    Evaluate {
+        /// After which gradient step.
+        step: u64,
+        /// Its hash.
+        weights: Hash,
+    },
+    /// No further evaluation will follow.
+    TrainingEnded,
+    /// The Zenoh session is there.
+    Online(Session),
+    /// Somebody asks for a job.
+    Claim(Query),
+    /// Somebody delivers scores.
+    Report(Query),
+    /// Somebody tells how far a job is.
+    Progress(Sample),
+    /// A liveliness token of an evaluator came or went.
+    Liveliness(Sample),
+    /// Do what was asked so far, then end.
+    Stop,
+}
+
+/// What the evaluations of a run are made of.
+#[derive(Clone, Copy, Debug)]
+pub struct EvaluationPlan {
+    /// Seed of the run.
+    pub seed: u64,
+    /// Episodes per evaluation.
+    pub episodes: u32,
+}
+
+/// State of the thread.
+pub struct Hub {
+    run: Name,
+    plan: EvaluationPlan,
+    scoreboard: Scoreboard,
+    scores: Log,
+    metrics: Metrics,
+    notices: UnboundedSender<Notice>,
+    session: Option<Session>,
+    present: BTreeSet<Name>,
+    last_seen: BTreeMap<Name, Instant>,
+    training_ended: bool,
+}
+
+/// Why a message from the wire was not accepted.
+#[derive(Debug, thiserror::Error)]
+enum Rejection {
+    #[error("the message is empty")]
+    Empty,
+    #[error("the message cannot be read: {0}")]
+    Codec(#[from] CodecError),
+    #[error("refused: {0}")]
+    Refused(#[from] Refusal),
+    #[error("there are too many evaluators")]
+    Crowd,
+    #[error("the scores could not be saved, try again: {0}")]
+    Disk(#[from] RunDirError),
+}
+
+impl Rejection {
+    fn label(&self) -> &'static str {
+        match self {
+            Self::Empty => "empty",
+            Self::Codec(error) => error.label(),
+            Self::Refused(refusal) => refusal.label(),
+            Self::Crowd => "too_many_evaluators",
+            Self::Disk(_) => "not_saved",
+        }
+    }
+}
+
+impl Hub {
+    /// State before the first evaluation.
+    pub fn new(
+        run: Name,
+        plan: EvaluationPlan,
+        scoreboard: Scoreboard,
+        scores: Log,
+        metrics: Metrics,
+        notices: UnboundedSender<Notice>,
+    ) -> Self {
+        Self {
+            run,
+            plan,
+            scoreboard,
+            scores,
+            metrics,
+            notices,
+            session: None,
+            present: BTreeSet::new(),
+            last_seen: BTreeMap::new(),
+            training_ended: false,
+        }
+    }
+
+    /// The thread's work, until it is told to stop.
+    pub fn run(mut self, messages: &Messages<Event>) {
+        let mut ticked = Instant::now();
+        while let Ok(event) = messages.next(TICK) {
+            match event {
+                None => {}
+                Some(Event::Stop) => return,
+                Some(event) => self.handle(event),
+            }
+            if ticked.elapsed() >= TICK {
+                ticked = Instant::now();
+                self.tick(ticked);
+            }
+            self.metrics.evaluation.episodes_pending.set(self.scoreboard.pending() as i64);
+        }
+    }
+
+    fn handle(&mut self, event: Event) {
+        match event {
+            Event::Evaluate { step, weights } => {
+                let seeds = episode_seeds(self.plan.seed, step, self.plan.episodes);
+                self.scoreboard.add_evaluation(step, weights, &seeds);
+            }
+            Event::TrainingEnded => {
+                self.training_ended = true;
+                self.settle();
+            }
+            Event::Online(session) => self.session = Some(session),
+            Event::Claim(query) => {
+                let reply = parse(query.payload()).map(|request| self.claim(&request));
+                self.answer(&query, keys::jobs(&self.run), reply);
+            }
+            Event::Report(query) => {
+                let mut completed = None;
+                let reply = parse(query.payload()).and_then(|report| self.report(&report, &mut completed));
+                self.answer(&query, keys::scores(&self.run), reply);
+                if let Some(notice) = completed {
+                    self.notices.send(notice).ok();
+                }
+                self.settle();
+            }
+            Event::Progress(sample) => {
+                if let Err(rejection) = self.progress(&sample) {
+                    self.reject(&rejection);
+                }
+            }
+            Event::Liveliness(sample) => {
+                if let Err(rejection) = self.liveliness(&sample) {
+                    self.reject(&rejection);
+                }
+            }
+            Event::Stop => {}
+        }
+    }
+
+    fn claim(&mut self, request: &JobRequest) -> JobReply {
+        let reply = self.scoreboard.claim(request, Instant::now());
+        if let JobReply::Job(job) = &reply {
+            debug!(job = job.id, step = job.step, evaluator = %request.evaluator, "handed out");
+            self.metrics.evaluation.jobs_handed_out.inc();
+        }
+        reply
+    }
+
+    /// Checks, writes down, counts; the caller thanks the evaluator after that.
+    fn report(&mut self, report: &ScoreReport, completed: &mut Option<Notice>) -> Result<ScoreReply, Rejection> {
+        let screened = match self.scoreboard.screen(report) {
+            Ok(screened) => screened,
+            Err(refusal) => {
+                self.reject(&Rejection::Refused(refusal));
+                return Ok(ScoreReply::Refused { reason: refusal.to_string() });
+            }
+        };
+        if !screened.new.is_empty() {
+            let lines: Vec<_> = screened.new.iter().map(|score| ScoreLine::new(report, score)).collect();
+            // If this fails nothing is counted, so the evaluator's next try finds the scores new again.
+            self.scores.append(&lines)?;
+        }
+        let recorded = self.scoreboard.record(report, &screened.new);
+        let evaluation = &self.metrics.evaluation;
+        evaluation.scores_recorded.inc_by(screened.new.len() as u64);
+        evaluation.scores_duplicate.inc_by(screened.duplicates.into());
+        evaluation.jobs_completed.inc_by(recorded.job_completed.into());
+        if let Some(scores) = recorded.evaluation_completed {
+            let mean = scores.iter().map(|score| score.score).sum::<f64>() / scores.len() as f64;
+            if i64::try_from(report.step).is_ok_and(|step| step >= evaluation.step.get()) {
+                evaluation.score.set(mean);
+                evaluation.step.set(report.step as i64);
+            }
+            *completed = Some(Notice::Evaluated { step: report.step, scores });
+        }
+        let reply = ScoreReply::Recorded { new: screened.new.len() as u32, duplicates: screened.duplicates };
+        if !screened.new.is_empty() {
+            self.publish(report, screened.new);
+        }
+        Ok(reply)
+    }
+
+    /// Tells whoever watches; nobody has to.
+    fn publish(&self, report: &ScoreReport, episodes: Vec<quad_protocol::EpisodeScore>) {
+        let Some(session) = &self.session else { return };
+        let ScoreReport { run, step, weights, evaluator, .. } = report.clone();
+        let recorded = RecordedScores { run, step, weights, evaluator, episodes };
+        let Ok(bytes) = encode(&recorded) else { return };
+        let put = session.put(keys::scores_at(&self.run, report.step), bytes);
+        if let Err(error) = put.congestion_control(CongestionControl::Drop).wait() {
+            debug!(%error, "recorded scores could not be published");
+        }
+    }
+
+    fn progress(&mut self, sample: &Sample) -> Result<(), Rejection> {
+        let progress: Progress = parse(Some(sample.payload()))?;
+        let now = Instant::now();
+        self.scoreboard.progress(&progress, now)?;
+        if self.last_seen.len() >= MOST_EVALUATORS && !self.last_seen.contains_key(&progress.evaluator) {
+            return Err(Rejection::Crowd);
+        }
+        self.metrics.evaluators.observe(&progress);
+        self.last_seen.insert(progress.evaluator, now);
+        Ok(())
+    }
+
+    fn liveliness(&mut self, sample: &Sample) -> Result<(), Rejection> {
+        let Some(evaluator) = keys::evaluator_of(sample.key_expr().as_str()) else { return Err(Rejection::Empty) };
+        match sample.kind() {
+            SampleKind::Put if self.present.len() >= MOST_EVALUATORS => return Err(Rejection::Crowd),
+            SampleKind::Put => {
+                if self.present.insert(evaluator.clone()) {
+                    self.notices.send(Notice::EvaluatorJoined(evaluator)).ok();
+                }
+            }
+            SampleKind::Delete => {
+                if self.present.remove(&evaluator) {
+                    let lost = self.scoreboard.evaluator_gone(&evaluator);
+                    self.metrics.evaluation.jobs_expired.inc_by(lost as u64);
+                    self.notices.send(Notice::EvaluatorLeft(evaluator, lost)).ok();
+                }
+            }
+        }
+        self.metrics.evaluators.present.set(self.present.len() as i64);
+        Ok(())
+    }
+
+    fn tick(&mut self, now: Instant) {
+        let expired = self.scoreboard.expire(now);
+        if expired > 0 {
+            self.metrics.evaluation.jobs_expired.inc_by(expired as u64);
+            self.notices.send(Notice::JobsExpired(expired)).ok();
+        }
+        let (present, metrics) = (&self.present, &self.metrics.evaluators);
+        self.last_seen.retain(|evaluator, seen| {
+            let keep = present.contains(evaluator) || now.duration_since(*seen) < FORGET_AFTER;
+            if !keep {
+                metrics.forget(evaluator);
+            }
+            keep
+        });
+    }
+
+    fn settle(&mut self) {
+        if self.training_ended && self.scoreboard.pending() == 0 {
+            self.training_ended = false; // said once
+            self.notices.send(Notice::Settled).ok();
+        }
+    }
+
+    fn reject(&self, rejection: &Rejection) {
+        match rejection {
+            Rejection::Disk(error) => error!(%error, "scores could not be saved"),
+            _ => debug!(%rejection, "a message was not accepted"),
+        }
+        self.metrics.reject(rejection.label());
+    }
+
+    fn answer<M: Message>(&self, query: &Query, key: String, reply: Result<M, Rejection>) {
+        let sent = match reply.and_then(|message| Ok(encode(&message)?)) {
+            Ok(bytes) => query.reply(key, bytes).wait(),
+            Err(rejection) => {
+                self.reject(&rejection);
+                query.reply_err(rejection.to_string()).wait()
+            }
+        };
+        if let Err(error) = sent {
+            debug!(%error, "an answer could not be sent");
+        }
+    }
+}
+
+fn parse<M: Message>(payload: Option<&ZBytes>) -> Result<M, Rejection> {
+    Ok(decode(&payload.ok_or(Rejection::Empty)?.to_bytes())?)
+}

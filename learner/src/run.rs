@@ -1,0 +1,180 @@
+//! `learner train` and `learner report`, from the command line to the exit.
+
+use std::path::{Path, PathBuf};
+use std::time::{SystemTime, UNIX_EPOCH};
+
+use anyhow::{Context, anyhow};
+use quad_dataset::{EnvironmentSpec, ReadOptions, Transitions};
+use quad_protocol::Name;
+use quad_service::{Endpoints, Hint};
+use tokio::sync::mpsc;
+use tracing::{debug, info};
+
+use crate::cli::{Cli, Command, ReportArgs, TrainArgs};
+use crate::conduct::{Conductor, Ending, open_network};
+use crate::config::{self, DatasetInfo, Experiment, RunConfig, RunInfo};
+use crate::display::Display;
+use crate::metrics::Metrics;
+use crate::plot;
+use crate::report::{Report, RunReport};
+use crate::run_dir::RunDir;
+use crate::threads::Threads;
+
+/// Where evaluators look by default.
+const DEFAULT_ENDPOINT: &str = "tcp/127.0.0.1:7447";
+/// For a run that waits for nobody: several of them may run at a time.
+const ANY_ENDPOINT: &str = "tcp/127.0.0.1:0";
+
+/// Does what the command line says.
+pub fn run(cli: &Cli) -> anyhow::Result<()> {
+    match &cli.command {
+        Command::Train(args) => train(args),
+        Command::Report(args) => report(args),
+    }
+}
+
+fn report(args: &ReportArgs) -> anyhow::Result<()> {
+    let report = Report::read(&args.dirs).hint("DIR is a folder that `learner train` has written")?;
+    if let Some(path) = &args.plot {
+        plot::learning_curves(path, &report.runs)?;
+        info!("learning curves: {}", path.display());
+    }
+    match args.json {
+        true => print(&serde_json::to_string_pretty(&report)?),
+        false => print(report.table().trim_end()),
+    }
+    Ok(())
+}
+
+#[allow(clippy::print_stdout)] // results, not logs, go to stdout
+fn print(text: &str) {
+    println!("{text}");
+}
+
+fn train(args: &TrainArgs) -> anyhow::Result<()> {
+    let experiment = config::resolve(&args.preset, &args.overrides())?;
+    let path = args.run_dir.clone().unwrap_or_else(|| default_run_dir(&args.preset, &experiment));
+    let name = run_name(&path)?;
+    RunDir::check_free(&path).hint("choose another --run-dir, or remove the folder if you do not need it")?;
+
+    let environment = quad_dataset::environment::find(&experiment.environment)?;
+    let options = ReadOptions { environment, reward: experiment.reward };
+    let transitions = Transitions::read(&args.dataset, &options)
+        .with_context(|| format!("cannot learn from {}", args.dataset.display()))
+        .hint(format!("record a dataset with `evaluator collect --env {} --out FILE`", environment.name))?;
+    let config = run_config(args, &name, experiment, &transitions)?;
+    let DatasetInfo { transitions: count, episodes, mean_score, .. } = &config.dataset;
+    info!("{count} transitions of {episodes} episodes, mean score {mean_score:.2}");
+    info!("{}", config.experiment.summary());
+    debug!("{config:?}");
+
+    // Zenoh and the training thread have threads of their own; this runtime serves the metrics and the main loop.
+    let runtime = tokio::runtime::Builder::new_multi_thread().worker_threads(2).enable_all().build()?;
+    let (run_dir, ending) = runtime.block_on(conduct(args, &path, name, &config, environment, transitions))?;
+    conclude(&run_dir, &config, ending)
+}
+
+async fn conduct(
+    args: &TrainArgs,
+    path: &Path,
+    run: Name,
+    config: &RunConfig,
+    environment: &'static EnvironmentSpec,
+    transitions: Transitions,
+) -> anyhow::Result<(RunDir, Ending)> {
+    let steps = config.experiment.steps;
+    let (metrics, registry) = Metrics::new(&run, steps)?;
+    let server = quad_service::serve_metrics(args.metrics, registry).await?;
+    let endpoints = endpoints(args, config.experiment.eval_interval);
+    let opening = open_network(&endpoints).await?;
+    // From here on nothing outside can be wrong any more, so a refused start leaves no folder behind.
+    let run_dir = RunDir::create(path, config)?;
+    let (notify, notices) = mpsc::unbounded_channel();
+    let threads = Threads::start(&run, config, environment, transitions, &run_dir, &metrics, &notify)?;
+    let display = Display::start(metrics.clone(), steps);
+    let metrics_address = server.address.to_string();
+    let conductor = Conductor {
+        run,
+        run_dir: run_dir.clone(),
+        metrics,
+        metrics_address,
+        endpoints,
+        reachable_at: Vec::new(),
+        notices,
+        threads,
+        display,
+    };
+    Ok((run_dir, conductor.conduct(opening).await?))
+}
+
+fn endpoints(args: &TrainArgs, eval_interval: u64) -> Endpoints {
+    let default = if eval_interval == 0 { ANY_ENDPOINT } else { DEFAULT_ENDPOINT };
+    let listen = match (&args.listen, &args.connect) {
+        (None, None) => vec![default.to_owned()],
+        (listen, _) => Vec::from_iter(listen.clone()),
+    };
+    Endpoints { listen, connect: Vec::from_iter(args.connect.clone()) }
+}
+
+/// Leaves a report of what there is, whatever the ending; an ending before the end is an error.
+fn conclude(run_dir: &RunDir, config: &RunConfig, ending: Ending) -> anyhow::Result<()> {
+    let folder = run_dir.path().display();
+    let report = RunReport::read(run_dir.path())?;
+    let mut text = String::new();
+    if !report.evaluations.is_empty() {
+        run_dir.write_json("report.json", &report)?;
+        let picture = run_dir.learning_curve();
+        plot::learning_curves(&picture, std::slice::from_ref(&report))?;
+        text = format!("\n{}\nlearning curve: {}\n", report.table(), picture.display());
+    }
+    print(&format!("{text}run folder: {folder}"));
+    let kept = format!("snapshots, metrics and scores so far are kept in {folder}");
+    match ending {
+        Ending::Complete => Ok(()),
+        Ending::Failed(error) => Err(error).hint(kept),
+        Ending::Interrupted => {
+            Err(anyhow!("interrupted before the end of {} steps and their evaluations", config.experiment.steps))
+                .hint(kept)
+        }
+    }
+}
+
+fn default_run_dir(preset: &str, experiment: &Experiment) -> PathBuf {
+    let guidance = config::guidance_name(experiment.agent.guidance);
+    Path::new("runs").join(format!("{}-{guidance}-seed{}", config::preset_label(preset), experiment.seed))
+}
+
+/// The folder's name, which is also the run's place in Zenoh's key space.
+fn run_name(path: &Path) -> anyhow::Result<Name> {
+    let folder = path.file_name().and_then(|name| name.to_str()).unwrap_or_default();
+    Name::new(folder)
+        .with_context(|| format!("the run folder {} gives no name for the run", path.display()))
+        .hint("its last part must be 1 to 64 letters, digits, dots, dashes or underscores")
+}
+
+fn run_config(
+    args: &TrainArgs,
+    name: &Name,
+    experiment: Experiment,
+    transitions: &Transitions,
+) -> anyhow::Result<RunConfig> {
+    let statistics = transitions.statistics();
+    Ok(RunConfig {
+        run: RunInfo {
+            name: name.to_string(),
+            epoch: SystemTime::now().duration_since(UNIX_EPOCH)?.as_millis() as u64,
+            preset: config::preset_label(&args.preset),
+            version: env!("CARGO_PKG_VERSION").to_owned(),
+        },
+        dataset: DatasetInfo {
+            path: args.dataset.clone(),
+            transitions: statistics.transitions as u64,
+            episodes: statistics.episodes as u64,
+            min_return: statistics.return_min,
+            mean_return: statistics.return_mean,
+            max_return: statistics.return_max,
+            mean_score: statistics.score_mean,
+        },
+        experiment,
+    })
+}

@@ -1,0 +1,153 @@
+//! The thread that keeps the snapshots: takes them from the training thread, publishes them, saves them, asks for their
+//! evaluation, and answers evaluators that missed one.
+
+use std::collections::BTreeMap;
+use std::time::Duration;
+
+use anyhow::Context;
+use quad_protocol::{Hash, Name, Schema, encode, keys};
+use tokio::sync::mpsc::UnboundedSender;
+use tracing::debug;
+use zenoh::Wait;
+use zenoh::bytes::ZBytes;
+use zenoh::pubsub::Publisher;
+use zenoh::query::Query;
+
+use crate::hub;
+use crate::inbox::{Inbox, Messages};
+use crate::metrics::Metrics;
+use crate::notice::Notice;
+use crate::run_dir::RunDir;
+use crate::train;
+
+/// Nothing happens by itself here, so this only bounds how long an idle wait is.
+const IDLE: Duration = Duration::from_secs(60);
+
+/// What the thread is told.
+#[derive(Debug)]
+pub enum Event {
+    /// A new snapshot, from the training thread.
+    Snapshot(train::Snapshot),
+    /// No snapshot will follow.
+    TrainingEnded,
+    /// The Zenoh session is there; publish with this.
+    Online(Publisher<'static>),
+    /// Somebody asks for `weights/<step>`.
+    Query(Query),
+    /// Do what was asked so far, then end.
+    Stop,
+}
+
+/// What every snapshot of a run says about itself.
+#[derive(Clone, Debug)]
+pub struct Identity {
+    /// The run.
+    pub run: Name,
+    /// The learner's life.
+    pub epoch: u64,
+    /// Environment and shapes.
+    pub schema: Schema,
+}
+
+/// State of the thread.
+pub struct WeightKeeper {
+    identity: Identity,
+    run_dir: RunDir,
+    metrics: Metrics,
+    hub: Inbox<hub::Event>,
+    notices: UnboundedSender<Notice>,
+    publisher: Option<Publisher<'static>>,
+    /// What can be asked for: every saved snapshot.
+    hashes: BTreeMap<u64, Hash>,
+    /// The newest, ready to be sent; older ones are read from the disk.
+    newest: Option<(u64, ZBytes)>,
+}
+
+impl WeightKeeper {
+    /// State before the first snapshot.
+    pub fn new(
+        identity: Identity,
+        run_dir: RunDir,
+        metrics: Metrics,
+        hub: Inbox<hub::Event>,
+        notices: UnboundedSender<Notice>,
+    ) -> Self {
+        Self { identity, run_dir, metrics, hub, notices, publisher: None, hashes: BTreeMap::new(), newest: None }
+    }
+
+    /// The thread's work, until it is told to stop.
+    pub fn run(mut self, messages: &Messages<Event>) {
+        while let Ok(event) = messages.next(IDLE) {
+            match event {
+                None => {}
+                Some(Event::Snapshot(snapshot)) => {
+                    if let Err(error) = self.keep(snapshot) {
+                        self.notices.send(Notice::Failed(error)).ok();
+                    }
+                }
+                Some(Event::TrainingEnded) => self.hub.send(hub::Event::TrainingEnded),
+                Some(Event::Online(publisher)) => self.publisher = Some(publisher),
+                Some(Event::Query(query)) => self.answer(&query),
+                Some(Event::Stop) => return,
+            }
+        }
+    }
+
+    fn keep(&mut self, snapshot: train::Snapshot) -> anyhow::Result<()> {
+        let train::Snapshot { step, tensors, evaluate } = snapshot;
+        let hash = Hash::of(&tensors);
+        self.metrics.evaluation.snapshot_bytes.set(tensors.len() as i64);
+        if !evaluate {
+            return Ok(self.run_dir.write_snapshot(step, &tensors)?);
+        }
+        let message = self.message(step, hash, tensors);
+        let bytes = ZBytes::from(encode(&message)?);
+        self.hashes.insert(step, hash);
+        self.newest = Some((step, bytes.clone()));
+        // Its jobs first: evaluators ask for one as soon as they see the weights. The disk last: nobody waits for it.
+        self.hub.send(hub::Event::Evaluate { step, weights: hash });
+        if let Some(publisher) = &self.publisher
+            && let Err(error) = publisher.put(bytes).wait()
+        {
+            // Whoever gets a job for it asks for it.
+            debug!(%error, step, "the snapshot could not be published");
+        }
+        self.metrics.evaluation.snapshots_published.inc();
+        self.run_dir.write_snapshot(step, &message.tensors)?;
+        self.notices.send(Notice::Published { step }).ok();
+        Ok(())
+    }
+
+    fn message(&self, step: u64, hash: Hash, tensors: Vec<u8>) -> quad_protocol::Snapshot {
+        let Identity { run, epoch, schema } = self.identity.clone();
+        quad_protocol::Snapshot { run, epoch, step, schema, hash, tensors }
+    }
+
+    fn answer(&self, query: &Query) {
+        let asked = keys::step_of(query.key_expr().as_str());
+        let Some((&step, &hash)) = asked.and_then(|step| self.hashes.get_key_value(&step)) else {
+            self.metrics.reject("unknown_step");
+            query.reply_err("there is no snapshot of that step").wait().ok();
+            return;
+        };
+        let sent = match self.bytes(step, hash) {
+            Ok(bytes) => query.reply(keys::weights_at(&self.identity.run, step), bytes).wait(),
+            Err(error) => query.reply_err(format!("{error:#}")).wait(),
+        };
+        if let Err(error) = sent {
+            debug!(%error, step, "the answer to a question for weights could not be sent");
+        }
+    }
+
+    fn bytes(&self, step: u64, hash: Hash) -> anyhow::Result<ZBytes> {
+        if let Some((newest, bytes)) = &self.newest
+            && *newest == step
+        {
+            return Ok(bytes.clone());
+        }
+        let tensors = self.run_dir.read_snapshot(step)?;
+        anyhow::ensure!(Hash::of(&tensors) == hash, "the saved snapshot of step {step} was changed");
+        let bytes = encode(&self.message(step, hash, tensors)).context("cannot encode the snapshot")?;
+        Ok(ZBytes::from(bytes))
+    }
+}

@@ -1,0 +1,317 @@
+//! The learner's side of the wire, spoken to by made-up evaluators over TCP.
+
+use std::net::TcpListener;
+use std::time::{Duration, Instant};
+
+use quad_learner::hub::{self, EvaluationPlan, Hub};
+use quad_learner::inbox::{Inbox, inbox};
+use quad_learner::metrics::Metrics;
+use quad_learner::notice::Notice;
+use quad_learner::run_dir::RunDir;
+use quad_learner::scoreboard::{Rules, Scoreboard};
+use quad_learner::train;
+use quad_learner::weights::{self, Identity, WeightKeeper};
+use quad_learner::wire::Wire;
+use quad_protocol::{
+    EpisodeScore, Hash, Job, JobReply, JobRequest, Message, Name, Progress, RecordedScores, Schema, ScoreReply,
+    ScoreReport, Snapshot, decode, encode, keys,
+};
+use quad_service::{Endpoints, open_session};
+use tokio::sync::mpsc::UnboundedReceiver;
+use zenoh::Session;
+
+const PATIENCE: Duration = Duration::from_secs(20);
+const LEASE: Duration = Duration::from_millis(800);
+const EPOCH: u64 = 5;
+
+/// A learner without training: its threads, its declarations, its folder.
+struct Bench {
+    run: Name,
+    run_dir: RunDir,
+    endpoint: String,
+    metrics: Metrics,
+    notices: UnboundedReceiver<Notice>,
+    weights: Inbox<weights::Event>,
+    hub: Inbox<hub::Event>,
+    _wire: Wire,
+    _folder: tempfile::TempDir,
+}
+
+fn name(text: &str) -> Name {
+    Name::new(text).unwrap()
+}
+
+fn tensors(step: u64) -> Vec<u8> {
+    vec![step as u8; 200_000]
+}
+
+impl Bench {
+    /// Jobs of two episodes, four episodes per evaluation.
+    async fn start() -> Self {
+        let folder = tempfile::tempdir().unwrap();
+        let run = name("bench");
+        let run_dir = RunDir::create(&folder.path().join("bench"), &config()).unwrap();
+        let (metrics, _) = Metrics::new(&run, 100).unwrap();
+        let (notify, notices) = tokio::sync::mpsc::unbounded_channel();
+        let environment = quad_dataset::environment::find("hopper").unwrap();
+        let rules = Rules { run: run.clone(), epoch: EPOCH, environment, candidates: 3, job_episodes: 2, lease: LEASE };
+        let plan = EvaluationPlan { seed: 1, episodes: 4 };
+        let log = run_dir.score_log().unwrap();
+        let state = Hub::new(run.clone(), plan, Scoreboard::new(rules), log, metrics.clone(), notify.clone());
+        let (hub, messages) = inbox();
+        std::thread::spawn(move || state.run(&messages));
+        let schema = Schema {
+            environment: "hopper".into(),
+            observation_dim: 11,
+            action_dim: 3,
+            hidden: 8,
+            critics: 2,
+            diffusion_steps: 2,
+        };
+        let identity = Identity { run: run.clone(), epoch: EPOCH, schema };
+        let state = WeightKeeper::new(identity, run_dir.clone(), metrics.clone(), hub.clone(), notify);
+        let (weights, messages) = inbox();
+        std::thread::spawn(move || state.run(&messages));
+
+        let port = TcpListener::bind("127.0.0.1:0").unwrap().local_addr().unwrap().port();
+        let endpoint = format!("tcp/127.0.0.1:{port}");
+        let session = open_session(&Endpoints { listen: vec![endpoint.clone()], connect: Vec::new() }).await.unwrap();
+        let wire = Wire::declare(session, &run, &hub, &weights, &metrics, || Ok(())).await.unwrap();
+        Self { run, run_dir, endpoint, metrics, notices, weights, hub, _wire: wire, _folder: folder }
+    }
+
+    async fn client(&self) -> Session {
+        open_session(&Endpoints { listen: Vec::new(), connect: vec![self.endpoint.clone()] }).await.unwrap()
+    }
+
+    async fn snapshot(&mut self, step: u64) {
+        self.weights.send(weights::Event::Snapshot(train::Snapshot { step, tensors: tensors(step), evaluate: true }));
+        self.until(|notice| matches!(notice, Notice::Published { step: published } if *published == step)).await;
+    }
+
+    async fn until(&mut self, wanted: impl Fn(&Notice) -> bool) -> Notice {
+        let search = async {
+            loop {
+                let notice = self.notices.recv().await.unwrap();
+                if wanted(&notice) {
+                    return notice;
+                }
+            }
+        };
+        tokio::time::timeout(PATIENCE, search).await.expect("the notice comes in time")
+    }
+
+    fn rejected(&self, reason: &str) -> u64 {
+        self.metrics.rejected.with_label_values(&[reason]).get()
+    }
+
+    fn lines(&self) -> usize {
+        self.run_dir.read_scores().unwrap().len()
+    }
+}
+
+fn config() -> quad_learner::config::RunConfig {
+    let text = r#"
+        [run]
+        name = "bench"
+        epoch = 5
+        preset = "hopper-demo"
+        version = "0"
+        [dataset]
+        path = "none"
+        transitions = 0
+        episodes = 0
+        min_return = 0.0
+        mean_return = 0.0
+        max_return = 0.0
+        mean_score = 0.0
+    "#;
+    let mut table: toml::Table = text.parse().unwrap();
+    let experiment = quad_learner::config::resolve("hopper-demo", &Default::default()).unwrap();
+    table.insert("experiment".into(), toml::Value::try_from(experiment).unwrap());
+    table.try_into().unwrap()
+}
+
+/// The answer, or the text of the error that came instead; nothing if nobody answered.
+async fn ask<A: Message>(session: &Session, key: String, payload: Option<Vec<u8>>) -> Option<Result<A, String>> {
+    let get = session.get(key).timeout(PATIENCE);
+    let replies = match payload {
+        Some(payload) => get.payload(payload).await.unwrap(),
+        None => get.await.unwrap(),
+    };
+    let reply = replies.recv_async().await.ok()?;
+    Some(match reply.into_result() {
+        Ok(sample) => Ok(decode(&sample.payload().to_bytes()).unwrap()),
+        Err(error) => Err(error.payload().try_to_string().unwrap().into_owned()),
+    })
+}
+
+async fn claim(session: &Session, run: &Name, evaluator: &str) -> Option<Job> {
+    let request = JobRequest { evaluator: name(evaluator), environments: vec!["hopper".into()] };
+    match ask(session, keys::jobs(run), Some(encode(&request).unwrap())).await?.unwrap() {
+        JobReply::Job(job) => Some(job),
+        JobReply::Wait { .. } => None,
+    }
+}
+
+async fn claim_eventually(session: &Session, run: &Name, evaluator: &str) -> Job {
+    let start = Instant::now();
+    loop {
+        if let Some(job) = claim(session, run, evaluator).await {
+            return job;
+        }
+        assert!(start.elapsed() < PATIENCE, "no job for {evaluator}");
+        tokio::time::sleep(Duration::from_millis(50)).await;
+    }
+}
+
+fn report(job: &Job, evaluator: &str) -> ScoreReport {
+    let hopper = quad_dataset::environment::find("hopper").unwrap();
+    let episode =
+        |&seed| EpisodeScore { seed, episode_return: 1000.0, length: 300, score: hopper.normalised_score(1000.0) };
+    let Job { run, epoch, step, weights, .. } = job.clone();
+    let episodes = job.seeds.iter().map(episode).collect();
+    ScoreReport { evaluator: name(evaluator), run, epoch, job: job.id, step, weights, episodes }
+}
+
+async fn deliver(session: &Session, report: &ScoreReport) -> ScoreReply {
+    ask(session, keys::scores(&report.run), Some(encode(report).unwrap())).await.unwrap().unwrap()
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn a_job_goes_out_and_its_scores_are_on_disk_before_the_thanks() {
+    let mut bench = Bench::start().await;
+    let client = bench.client().await;
+    let watched = client.declare_subscriber(keys::scores_at(&bench.run, 10)).await.unwrap();
+    bench.snapshot(10).await;
+
+    let job = claim_eventually(&client, &bench.run, "a").await;
+    assert_eq!((job.step, job.epoch, job.candidates, job.seeds.len()), (10, EPOCH, 3, 2));
+    assert_eq!(job.weights, Hash::of(&tensors(10)));
+
+    let recorded = deliver(&client, &report(&job, "a")).await;
+    assert_eq!(bench.lines(), 2);
+    assert!(matches!(recorded, ScoreReply::Recorded { new: 2, duplicates: 0 }));
+    let again = deliver(&client, &report(&job, "a")).await;
+    assert!(matches!(again, ScoreReply::Recorded { new: 0, duplicates: 2 }));
+    assert_eq!((bench.lines(), bench.metrics.evaluation.scores_duplicate.get()), (2, 2));
+
+    let sample = tokio::time::timeout(PATIENCE, watched.recv_async()).await.unwrap().unwrap();
+    let published: RecordedScores = decode(&sample.payload().to_bytes()).unwrap();
+    assert_eq!((published.step, published.episodes.len(), published.evaluator), (10, 2, name("a")));
+
+    let rest = claim_eventually(&client, &bench.run, "a").await;
+    deliver(&client, &report(&rest, "a")).await;
+    let Notice::Evaluated { step: 10, scores } = bench.until(|notice| matches!(notice, Notice::Evaluated { .. })).await
+    else {
+        panic!("another step")
+    };
+    assert_eq!(scores.len(), 4);
+    assert_eq!(bench.metrics.evaluation.step.get(), 10);
+    bench.weights.send(weights::Event::TrainingEnded);
+    bench.until(|notice| matches!(notice, Notice::Settled)).await;
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn weights_are_published_and_older_ones_are_answered_from_the_disk() {
+    let mut bench = Bench::start().await;
+    let client = bench.client().await;
+    let published = client.declare_subscriber(keys::weights(&bench.run)).await.unwrap();
+    tokio::time::sleep(Duration::from_millis(200)).await; // the learner learns of the subscription
+    bench.snapshot(10).await;
+    let sample = tokio::time::timeout(PATIENCE, published.recv_async()).await.unwrap().unwrap();
+    assert_eq!(decode::<Snapshot>(&sample.payload().to_bytes()).unwrap().step, 10);
+    bench.snapshot(20).await;
+    for step in [10, 20] {
+        let snapshot: Snapshot = ask(&client, keys::weights_at(&bench.run, step), None).await.unwrap().unwrap();
+        assert_eq!((snapshot.step, snapshot.hash, snapshot.tensors), (step, Hash::of(&tensors(step)), tensors(step)));
+    }
+    let missing = ask::<Snapshot>(&client, keys::weights_at(&bench.run, 11), None).await.unwrap();
+    assert!(missing.unwrap_err().contains("no snapshot"));
+
+    let path = bench.run_dir.snapshot(10);
+    std::fs::write(path, "something else").unwrap();
+    let changed = ask::<Snapshot>(&client, keys::weights_at(&bench.run, 10), None).await.unwrap();
+    assert!(changed.unwrap_err().contains("was changed"));
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn garbage_is_counted_by_reason_and_answered_with_an_error() {
+    let mut bench = Bench::start().await;
+    let client = bench.client().await;
+    bench.snapshot(10).await;
+    let request = JobRequest { evaluator: name("a"), environments: vec!["hopper".into()] };
+    let good = encode(&request).unwrap();
+    let mut newer = good.clone();
+    newer[4] ^= 0xff;
+    for key in [keys::jobs(&bench.run), keys::scores(&bench.run)] {
+        for payload in [None, Some(b"GET / HTTP/1.1".to_vec()), Some(newer.clone()), Some(good[..9].to_vec())] {
+            assert!(ask::<JobReply>(&client, key.clone(), payload).await.unwrap().is_err());
+        }
+        assert!(ask::<JobReply>(&client, key, Some(vec![0; 1 << 20])).await.unwrap().is_err());
+    }
+    let wrong_kind = ask::<ScoreReply>(&client, keys::scores(&bench.run), Some(good.clone())).await.unwrap();
+    assert!(wrong_kind.is_err());
+    client.put(keys::progress(&bench.run, &name("a")), "nonsense").await.unwrap();
+    for reason in ["empty", "not_quad", "version", "truncated", "oversized", "kind"] {
+        assert!(bench.rejected(reason) > 0, "{reason} is not counted");
+    }
+
+    let job = claim_eventually(&client, &bench.run, "a").await;
+    let wrong = ScoreReport { weights: Hash::of(b"others"), ..report(&job, "a") };
+    let ScoreReply::Refused { reason } = deliver(&client, &wrong).await else { panic!("accepted") };
+    assert!(reason.contains("other weights"), "{reason}");
+    assert_eq!((bench.rejected("unknown_weights"), bench.lines()), (1, 0));
+    assert!(matches!(deliver(&client, &report(&job, "a")).await, ScoreReply::Recorded { new: 2, .. }));
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn jobs_of_evaluators_that_die_or_fall_silent_go_to_others() {
+    let mut bench = Bench::start().await;
+    bench.snapshot(10).await;
+
+    let mortal = bench.client().await;
+    let _token = mortal.liveliness().declare_token(keys::live_evaluator(&bench.run, &name("mortal"))).await.unwrap();
+    bench.until(|notice| matches!(notice, Notice::EvaluatorJoined(who) if *who == name("mortal"))).await;
+    assert_eq!(bench.metrics.evaluators.present.get(), 1);
+    let lost = claim_eventually(&mortal, &bench.run, "mortal").await;
+    mortal.close().await.unwrap();
+    let left = bench.until(|notice| matches!(notice, Notice::EvaluatorLeft(..))).await;
+    assert!(matches!(left, Notice::EvaluatorLeft(_, 1)), "{left:?}");
+
+    // Without a token only the lease tells; progress holds it up.
+    let client = bench.client().await;
+    let silent = claim_eventually(&client, &bench.run, "silent").await;
+    assert_eq!(silent.seeds, lost.seeds);
+    let working = claim_eventually(&client, &bench.run, "working").await;
+    assert!(claim(&client, &bench.run, "a").await.is_none());
+    let progress = Progress {
+        evaluator: name("working"),
+        run: bench.run.clone(),
+        job: working.id,
+        step: 10,
+        episodes_done: 1,
+        episodes_total: 2,
+        environment_steps: 40,
+        episodes: 1,
+    };
+    let start = Instant::now();
+    let again = loop {
+        client.put(keys::progress(&bench.run, &name("working")), encode(&progress).unwrap()).await.unwrap();
+        if let Some(job) = claim(&client, &bench.run, "a").await {
+            break job;
+        }
+        assert!(start.elapsed() < PATIENCE);
+        tokio::time::sleep(LEASE / 8).await;
+    };
+    assert_eq!(again.seeds, silent.seeds);
+    assert!(start.elapsed() >= LEASE / 2, "the lease was respected");
+    assert_eq!(bench.metrics.evaluation.jobs_expired.get(), 2);
+
+    for (job, evaluator) in [(&again, "a"), (&working, "working"), (&silent, "silent")] {
+        deliver(&client, &report(job, evaluator)).await;
+    }
+    assert_eq!((bench.lines(), bench.metrics.evaluation.scores_duplicate.get()), (4, 2));
+    bench.hub.send(hub::Event::TrainingEnded);
+    bench.until(|notice| matches!(notice, Notice::Settled)).await;
+}
