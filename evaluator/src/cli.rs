@@ -2,6 +2,8 @@
 
 use clap::{Parser, Subcommand};
 
+use crate::serve::{self, ServeArgs};
+
 /// Runs policies in MuJoCo, and records datasets there.
 #[derive(Debug, Parser)]
 #[command(version, arg_required_else_help = true)]
@@ -11,4 +13,15 @@ pub struct Cli {
 }
 
 #[derive(Debug, Subcommand)]
-enum Command {}
+enum Command {
+    Serve(ServeArgs),
+}
+
+impl Cli {
+    /// Does what was asked for.
+    pub fn run(self) -> anyhow::Result<()> {
+        match self.command {
+            Command::Serve(args) => serve::serve(args),
+        }
+    }
+}

@@ -1,2 +1,12 @@
 //! `evaluator`: see `evaluator --help`.
-fn main() {}
+
+use std::process::ExitCode;
+
+use clap::Parser;
+use quad_evaluator::cli::Cli;
+
+fn main() -> ExitCode {
+    quad_service::init_logging();
+    let cli = Cli::parse();
+    quad_service::run_main(|| cli.run())
+}

@@ -91,9 +91,11 @@ async fn serve_until_stopped(args: ServeArgs) -> anyhow::Result<()> {
     let mut discovery = Discovery::start(args.connect);
     let worker = Worker::new(name, metrics.clone(), discovery.runs());
     let result = tokio::select! {
+        biased;
         () = stop => Ok(()),
-        error = worker.run() => Err(error),
+        // Before the worker, which fails for want of runs when this has failed.
         error = discovery.failed() => Err(error),
+        error = worker.run() => Err(error),
     };
     let (episodes, steps) = (metrics.episodes.get(), metrics.environment_steps.get());
     info!(episodes, steps, "leaving");
