@@ -1,8 +1,15 @@
 //! The command line.
 
-use clap::{Parser, Subcommand};
+use std::num::NonZeroUsize;
+use std::path::PathBuf;
 
+use clap::{Args, Parser, Subcommand};
+use quad_dataset::EnvironmentSpec;
+use quad_dataset::environment;
+
+use crate::collect::{self, Summary};
 use crate::serve::{self, ServeArgs};
+use crate::verify::{self, Report};
 
 /// Runs policies in MuJoCo, and records datasets there.
 #[derive(Debug, Parser)]
@@ -15,6 +22,46 @@ pub struct Cli {
 #[derive(Debug, Subcommand)]
 enum Command {
     Serve(ServeArgs),
+    Collect(CollectArgs),
+    VerifyDataset(VerifyArgs),
+}
+
+/// Record a dataset of mediocre behaviour to learn from, without downloading anything
+///
+/// Trains linear policies by augmented random search, from ones that fall over at once to ones that hop well, and mixes
+/// noisy episodes of all of them into one file in D4RL's layout (HDF5; h5py reads it). About a minute on two cores. The
+/// same seed makes the same data.
+#[derive(Debug, Args)]
+struct CollectArgs {
+    /// What to act in: hopper
+    #[arg(long, value_name = "NAME", value_parser = environment::find)]
+    env: &'static EnvironmentSpec,
+    /// The file to write. It appears when it is complete
+    #[arg(long, value_name = "FILE")]
+    out: PathBuf,
+    /// Transitions to record, at least: the last episode is recorded to its end
+    #[arg(long, value_name = "N", default_value = "100000")]
+    transitions: NonZeroUsize,
+    /// Seed of everything random
+    #[arg(long, value_name = "N", default_value_t = 0)]
+    seed: u64,
+}
+
+/// Replay a recorded file one step at a time from its own states, and say how far the simulation is from it
+///
+/// The file needs infos/qpos, infos/qvel and next_observations beside what is learned from. Differences are reported, not
+/// judged: the exit code is 0 whenever the file could be replayed. A reward differs when it is more than 0.001 (relative,
+/// for rewards above 1) away from the recorded one, which rounding to float32 cannot explain.
+#[derive(Debug, Args)]
+struct VerifyArgs {
+    /// The file to replay
+    file: PathBuf,
+    /// What it was recorded in: hopper
+    #[arg(long, value_name = "NAME", value_parser = environment::find, default_value = "hopper")]
+    env: &'static EnvironmentSpec,
+    /// Print one JSON object
+    #[arg(long)]
+    json: bool,
 }
 
 impl Cli {
@@ -22,6 +69,44 @@ impl Cli {
     pub fn run(self) -> anyhow::Result<()> {
         match self.command {
             Command::Serve(args) => serve::serve(args),
+            Command::Collect(args) => {
+                let summary = collect::collect(args.env, &args.out, args.transitions.get(), args.seed)?;
+                print(&collected(&args, &summary));
+                Ok(())
+            }
+            Command::VerifyDataset(args) => {
+                let report = verify::verify(&args.file, args.env)?;
+                print(&if args.json { serde_json::to_string(&report)? } else { verified(&report) });
+                Ok(())
+            }
         }
     }
+}
+
+fn collected(args: &CollectArgs, summary: &Summary) -> String {
+    let Summary { transitions, episodes, mean_score, score_percentiles: [p50, p90, p99, max], policies, seconds } =
+        summary;
+    format!(
+        "{}: {transitions} transitions, {episodes} episodes of {policies} policies, in {seconds:.0} s\n\
+         normalised score: mean {mean_score:.1}, median {p50:.1}, p90 {p90:.1}, p99 {p99:.1}, max {max:.1}",
+        args.out.display()
+    )
+}
+
+fn verified(report: &Report) -> String {
+    let Report { transitions, obs_error, reward_error, rewards_differ, terminals_differ } = report;
+    format!(
+        "transitions        {transitions}\n\
+         observation error  median {:.1e}, p99 {:.1e}, max {:.1e}\n\
+         reward error       max {:.1e}\n\
+         rewards differ     {rewards_differ}\n\
+         terminals differ   {terminals_differ}",
+        obs_error.median, obs_error.p99, obs_error.max, reward_error.max
+    )
+}
+
+/// A command's result goes to standard output; everything else is a log line.
+#[allow(clippy::print_stdout)]
+fn print(result: &str) {
+    println!("{result}");
 }

@@ -6,11 +6,15 @@
 //!
 //! - [`environment`]: the tasks, with the semantics that D4RL's scores are defined by.
 //! - [`rollout`]: many episodes as one batch, one policy call per step.
+//! - [`collect`]: trains behaviour from random to competent and records it as a dataset.
+//! - [`verify`]: replays a recorded dataset and measures how far the simulation is from it.
 //! - [`serve`]: finds runs on the network, measures the weights they publish; [`metrics`]: what it tells Prometheus.
 //! - [`cli`]: the command line.
 
 pub mod cli;
+pub mod collect;
 pub mod environment;
 pub mod metrics;
 pub mod rollout;
 pub mod serve;
+pub mod verify;

@@ -1,0 +1,93 @@
+//! Linear policies over normalised observations.
+
+/// a = M · (s - mean) / deviation, to be clipped by whoever applies it.
+#[derive(Clone, Debug)]
+pub struct LinearPolicy {
+    /// M, action_dim × observation_dim.
+    pub weights: Vec<f64>,
+    /// What observations are normalised with.
+    pub normaliser: Normaliser,
+}
+
+impl LinearPolicy {
+    /// The policy that never moves.
+    pub fn zero(observation_dim: usize, action_dim: usize) -> Self {
+        let normaliser = Normaliser { mean: vec![0.0; observation_dim], inverse_deviation: vec![1.0; observation_dim] };
+        Self { weights: vec![0.0; action_dim * observation_dim], normaliser }
+    }
+
+    /// Fills in `action` for `observation`.
+    pub fn act(&self, observation: &[f64], action: &mut [f32]) {
+        let Normaliser { mean, inverse_deviation } = &self.normaliser;
+        for (value, row) in action.iter_mut().zip(self.weights.chunks_exact(observation.len())) {
+            let mut sum = 0.0;
+            for (i, &observed) in observation.iter().enumerate() {
+                sum += row[i] * (observed - mean[i]) * inverse_deviation[i];
+            }
+            *value = sum as f32;
+        }
+    }
+}
+
+/// Mean and inverse standard deviation of each observed value.
+#[derive(Clone, Debug)]
+pub struct Normaliser {
+    mean: Vec<f64>,
+    inverse_deviation: Vec<f64>,
+}
+
+/// Running mean and variance of observations, by Welford's recurrence; two merge by Chan's formula.
+#[derive(Clone, Debug)]
+pub struct Moments {
+    count: f64,
+    mean: Vec<f64>,
+    /// Σ (s - mean)²
+    squares: Vec<f64>,
+}
+
+impl Moments {
+    /// Of no observation.
+    pub fn new(observation_dim: usize) -> Self {
+        Self { count: 0.0, mean: vec![0.0; observation_dim], squares: vec![0.0; observation_dim] }
+    }
+
+    /// Forgets all observations.
+    pub fn clear(&mut self) {
+        self.count = 0.0;
+        self.mean.fill(0.0);
+        self.squares.fill(0.0);
+    }
+
+    /// Takes up one observation.
+    pub fn push(&mut self, observation: &[f64]) {
+        self.count += 1.0;
+        for (i, value) in observation.iter().enumerate() {
+            let delta = value - self.mean[i];
+            self.mean[i] += delta / self.count;
+            self.squares[i] += delta * (value - self.mean[i]);
+        }
+    }
+
+    /// Takes up all that `other` has seen.
+    pub fn merge(&mut self, other: &Self) {
+        let count = self.count + other.count;
+        if other.count == 0.0 {
+            return;
+        }
+        for i in 0..self.mean.len() {
+            let delta = other.mean[i] - self.mean[i];
+            self.mean[i] += delta * other.count / count;
+            self.squares[i] += other.squares[i] + delta * delta * self.count * other.count / count;
+        }
+        self.count = count;
+    }
+
+    /// What normalises what has been seen. A value that never changed is only centred.
+    pub fn normaliser(&self) -> Normaliser {
+        let inverse = |squares: &f64| {
+            let deviation = (squares / (self.count - 1.0).max(1.0)).sqrt();
+            if deviation > 1e-7 { 1.0 / deviation } else { 1.0 }
+        };
+        Normaliser { mean: self.mean.clone(), inverse_deviation: self.squares.iter().map(inverse).collect() }
+    }
+}

@@ -1,0 +1,111 @@
+//! Records a dataset of mediocre behaviour, so that a fresh machine needs no download.
+//!
+//! [`search`] trains [`linear`] policies, and [`record`] mixes episodes of all of them, from the first to the last, into
+//! one file in D4RL's layout: something like D4RL's "medium-replay", the replay buffer of a policy that was learning.
+//! The file is a function of the number of transitions and the seed; the number of threads does not change it.
+
+pub mod linear;
+pub mod record;
+pub mod search;
+
+use std::path::Path;
+use std::time::Instant;
+
+use quad_dataset::{D4rlWriter, DatasetError, EnvironmentSpec, Metadata};
+use rand::SeedableRng;
+use rand_chacha::ChaCha8Rng;
+use serde::Serialize;
+use thiserror::Error;
+use tracing::info;
+
+use crate::environment::EnvironmentError;
+use search::Search;
+
+/// Steps that the search may take for each transition that is to be recorded…
+const SEARCH_STEPS_PER_TRANSITION: u64 = 8;
+/// …up to this many: by then it hops well for most seeds, and a minute of two cores is over.
+const MAX_SEARCH_STEPS: u64 = 800_000;
+
+/// The streams of the file's seed.
+const SEARCH_STREAM: u64 = 0;
+const RECORD_STREAM: u64 = 1;
+
+/// What was recorded.
+#[derive(Debug, Serialize)]
+pub struct Summary {
+    /// Rows in the file.
+    pub transitions: usize,
+    /// Episodes in the file.
+    pub episodes: usize,
+    /// Mean over the episodes of D4RL's normalised score.
+    pub mean_score: f64,
+    /// The 50th, 90th and 99th percentile of the same, and its maximum.
+    pub score_percentiles: [f64; 4],
+    /// Policies that the episodes are of.
+    pub policies: usize,
+    /// Wall-clock time of it all.
+    pub seconds: f64,
+}
+
+/// Why nothing was recorded.
+#[derive(Debug, Error)]
+pub enum CollectError {
+    /// The file could not be written.
+    #[error(transparent)]
+    Dataset(#[from] DatasetError),
+    /// The environment could not be made.
+    #[error(transparent)]
+    Environment(#[from] EnvironmentError),
+}
+
+/// Trains, then records at least `transitions` transitions, in whole episodes, to `path`.
+pub fn collect(
+    spec: &'static EnvironmentSpec,
+    path: &Path,
+    transitions: usize,
+    seed: u64,
+) -> Result<Summary, CollectError> {
+    let start = Instant::now();
+    let mut writer = D4rlWriter::create(path, spec)?;
+
+    let budget = (SEARCH_STEPS_PER_TRANSITION * transitions as u64).min(MAX_SEARCH_STEPS);
+    let mut search = Search::new(spec, stream(seed, SEARCH_STREAM))?;
+    let mut policies = vec![search.policy().clone()];
+    let mut announced = 0;
+    while search.environment_steps() < budget {
+        let mean_return = search.iterate();
+        policies.push(search.policy().clone());
+        let percent = 100 * search.environment_steps() / budget;
+        if percent >= announced + 10 {
+            announced = percent;
+            let (iterations, score) = (policies.len() - 1, spec.normalised_score(mean_return));
+            info!("training: {percent} % of its steps, {iterations} iterations, normalised score {score:.1}");
+        }
+    }
+
+    let mut scores = record::record(spec, &policies, transitions, stream(seed, RECORD_STREAM), &mut writer)?;
+    let rows = writer.rows();
+    let iteration = policies.len() as i64 - 1;
+    writer.finish(&Metadata {
+        algorithm: "augmented random search, all iterations, with action noise",
+        iteration,
+        seed,
+    })?;
+
+    scores.sort_by(f64::total_cmp);
+    let percentile = |percent: usize| scores[(scores.len() - 1) * percent / 100];
+    Ok(Summary {
+        transitions: rows,
+        episodes: scores.len(),
+        mean_score: scores.iter().sum::<f64>() / scores.len() as f64,
+        score_percentiles: [50, 90, 99, 100].map(percentile),
+        policies: policies.len(),
+        seconds: start.elapsed().as_secs_f64(),
+    })
+}
+
+fn stream(seed: u64, stream: u64) -> ChaCha8Rng {
+    let mut random = ChaCha8Rng::seed_from_u64(seed);
+    random.set_stream(stream);
+    random
+}

@@ -1,0 +1,155 @@
+//! Episodes of a search's policies, from its first to its last, mixed into one dataset.
+
+use quad_dataset::{D4rlWriter, EnvironmentSpec, Row};
+use rand::{Rng, SeedableRng};
+use rand_chacha::ChaCha8Rng;
+use rand_distr::{Distribution, StandardNormal};
+use rayon::prelude::*;
+use tracing::info;
+
+use super::CollectError;
+use super::linear::LinearPolicy;
+use crate::environment::{self, Environment, EnvironmentError, Step};
+
+/// Episodes by their normalised score: where a band begins, and its share of the transitions.
+///
+/// Left to itself, a search's history is mostly long, good episodes, and there is little to learn offline from what is
+/// good already. These shares make the mixture that offline learning is for, whatever the seed: a fifth of the
+/// transitions, but three quarters of the episodes, fall over at once and pull the mean score down to about 10; most of
+/// the others hop a while with one gait or another; and about one in seven shows how far it can be taken. Good actions
+/// are there to be found, diluted by worse ones in the same states.
+const MIXTURE: [(f64, f64); 6] =
+    [(f64::NEG_INFINITY, 0.12), (3.0, 0.08), (10.0, 0.2), (30.0, 0.3), (50.0, 0.15), (80.0, 0.15)];
+
+/// Each episode adds Gaussian noise to its actions (which span ±1), of a standard deviation drawn uniformly from 0 to
+/// this: from the bare policy, whose actions say nothing about others, to noise that few gaits survive.
+const MAX_NOISE: f64 = 0.5;
+
+/// Episodes run at a time, in parallel.
+const ROUND: usize = 32;
+
+/// Once this many times the wanted transitions were simulated, any episode is taken: a search that never got good has
+/// none for the upper bands.
+const PATIENCE: usize = 10;
+
+/// The stream that the noise of actions is drawn from, among those of an episode's seed.
+const NOISE_STREAM: u64 = 3;
+
+/// Records whole episodes, each of a policy drawn from `policies`, until there are `transitions` rows; answers with each
+/// episode's normalised score.
+pub fn record(
+    spec: &'static EnvironmentSpec,
+    policies: &[LinearPolicy],
+    transitions: usize,
+    mut random: ChaCha8Rng,
+    writer: &mut D4rlWriter,
+) -> Result<Vec<f64>, CollectError> {
+    let mut recorders = (0..ROUND).map(|_| Recorder::new(spec)).collect::<Result<Vec<_>, EnvironmentError>>()?;
+    let mut room = MIXTURE.map(|(_, share)| share * transitions as f64);
+    let mut scores = Vec::new();
+    let (mut simulated, mut announced) = (0, 0);
+    loop {
+        let tasks: Vec<(&LinearPolicy, u64)> =
+            (0..ROUND).map(|_| (&policies[random.random_range(0..policies.len())], random.random())).collect();
+        recorders
+            .par_iter_mut()
+            .zip(tasks)
+            .with_max_len(1)
+            .for_each(|(recorder, (policy, seed))| recorder.run(policy, seed));
+        for recorder in &recorders {
+            simulated += recorder.steps.len();
+            let score = spec.normalised_score(recorder.steps.iter().map(|step| step.reward).sum());
+            let band = MIXTURE.iter().rposition(|&(from, _)| score >= from).unwrap_or(0);
+            if room[band] > 0.0 || simulated > PATIENCE * transitions {
+                room[band] -= recorder.steps.len() as f64;
+                recorder.write(writer)?;
+                scores.push(score);
+            }
+            if writer.rows() >= transitions {
+                return Ok(scores);
+            }
+        }
+        let percent = 100 * writer.rows() / transitions;
+        if percent >= announced + 10 {
+            announced = percent;
+            info!("recording: {percent} % of the transitions, {} episodes", scores.len());
+        }
+    }
+}
+
+/// An environment and the episode last run in it.
+struct Recorder {
+    spec: &'static EnvironmentSpec,
+    environment: Box<dyn Environment>,
+    /// (steps + 1) × observation_dim, as the next two: from the state before the first step to that after the last.
+    observations: Vec<f64>,
+    qpos: Vec<f64>,
+    qvel: Vec<f64>,
+    /// steps × action_dim, as they were applied.
+    actions: Vec<f64>,
+    steps: Vec<Step>,
+}
+
+impl Recorder {
+    fn new(spec: &'static EnvironmentSpec) -> Result<Self, EnvironmentError> {
+        Ok(Self {
+            spec,
+            environment: environment::make(spec)?,
+            observations: Vec::new(),
+            qpos: Vec::new(),
+            qvel: Vec::new(),
+            actions: Vec::new(),
+            steps: Vec::new(),
+        })
+    }
+
+    fn run(&mut self, policy: &LinearPolicy, seed: u64) {
+        for values in [&mut self.observations, &mut self.qpos, &mut self.qvel, &mut self.actions] {
+            values.clear();
+        }
+        self.steps.clear();
+        let mut random = ChaCha8Rng::seed_from_u64(seed);
+        random.set_stream(NOISE_STREAM);
+        let deviation = MAX_NOISE * random.random::<f64>();
+        let mut action = vec![0.0; self.spec.action_dim];
+        self.environment.reset(seed);
+        self.keep_state();
+        loop {
+            policy.act(self.environment.observation(), &mut action);
+            for value in &mut action {
+                let noise: f64 = StandardNormal.sample(&mut random);
+                *value = (f64::from(*value) + deviation * noise).clamp(-1.0, 1.0) as f32;
+                self.actions.push(f64::from(*value));
+            }
+            let step = self.environment.step(&action);
+            self.steps.push(step);
+            self.keep_state();
+            if step.terminated || step.truncated {
+                return;
+            }
+        }
+    }
+
+    fn keep_state(&mut self) {
+        self.observations.extend_from_slice(self.environment.observation());
+        self.qpos.extend_from_slice(self.environment.qpos());
+        self.qvel.extend_from_slice(self.environment.qvel());
+    }
+
+    fn write(&self, writer: &mut D4rlWriter) -> Result<(), CollectError> {
+        let EnvironmentSpec { observation_dim, action_dim, qpos_dim, qvel_dim, .. } = *self.spec;
+        for (i, step) in self.steps.iter().enumerate() {
+            writer.push(&Row {
+                observation: &self.observations[i * observation_dim..][..observation_dim],
+                action: &self.actions[i * action_dim..][..action_dim],
+                next_observation: &self.observations[(i + 1) * observation_dim..][..observation_dim],
+                reward: step.reward,
+                terminal: step.terminated,
+                timeout: step.truncated && !step.terminated,
+                qpos: &self.qpos[i * qpos_dim..][..qpos_dim],
+                qvel: &self.qvel[i * qvel_dim..][..qvel_dim],
+            })?;
+        }
+        Ok(())
+    }
+}

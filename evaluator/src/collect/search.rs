@@ -1,0 +1,141 @@
+//! Augmented random search: behaviour that learns in seconds, without a gradient.
+//!
+//! ARS V2-t of Mania, Guy and Recht, "Simple random search of static linear policies is competitive for reinforcement
+//! learning" (2018): perturb the weights of a linear policy in random directions, forwards and backwards, and move along
+//! the better directions by how much better they were; observations are normalised by all that were seen; the bonus for
+//! being alive is left out of what is maximised, or standing still is a local optimum.
+
+use quad_dataset::EnvironmentSpec;
+use rand::Rng;
+use rand_chacha::ChaCha8Rng;
+use rand_distr::{Distribution, StandardNormal};
+use rayon::prelude::*;
+
+use super::linear::{LinearPolicy, Moments};
+use crate::environment::{self, Environment, EnvironmentError};
+
+/// N: directions tried in one iteration, each forwards and backwards.
+const DIRECTIONS: usize = 8;
+/// b: the directions that count, by the better of their two returns.
+const BEST: usize = 4;
+/// ν: how far the weights are perturbed.
+const PERTURBATION: f64 = 0.05;
+/// α: length of a step.
+const STEP_SIZE: f64 = 0.02;
+/// Taken off each step's reward.
+const ALIVE_BONUS: f64 = 1.0;
+
+/// A search and the policy it has come to.
+pub struct Search {
+    policy: LinearPolicy,
+    moments: Moments,
+    random: ChaCha8Rng,
+    trials: Vec<Trial>,
+    environment_steps: u64,
+}
+
+/// One perturbed policy and the environment it is tried in.
+struct Trial {
+    environment: Box<dyn Environment>,
+    policy: LinearPolicy,
+    action: Vec<f32>,
+    moments: Moments,
+    shaped_return: f64,
+    episode_return: f64,
+    steps: u64,
+}
+
+impl Search {
+    /// Starts from the policy that never moves.
+    pub fn new(spec: &EnvironmentSpec, random: ChaCha8Rng) -> Result<Self, EnvironmentError> {
+        let policy = LinearPolicy::zero(spec.observation_dim, spec.action_dim);
+        let trial = |_| {
+            Ok(Trial {
+                environment: environment::make(spec)?,
+                policy: policy.clone(),
+                action: vec![0.0; spec.action_dim],
+                moments: Moments::new(spec.observation_dim),
+                shaped_return: 0.0,
+                episode_return: 0.0,
+                steps: 0,
+            })
+        };
+        let trials = (0..2 * DIRECTIONS).map(trial).collect::<Result<_, EnvironmentError>>()?;
+        Ok(Self { policy, moments: Moments::new(spec.observation_dim), random, trials, environment_steps: 0 })
+    }
+
+    /// The policy as it is now.
+    pub fn policy(&self) -> &LinearPolicy {
+        &self.policy
+    }
+
+    /// Steps taken in all trials so far.
+    pub fn environment_steps(&self) -> u64 {
+        self.environment_steps
+    }
+
+    /// One iteration; answers with the mean return of its trials.
+    ///
+    /// Trials run in parallel, but everything random is drawn and everything learned is summed in their order, so the
+    /// result does not depend on the number of threads.
+    pub fn iterate(&mut self) -> f64 {
+        let normal = StandardNormal;
+        let directions: Vec<Vec<f64>> = (0..DIRECTIONS)
+            .map(|_| (0..self.policy.weights.len()).map(|_| normal.sample(&mut self.random)).collect())
+            .collect();
+        let seeds: Vec<u64> = (0..self.trials.len()).map(|_| self.random.random()).collect();
+
+        for (trial, (direction, sign)) in
+            self.trials.iter_mut().zip(directions.iter().flat_map(|direction| [(direction, 1.0), (direction, -1.0)]))
+        {
+            trial.policy.normaliser = self.policy.normaliser.clone();
+            for ((weight, centre), delta) in trial.policy.weights.iter_mut().zip(&self.policy.weights).zip(direction) {
+                *weight = centre + sign * PERTURBATION * delta;
+            }
+        }
+        self.trials.par_iter_mut().zip(&seeds).with_max_len(1).for_each(|(trial, &seed)| trial.run(seed));
+        for trial in &self.trials {
+            self.moments.merge(&trial.moments);
+            self.environment_steps += trial.steps;
+        }
+
+        let mut pairs: Vec<(f64, f64, &Vec<f64>)> = self
+            .trials
+            .chunks_exact(2)
+            .zip(&directions)
+            .map(|(pair, direction)| (pair[0].shaped_return, pair[1].shaped_return, direction))
+            .collect();
+        pairs.sort_by(|a, b| b.0.max(b.1).total_cmp(&a.0.max(a.1)));
+        pairs.truncate(BEST);
+        let returns: Vec<f64> = pairs.iter().flat_map(|pair| [pair.0, pair.1]).collect();
+        let mean = returns.iter().sum::<f64>() / returns.len() as f64;
+        let variance = returns.iter().map(|value| (value - mean).powi(2)).sum::<f64>() / returns.len() as f64;
+        let rate = STEP_SIZE / (BEST as f64 * variance.sqrt().max(1e-6));
+        for (forwards, backwards, direction) in pairs {
+            for (weight, delta) in self.policy.weights.iter_mut().zip(direction) {
+                *weight += rate * (forwards - backwards) * delta;
+            }
+        }
+        self.policy.normaliser = self.moments.normaliser();
+        self.trials.iter().map(|trial| trial.episode_return).sum::<f64>() / self.trials.len() as f64
+    }
+}
+
+impl Trial {
+    fn run(&mut self, seed: u64) {
+        self.moments.clear();
+        (self.shaped_return, self.episode_return, self.steps) = (0.0, 0.0, 0);
+        self.environment.reset(seed);
+        loop {
+            self.moments.push(self.environment.observation());
+            self.policy.act(self.environment.observation(), &mut self.action);
+            let step = self.environment.step(&self.action);
+            self.shaped_return += step.reward - ALIVE_BONUS;
+            self.episode_return += step.reward;
+            self.steps += 1;
+            if step.terminated || step.truncated {
+                return;
+            }
+        }
+    }
+}
