@@ -12,7 +12,7 @@
 //! - [`prometheus`]: one to start, and what to ask any; [`dashboard`]: what Grafana's panels ask it.
 //!
 //! A helper that cannot do its work panics, and so fails its test.
-#![allow(clippy::unwrap_used, clippy::expect_used)]
+#![allow(clippy::unwrap_used, clippy::expect_used, clippy::print_stderr)]
 
 pub mod dashboard;
 pub mod http;

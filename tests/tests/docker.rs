@@ -2,6 +2,7 @@
 //!
 //! Base images come from a registry or, where there is none, from a script that makes stand-ins for them: the one that
 //! QUAD_STAND_INS names, else ../shared/docker/stand-ins. Building takes minutes, so this runs only when asked for.
+#![allow(clippy::expect_used, clippy::print_stderr)]
 
 use std::collections::HashSet;
 use std::path::{Path, PathBuf};
