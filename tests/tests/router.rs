@@ -3,9 +3,9 @@
 
 use std::time::Duration;
 
-use quad_tests::eventually;
 use quad_tests::router::router;
 use quad_tests::system::{Scratch, Setting, free_port};
+use quad_tests::{eventually, http};
 
 const PATIENCE: Duration = Duration::from_secs(60);
 
@@ -45,4 +45,28 @@ fn one_evaluator_serves_two_learners_that_listen_themselves() {
         assert!(status.success(), "the learner ended with {status}");
         learner.assert_complete(&setting);
     }
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn scores_measured_while_cut_off_are_delivered_later() {
+    let scratch = Scratch::new();
+    let endpoint = format!("tcp/127.0.0.1:{}", free_port());
+    let setting = Setting { steps: 10, eval_interval: 10, episodes: 5, candidates: 500, hidden: 256, seed: 1 };
+    let session = router(&endpoint).await;
+    let mut learner = scratch.learner_with("run", setting, &["--connect", &endpoint]);
+    let evaluator = scratch.evaluator("cut-off", &endpoint);
+    evaluator.process.wait_for_log("evaluating", PATIENCE);
+    session.close().await.unwrap();
+    drop(session);
+    // It finds out that nobody answers when it has the scores.
+    evaluator.process.wait_for_log("nobody answered", PATIENCE);
+    assert!(learner.scores().is_empty());
+
+    let _session = router(&endpoint).await;
+    let status = learner.process.wait(PATIENCE);
+    assert!(status.success(), "the learner ended with {status}");
+    learner.assert_complete(&setting);
+    let page = http::metrics(&evaluator.metrics()).unwrap();
+    let measured = http::sum(&page, "quad_evaluator_episodes_total", "");
+    assert_eq!(measured, f64::from(setting.episodes), "nothing was measured twice");
 }
