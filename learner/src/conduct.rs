@@ -1,16 +1,18 @@
 //! The main loop of a run: brings the network up beside the threads, shows what happens, decides when it is over.
 
-use std::pin::Pin;
+use std::thread;
 use std::time::{Duration, Instant};
 
 use anyhow::anyhow;
 use quad_protocol::Name;
 use quad_service::Endpoints;
+use tokio::runtime::Handle;
 use tokio::sync::mpsc::UnboundedReceiver;
+use tokio::sync::oneshot;
 use tokio::time::{MissedTickBehavior, interval, timeout};
 use zenoh::Session;
 
-use crate::display::Display;
+use crate::display::{Display, evaluators};
 use crate::metrics::Metrics;
 use crate::notice::Notice;
 use crate::report::Spread;
@@ -27,17 +29,28 @@ const EVALUATOR_PATIENCE: Duration = Duration::from_secs(10);
 const CLOSE_PATIENCE: Duration = Duration::from_secs(5);
 
 /// A Zenoh session that may still wait for a router.
-pub type Opening = Pin<Box<dyn Future<Output = anyhow::Result<Session>> + Send>>;
+pub type Opening = oneshot::Receiver<anyhow::Result<Session>>;
 
 /// Starts to open the session. What cannot work, like listening at a port in use, is an error at once.
 pub async fn open_network(endpoints: &Endpoints) -> anyhow::Result<Opening> {
-    let endpoints = endpoints.clone();
-    let mut opening: Opening = Box::pin(async move { Ok(quad_service::open_session(&endpoints).await?) });
+    let (tell, mut opening) = oneshot::channel();
+    let (endpoints, runtime) = (endpoints.clone(), Handle::current());
+    // Zenoh waits for a router without giving way to other tasks; this thread may, and ends with the process.
+    thread::Builder::new().name("session".to_owned()).spawn(move || {
+        let session = runtime.block_on(quad_service::open_session(&endpoints));
+        tell.send(session.map_err(anyhow::Error::from)).ok();
+    })?;
     match timeout(SESSION_PATIENCE, &mut opening).await {
-        Ok(session) => Ok(Box::pin(std::future::ready(Ok(session?)))),
+        Ok(session) => {
+            let (tell, opened) = oneshot::channel();
+            tell.send(Ok(session??)).ok();
+            Ok(opened)
+        }
         Err(_) => Ok(opening),
     }
 }
+
+type Opened = Result<anyhow::Result<Session>, oneshot::error::RecvError>;
 
 /// How a run ended.
 #[derive(Debug)]
@@ -101,7 +114,7 @@ impl Conductor {
                 trained = &mut self.threads.trained, if training => {
                     training = false;
                     match trained {
-                        Ok(Ok(Outcome::Completed)) => self.training_completed(),
+                        Ok(Ok(Outcome::Completed)) => {}
                         Ok(Ok(Outcome::Stopped { .. })) => return Ending::Interrupted,
                         Ok(Err(error)) => return Ending::Failed(error),
                         Err(_) => return Ending::Failed(anyhow!("the training thread panicked")),
@@ -131,8 +144,8 @@ impl Conductor {
         Ending::Complete
     }
 
-    async fn go_online(&mut self, session: anyhow::Result<Session>) -> anyhow::Result<Wire> {
-        let session = session?;
+    async fn go_online(&mut self, session: Opened) -> anyhow::Result<Wire> {
+        let session = session??;
         self.reachable_at = quad_service::reachable_at(&session, &self.endpoints).await?;
         let endpoints = RunEndpoints { zenoh: self.reachable_at.clone(), metrics: self.metrics_address.clone() };
         let ready = || Ok(self.run_dir.write_endpoints(&endpoints)?);
@@ -141,18 +154,6 @@ impl Conductor {
         let (zenoh, metrics) = (endpoints.zenoh.join(", "), &endpoints.metrics);
         self.display.say(&format!("run {} is at {zenoh}, its metrics at http://{metrics}/metrics", self.run));
         Ok(wire)
-    }
-
-    fn training_completed(&self) {
-        let pending = self.metrics.evaluation.episodes_pending.get();
-        let present = self.metrics.evaluators.present.get();
-        let text = match pending {
-            0 => "training is done".to_owned(),
-            _ => {
-                format!("training is done; waiting for the scores of {pending} episodes ({present} evaluators present)")
-            }
-        };
-        self.display.say(&text);
     }
 
     fn tell(&mut self, notice: Notice) {
@@ -170,6 +171,11 @@ impl Conductor {
                 self.display.scored(step, mean);
                 let std = std.map(|std| format!(" ± {std:.2}")).unwrap_or_default();
                 format!("step {step}: score {mean:.2}{std} over {} episodes", values.len())
+            }
+            Notice::Trained { pending: 0 } => "training is done".to_owned(),
+            Notice::Trained { pending } => {
+                let present = evaluators(self.metrics.evaluators.present.get());
+                format!("training is done; waiting for the scores of {pending} episodes ({present} here)")
             }
             Notice::Settled | Notice::Failed(_) => return,
         };

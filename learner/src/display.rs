@@ -76,12 +76,13 @@ impl Display {
         match &self.bar {
             Some(bar) => {
                 bar.set_position(step);
-                bar.set_message(self.figures(step));
+                bar.set_message(format!("{}\n{}", self.training_figures(step), self.evaluation_figures()));
             }
             None if training && now.duration_since(self.last_line) >= LINE => {
                 self.last_line = now;
                 let percent = 100.0 * step as f64 / self.steps as f64;
-                info!("step {step}/{} ({percent:.0} %), {}", self.steps, self.figures(step));
+                let (training, evaluation) = (self.training_figures(step), self.evaluation_figures());
+                info!("step {step}/{} ({percent:.0} %), {training}, {evaluation}", self.steps);
             }
             None => {}
         }
@@ -94,7 +95,7 @@ impl Display {
         }
     }
 
-    fn figures(&self, step: u64) -> String {
+    fn training_figures(&self, step: u64) -> String {
         let training = &self.metrics.training;
         let mut parts = Vec::new();
         if step < self.steps {
@@ -109,11 +110,11 @@ impl Display {
         parts.push(format!("λ {:.3}", training.lambda_mean.get()));
         parts.push(format!("critic loss {:.3}", training.critic_loss.get()));
         parts.push(format!("BC loss {:.3}", training.bc_loss.get()));
-        parts.push(match self.metrics.evaluators.present.get() {
-            0 => "no evaluator".to_owned(),
-            1 => "1 evaluator".to_owned(),
-            count => format!("{count} evaluators"),
-        });
+        parts.join(", ")
+    }
+
+    fn evaluation_figures(&self) -> String {
+        let mut parts = vec![evaluators(self.metrics.evaluators.present.get())];
         let pending = self.metrics.evaluation.episodes_pending.get();
         if pending > 0 {
             parts.push(format!("{pending} episodes to score"));
@@ -129,5 +130,14 @@ impl Display {
         let (Some((start, first)), Some((end, last))) = (self.samples.front(), self.samples.back()) else { return 0.0 };
         let seconds = end.duration_since(*start).as_secs_f64();
         if seconds > 0.0 { (last - first) as f64 / seconds } else { 0.0 }
+    }
+}
+
+/// "2 evaluators".
+pub fn evaluators(count: i64) -> String {
+    match count {
+        0 => "no evaluator".to_owned(),
+        1 => "1 evaluator".to_owned(),
+        _ => format!("{count} evaluators"),
     }
 }

@@ -40,8 +40,8 @@ pub enum Event {
         /// Its hash.
         weights: Hash,
     },
-    /// No further evaluation will follow.
-    TrainingEnded,
+    /// All gradient steps are done; no further evaluation will follow.
+    TrainingCompleted,
     /// The Zenoh session is there.
     Online(Session),
     /// Somebody asks for a job.
@@ -76,7 +76,7 @@ pub struct Hub {
     session: Option<Session>,
     present: BTreeSet<Name>,
     last_seen: BTreeMap<Name, Instant>,
-    training_ended: bool,
+    training_completed: bool,
 }
 
 /// Why a message from the wire was not accepted.
@@ -126,7 +126,7 @@ impl Hub {
             session: None,
             present: BTreeSet::new(),
             last_seen: BTreeMap::new(),
-            training_ended: false,
+            training_completed: false,
         }
     }
 
@@ -153,8 +153,9 @@ impl Hub {
                 let seeds = episode_seeds(self.plan.seed, step, self.plan.episodes);
                 self.scoreboard.add_evaluation(step, weights, &seeds);
             }
-            Event::TrainingEnded => {
-                self.training_ended = true;
+            Event::TrainingCompleted => {
+                self.training_completed = true;
+                self.notices.send(Notice::Trained { pending: self.scoreboard.pending() }).ok();
                 self.settle();
             }
             Event::Online(session) => self.session = Some(session),
@@ -290,8 +291,8 @@ impl Hub {
     }
 
     fn settle(&mut self) {
-        if self.training_ended && self.scoreboard.pending() == 0 {
-            self.training_ended = false; // said once
+        if self.training_completed && self.scoreboard.pending() == 0 {
+            self.training_completed = false; // said once
             self.notices.send(Notice::Settled).ok();
         }
     }

@@ -23,7 +23,12 @@ pub enum Notice {
         /// The scores, in the order of the evaluation's seeds.
         scores: Vec<EpisodeScore>,
     },
-    /// Training has ended and no score is outstanding.
+    /// All gradient steps are done, and every snapshot was handed to evaluation.
+    Trained {
+        /// Episodes that have no score yet.
+        pending: usize,
+    },
+    /// All gradient steps are done, and no score is outstanding.
     Settled,
     /// The run cannot go on.
     Failed(anyhow::Error),

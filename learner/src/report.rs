@@ -72,7 +72,7 @@ pub struct RunReport {
     pub dataset_score: f64,
     /// Its evaluations by step.
     pub evaluations: Vec<EvaluationReport>,
-    /// Mean score of the last 3 complete evaluations (of all, if they are fewer).
+    /// Mean score of the last 3 complete evaluations; absent if they are fewer.
     pub mean_last_3: Option<f64>,
     /// The same of the last 5.
     pub mean_last_5: Option<f64>,
@@ -128,7 +128,7 @@ impl RunReport {
             })
             .collect();
         let complete: Vec<_> = evaluations.iter().filter(|e| e.complete).map(|e| e.score.mean).collect();
-        let last = |count: usize| Spread::of(&complete[complete.len().saturating_sub(count)..]).map(|s| s.mean);
+        let last = |count: usize| Spread::of(&complete[complete.len().checked_sub(count)?..]).map(|spread| spread.mean);
         let (mean_last_3, mean_last_5) = (last(3), last(5));
         Self {
             dir: path.to_owned(),

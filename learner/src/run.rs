@@ -1,5 +1,6 @@
 //! `learner train` and `learner report`, from the command line to the exit.
 
+use std::io::{ErrorKind, Write};
 use std::path::{Path, PathBuf};
 use std::time::{SystemTime, UNIX_EPOCH};
 
@@ -40,15 +41,18 @@ fn report(args: &ReportArgs) -> anyhow::Result<()> {
         info!("learning curves: {}", path.display());
     }
     match args.json {
-        true => print(&serde_json::to_string_pretty(&report)?),
-        false => print(report.table().trim_end()),
+        true => print(&serde_json::to_string_pretty(&report)?)?,
+        false => print(report.table().trim_end())?,
     }
     Ok(())
 }
 
-#[allow(clippy::print_stdout)] // results, not logs, go to stdout
-fn print(text: &str) {
-    println!("{text}");
+/// Results go to stdout, logs do not. Whoever reads may stop at any time, like `head` does.
+fn print(text: &str) -> std::io::Result<()> {
+    match writeln!(std::io::stdout(), "{text}") {
+        Err(error) if error.kind() == ErrorKind::BrokenPipe => Ok(()),
+        result => result,
+    }
 }
 
 fn train(args: &TrainArgs) -> anyhow::Result<()> {
@@ -86,7 +90,10 @@ async fn conduct(
     let (metrics, registry) = Metrics::new(&run, steps)?;
     let server = quad_service::serve_metrics(args.metrics, registry).await?;
     let endpoints = endpoints(args, config.experiment.eval_interval);
-    let opening = open_network(&endpoints).await?;
+    let opening = open_network(&endpoints).await.hint(
+        "if the port is taken, perhaps by another learner, choose a free one with --listen tcp/127.0.0.1:0, \
+         or join a router with --connect",
+    )?;
     // From here on nothing outside can be wrong any more, so a refused start leaves no folder behind.
     let run_dir = RunDir::create(path, config)?;
     let (notify, notices) = mpsc::unbounded_channel();
@@ -127,7 +134,7 @@ fn conclude(run_dir: &RunDir, config: &RunConfig, ending: Ending) -> anyhow::Res
         plot::learning_curves(&picture, std::slice::from_ref(&report))?;
         text = format!("\n{}\nlearning curve: {}\n", report.table(), picture.display());
     }
-    print(&format!("{text}run folder: {folder}"));
+    print(&format!("{text}run folder: {folder}"))?;
     let kept = format!("snapshots, metrics and scores so far are kept in {folder}");
     match ending {
         Ending::Complete => Ok(()),

@@ -150,9 +150,11 @@ impl Trainer {
             stop: &self.stop,
         };
         let plan = Plan { steps: *steps, eval_interval: *eval_interval };
-        let outcome = train(&mut agent, &self.transitions, &mut sampler, plan, &outlets);
-        self.weights.send(weights::Event::TrainingEnded);
-        Ok(outcome?)
+        let outcome = train(&mut agent, &self.transitions, &mut sampler, plan, &outlets)?;
+        if outcome == Outcome::Completed {
+            self.weights.send(weights::Event::TrainingCompleted);
+        }
+        Ok(outcome)
     }
 }
 

@@ -28,8 +28,8 @@ const IDLE: Duration = Duration::from_secs(60);
 pub enum Event {
     /// A new snapshot, from the training thread.
     Snapshot(train::Snapshot),
-    /// No snapshot will follow.
-    TrainingEnded,
+    /// All gradient steps are done; no snapshot will follow.
+    TrainingCompleted,
     /// The Zenoh session is there; publish with this.
     Online(Publisher<'static>),
     /// Somebody asks for `weights/<step>`.
@@ -85,7 +85,7 @@ impl WeightKeeper {
                         self.notices.send(Notice::Failed(error)).ok();
                     }
                 }
-                Some(Event::TrainingEnded) => self.hub.send(hub::Event::TrainingEnded),
+                Some(Event::TrainingCompleted) => self.hub.send(hub::Event::TrainingCompleted),
                 Some(Event::Online(publisher)) => self.publisher = Some(publisher),
                 Some(Event::Query(query)) => self.answer(&query),
                 Some(Event::Stop) => return,

@@ -1,4 +1,5 @@
 //! The learner's side of the wire, spoken to by made-up evaluators over TCP.
+#![allow(clippy::unwrap_used, clippy::expect_used)]
 
 use std::net::TcpListener;
 use std::time::{Duration, Instant};
@@ -208,7 +209,7 @@ async fn a_job_goes_out_and_its_scores_are_on_disk_before_the_thanks() {
     };
     assert_eq!(scores.len(), 4);
     assert_eq!(bench.metrics.evaluation.step.get(), 10);
-    bench.weights.send(weights::Event::TrainingEnded);
+    bench.weights.send(weights::Event::TrainingCompleted);
     bench.until(|notice| matches!(notice, Notice::Settled)).await;
 }
 
@@ -312,6 +313,6 @@ async fn jobs_of_evaluators_that_die_or_fall_silent_go_to_others() {
         deliver(&client, &report(job, evaluator)).await;
     }
     assert_eq!((bench.lines(), bench.metrics.evaluation.scores_duplicate.get()), (4, 2));
-    bench.hub.send(hub::Event::TrainingEnded);
+    bench.hub.send(hub::Event::TrainingCompleted);
     bench.until(|notice| matches!(notice, Notice::Settled)).await;
 }

@@ -1,4 +1,5 @@
 //! A run folder as the learner writes it, and the report and the picture made from it.
+#![allow(clippy::unwrap_used, clippy::expect_used)]
 
 use std::path::Path;
 

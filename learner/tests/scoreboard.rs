@@ -1,4 +1,5 @@
 //! The scoreboard under a clock of the test's own.
+#![allow(clippy::unwrap_used, clippy::expect_used)]
 
 use std::time::{Duration, Instant};
 
