@@ -1,0 +1,100 @@
+//! What a frame claims to hold is not allocated before it is known to be there.
+#![allow(clippy::unwrap_used, clippy::expect_used)]
+
+use std::alloc::{GlobalAlloc, Layout, System};
+use std::cell::Cell;
+
+use quad_protocol::*;
+
+/// The system's allocator, with a note of the largest allocation of each thread.
+struct Watched;
+
+thread_local! {
+    static LARGEST: Cell<usize> = const { Cell::new(0) };
+}
+
+fn note(size: usize) {
+    LARGEST.set(LARGEST.get().max(size));
+}
+
+// SAFETY: everything is handed on to the system's allocator as it came.
+unsafe impl GlobalAlloc for Watched {
+    unsafe fn alloc(&self, layout: Layout) -> *mut u8 {
+        note(layout.size());
+        unsafe { System.alloc(layout) }
+    }
+
+    unsafe fn alloc_zeroed(&self, layout: Layout) -> *mut u8 {
+        note(layout.size());
+        unsafe { System.alloc_zeroed(layout) }
+    }
+
+    unsafe fn realloc(&self, pointer: *mut u8, layout: Layout, size: usize) -> *mut u8 {
+        note(size);
+        unsafe { System.realloc(pointer, layout, size) }
+    }
+
+    unsafe fn dealloc(&self, pointer: *mut u8, layout: Layout) {
+        unsafe { System.dealloc(pointer, layout) }
+    }
+}
+
+#[global_allocator]
+static ALLOCATOR: Watched = Watched;
+
+/// Writes every claim over every eight bytes of the frame, among them every length, and decodes.
+fn claim_too_much<M: Message>(message: &M) {
+    let frame = encode(message).unwrap();
+    for claim in [u64::MAX, 1 << 60, 1 << 40, 1 << 32, 1 << 26, 1 << 22, 1 << 16] {
+        for position in 7..=frame.len() - 8 {
+            let mut frame = frame.clone();
+            frame[position..position + 8].copy_from_slice(&claim.to_le_bytes());
+            LARGEST.set(0);
+            drop(decode::<M>(&frame));
+            let largest = LARGEST.get();
+            assert!(largest <= 4 << 20, "{claim} at byte {position}: {largest} bytes were allocated");
+        }
+    }
+}
+
+#[test]
+fn claimed_lengths_are_not_believed() {
+    let name = || Name::new("some-name").unwrap();
+    let environment = || "hopper".to_owned();
+    let tensors = vec![7; 100];
+    let hash = Hash::of(&tensors);
+    let schema = Schema {
+        environment: environment(),
+        observation_dim: 11,
+        action_dim: 3,
+        hidden: 256,
+        critics: 10,
+        diffusion_steps: 5,
+    };
+    let episodes = vec![EpisodeScore { seed: 1, episode_return: 2.0, length: 3, score: 4.0 }; 3];
+    let job = Job {
+        id: 1,
+        run: name(),
+        epoch: 2,
+        step: 3,
+        weights: hash,
+        environment: environment(),
+        seeds: vec![1, 2, 3],
+        candidates: 10,
+        lease_milliseconds: 1000,
+    };
+    claim_too_much(&Snapshot { run: name(), epoch: 1, step: 2, schema, hash, tensors });
+    claim_too_much(&JobRequest { evaluator: name(), environments: vec![environment(); 3] });
+    claim_too_much(&JobReply::Job(job));
+    claim_too_much(&ScoreReport {
+        evaluator: name(),
+        run: name(),
+        epoch: 1,
+        job: 2,
+        step: 3,
+        weights: hash,
+        episodes: episodes.clone(),
+    });
+    claim_too_much(&ScoreReply::Refused { reason: environment() });
+    claim_too_much(&RecordedScores { run: name(), step: 1, weights: hash, evaluator: name(), episodes });
+}
