@@ -1,9 +1,11 @@
 //! The connection to the others, over Zenoh.
 
+use std::thread;
 use std::time::Duration;
 
 use serde_json::{Value, json};
-use zenoh::{Config, Session};
+use tokio::sync::oneshot;
+use zenoh::{Config, Session, Wait};
 
 /// A node that is frozen, or cut off without a word, counts as gone after so long. (One that ends or is killed is
 /// noticed at once.) Half of Zenoh's default; still several missed signs of life on a machine that is busy training.
@@ -15,6 +17,9 @@ const MAX_MESSAGE_SIZE: u64 = 65 << 20;
 const RETRY: [Duration; 2] = [Duration::from_millis(250), Duration::from_secs(2)];
 /// A session asks itself what it listens at, so there is no network in between.
 const SELF_QUERY_TIMEOUT: Duration = Duration::from_secs(5);
+
+/// The one protocol that Zenoh is built with here.
+const PROTOCOL: &str = "tcp/";
 
 /// Where a session meets the others, as Zenoh's endpoints: `tcp/127.0.0.1:7447`.
 ///
@@ -34,13 +39,19 @@ pub enum SessionError {
     /// Nothing to listen at and nothing to connect to.
     #[error("no endpoint to listen at or to connect to")]
     NoEndpoint,
-    /// Not an endpoint, or nothing that can be listened at.
-    #[error("cannot use the Zenoh endpoint {endpoints}: {source}")]
+    /// Not an endpoint that this program can use. Zenoh would try for ever to connect to it.
+    #[error("{endpoint:?} is no endpoint like {PROTOCOL}127.0.0.1:7447")]
+    Protocol {
+        /// What was given.
+        endpoint: String,
+    },
+    /// It cannot be listened at, or its options are wrong.
+    #[error("cannot use the Zenoh endpoint {endpoints}: {reason}")]
     Endpoint {
         /// The endpoints.
         endpoints: String,
         /// Zenoh's own words.
-        source: zenoh::Error,
+        reason: String,
     },
     /// The session does not tell which endpoints it has bound.
     #[error("the Zenoh session does not tell where it listens")]
@@ -50,16 +61,26 @@ pub enum SessionError {
 /// Opens a session. Needs a multi-thread tokio runtime.
 ///
 /// A session that listens is there at once. A client is there as soon as it has a connection: it waits for a meeting
-/// point that has not started yet, however long, and later connects again whenever the connection is lost.
+/// point that has not started yet, until this future is dropped, and later connects again whenever the connection is
+/// lost.
 pub async fn open_session(endpoints: &Endpoints) -> Result<Session, SessionError> {
     if endpoints.listen.is_empty() && endpoints.connect.is_empty() {
         return Err(SessionError::NoEndpoint);
     }
-    let wrong = |source| SessionError::Endpoint {
-        endpoints: [&endpoints.listen[..], &endpoints.connect[..]].concat().join(", "),
-        source,
+    if let Some(endpoint) = endpoints.listen.iter().chain(&endpoints.connect).find(|e| !e.starts_with(PROTOCOL)) {
+        return Err(SessionError::Protocol { endpoint: endpoint.clone() });
+    }
+    let wrong = |error| {
+        let endpoints = [&endpoints.listen[..], &endpoints.connect[..]].concat().join(", ");
+        SessionError::Endpoint { endpoints, reason: for_people(error) }
     };
-    zenoh::open(config(endpoints).map_err(wrong)?).await.map_err(wrong)
+    let config = config(endpoints).map_err(wrong)?;
+    // Zenoh's future blocks its thread until there is a connection, so it gets one of its own. Nobody joins that: who
+    // gives up waiting just drops this future, and the process may end.
+    let (sender, opened) = oneshot::channel();
+    let open = move || drop(sender.send(zenoh::open(config).wait()));
+    thread::Builder::new().name("zenoh-open".to_owned()).spawn(open).map_err(|error| wrong(error.into()))?;
+    opened.await.map_err(|error| wrong(error.into()))?.map_err(wrong)
 }
 
 fn config(endpoints: &Endpoints) -> zenoh::Result<Config> {
@@ -88,6 +109,21 @@ fn config(endpoints: &Endpoints) -> zenoh::Result<Config> {
     Ok(config)
 }
 
+/// Zenoh's words without the places in its source code (`at /…/tcp.rs:61.`) that it adds.
+fn for_people(error: zenoh::Error) -> String {
+    let text = error.to_string();
+    let mut words = text.split(' ').peekable();
+    let mut plain = String::new();
+    while let Some(word) = words.next() {
+        match words.next_if(|next| word == "at" && next.contains(".rs:")) {
+            Some(place) => plain.extend(place.chars().rev().take_while(|&c| c == ']')),
+            None if plain.is_empty() => plain.push_str(word),
+            None => plain.extend([" ", word]),
+        }
+    }
+    plain
+}
+
 /// Whether the system is to choose the endpoint's port. Options may follow the address: `tcp/127.0.0.1:0#iface=lo`.
 fn leaves_port_open(endpoint: &str) -> bool {
     endpoint.split(['?', '#']).next().is_some_and(|address| address.ends_with(":0"))
@@ -103,8 +139,7 @@ pub async fn reachable_at(session: &Session, endpoints: &Endpoints) -> Result<Ve
         return Ok(endpoints.listen.clone());
     }
     let about_itself = format!("@/{}/peer", session.zid());
-    let wrong = |source| SessionError::Endpoint { endpoints: endpoints.listen.join(", "), source };
-    let replies = session.get(about_itself).timeout(SELF_QUERY_TIMEOUT).await.map_err(wrong)?;
+    let replies = session.get(about_itself).timeout(SELF_QUERY_TIMEOUT).await.map_err(|_| SessionError::Unknown)?;
     let reply = replies.recv_async().await.map_err(|_| SessionError::Unknown)?;
     let sample = reply.result().map_err(|_| SessionError::Unknown)?;
     let description: Value = serde_json::from_slice(&sample.payload().to_bytes()).map_err(|_| SessionError::Unknown)?;
@@ -116,6 +151,13 @@ pub async fn reachable_at(session: &Session, endpoints: &Endpoints) -> Result<Ve
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn errors_without_places() {
+        let text = "Can not listen: [In use (os error 98) at /a/src/tcp.rs:61.] at /a/src/unicast.rs:338.";
+        assert_eq!(for_people(text.into()), "Can not listen: [In use (os error 98)]");
+        assert_eq!(for_people("Nobody at home".into()), "Nobody at home");
+    }
 
     #[test]
     fn which_ports_the_system_chooses() {

@@ -1,0 +1,186 @@
+//! Sessions over real TCP: what learner and evaluators need of each other, whoever comes first, goes, or comes back.
+#![allow(clippy::unwrap_used, clippy::expect_used)]
+
+use std::net::TcpListener;
+use std::time::{Duration, Instant};
+
+use quad_service::{Endpoints, SessionError, open_session, reachable_at};
+use tokio::time::timeout;
+use zenoh::Session;
+use zenoh::handlers::FifoChannelHandler;
+use zenoh::pubsub::Subscriber;
+use zenoh::sample::{Sample, SampleKind};
+
+/// For whatever must happen; on a machine busy with other things.
+const PATIENCE: Duration = Duration::from_secs(30);
+/// For what must not happen.
+const LULL: Duration = Duration::from_millis(500);
+/// As many bytes as the paper's snapshot has, which takes many of Zenoh's fragments.
+const SNAPSHOT: usize = 6_000_000;
+
+fn listening_at(endpoint: &str) -> Endpoints {
+    Endpoints { listen: vec![endpoint.to_owned()], ..Endpoints::default() }
+}
+
+fn connecting_to(endpoint: &str) -> Endpoints {
+    Endpoints { connect: vec![endpoint.to_owned()], ..Endpoints::default() }
+}
+
+/// A session at a port that the system chose, and its endpoint.
+async fn meeting_point() -> (Session, String) {
+    let endpoints = listening_at("tcp/127.0.0.1:0");
+    let session = open_session(&endpoints).await.unwrap();
+    let reachable = reachable_at(&session, &endpoints).await.unwrap();
+    assert_eq!(reachable.len(), 1, "{reachable:?}");
+    assert!(reachable[0].starts_with("tcp/127.0.0.1:") && !reachable[0].ends_with(":0"), "{reachable:?}");
+    (session, reachable[0].clone())
+}
+
+/// An endpoint that nobody listens at for now.
+fn free_endpoint() -> String {
+    let listener = TcpListener::bind("127.0.0.1:0").unwrap();
+    format!("tcp/{}", listener.local_addr().unwrap())
+}
+
+async fn next(samples: &Subscriber<FifoChannelHandler<Sample>>) -> (SampleKind, String) {
+    let sample = timeout(PATIENCE, samples.recv_async()).await.expect("nothing arrived").unwrap();
+    (sample.kind(), sample.key_expr().to_string())
+}
+
+/// What a learner declares; ends when dropped.
+async fn declare_learner(session: &Session, run: &str) -> impl Sized + use<> {
+    let answer = |query: zenoh::query::Query| {
+        let mut bytes = query.payload().unwrap().to_bytes().into_owned();
+        bytes.reverse();
+        zenoh::Wait::wait(query.reply(query.key_expr().clone(), bytes)).unwrap();
+    };
+    let queryable = session.declare_queryable(format!("quad/{run}/jobs")).callback(answer).await.unwrap();
+    let token = session.liveliness().declare_token(format!("quad/{run}/live/learner")).await.unwrap();
+    (queryable, token)
+}
+
+async fn ask(session: &Session, run: &str, question: Vec<u8>) -> Option<Vec<u8>> {
+    let replies = session.get(format!("quad/{run}/jobs")).payload(question).timeout(PATIENCE).await.unwrap();
+    let reply = replies.recv_async().await.ok()?;
+    Some(reply.result().unwrap().payload().to_bytes().into_owned())
+}
+
+/// Everything that a learner and an evaluator do with each other.
+async fn talk(learner: &Session, evaluator: &Session, run: &str) {
+    let learner_key = format!("quad/{run}/live/learner");
+    let learners = evaluator.liveliness().declare_subscriber(&learner_key).history(true).await.unwrap();
+    let evaluators_key = format!("quad/{run}/live/evaluator/*");
+    let evaluators = learner.liveliness().declare_subscriber(evaluators_key).history(true).await.unwrap();
+    let weights_key = format!("quad/{run}/weights");
+    let weights = evaluator.declare_subscriber(&weights_key).await.unwrap();
+    let progress = learner.declare_subscriber(format!("quad/{run}/progress/*")).await.unwrap();
+
+    let declared = declare_learner(learner, run).await;
+    assert_eq!(next(&learners).await, (SampleKind::Put, learner_key.clone()));
+    assert_eq!(ask(evaluator, run, vec![1, 2, 3]).await.unwrap(), [3, 2, 1], "the queryable is there with the token");
+
+    let evaluator_key = format!("quad/{run}/live/evaluator/e");
+    let token = evaluator.liveliness().declare_token(&evaluator_key).await.unwrap();
+    assert_eq!(next(&evaluators).await, (SampleKind::Put, evaluator_key.clone()));
+
+    // The evaluator said that it is there after it subscribed, so nothing is lost from here on.
+    let snapshot: Vec<u8> = (0..SNAPSHOT).map(|i| (i % 251) as u8).collect();
+    learner.put(&weights_key, snapshot.clone()).await.unwrap();
+    let sample = timeout(PATIENCE, weights.recv_async()).await.expect("no weights arrived").unwrap();
+    assert!(sample.payload().to_bytes() == snapshot, "the weights arrived changed");
+    assert_eq!(ask(evaluator, run, snapshot.clone()).await.unwrap().len(), SNAPSHOT);
+
+    let progress_key = format!("quad/{run}/progress/e");
+    evaluator.put(&progress_key, "half").await.unwrap();
+    assert_eq!(next(&progress).await, (SampleKind::Put, progress_key));
+
+    token.undeclare().await.unwrap();
+    assert_eq!(next(&evaluators).await, (SampleKind::Delete, evaluator_key));
+    drop(declared);
+    assert_eq!(next(&learners).await, (SampleKind::Delete, learner_key));
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn a_peer_serves_several_clients() {
+    let (learner, endpoint) = meeting_point().await;
+    let first = open_session(&connecting_to(&endpoint)).await.unwrap();
+    let second = open_session(&connecting_to(&endpoint)).await.unwrap();
+    let watcher = open_session(&connecting_to(&endpoint)).await.unwrap();
+    let published = watcher.declare_subscriber("quad/*/weights").await.unwrap();
+    tokio::join!(talk(&learner, &first, "a"), talk(&learner, &second, "b"));
+    talk(&learner, &first, "c").await;
+    let mut keys = [next(&published).await.1, next(&published).await.1, next(&published).await.1];
+    keys.sort();
+    assert_eq!(keys, ["quad/a/weights", "quad/b/weights", "quad/c/weights"]);
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn clients_of_one_peer_meet_through_it() {
+    let (_meeting_point, endpoint) = meeting_point().await;
+    let learner = open_session(&connecting_to(&endpoint)).await.unwrap();
+    let evaluator = open_session(&connecting_to(&endpoint)).await.unwrap();
+    talk(&learner, &evaluator, "run").await;
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn a_client_waits_for_a_peer_that_has_not_started() {
+    let endpoint = free_endpoint();
+    let mut opening = tokio::spawn({
+        let endpoints = connecting_to(&endpoint);
+        async move { open_session(&endpoints).await }
+    });
+    assert!(timeout(LULL, &mut opening).await.is_err(), "there is nobody to connect to");
+    let endpoints = listening_at(&endpoint);
+    let learner = open_session(&endpoints).await.unwrap();
+    assert_eq!(reachable_at(&learner, &endpoints).await.unwrap(), [endpoint]);
+    let evaluator = timeout(PATIENCE, opening).await.expect("it did not connect").unwrap().unwrap();
+    talk(&learner, &evaluator, "run").await;
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn waiting_can_be_given_up() {
+    let (endpoints, begin) = (connecting_to(&free_endpoint()), Instant::now());
+    assert!(timeout(LULL, open_session(&endpoints)).await.is_err(), "there is nobody to connect to");
+    assert!(begin.elapsed() < PATIENCE, "it took {:?}", begin.elapsed());
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn a_client_connects_again_when_the_peer_comes_back() {
+    let endpoint = free_endpoint();
+    let learner = open_session(&listening_at(&endpoint)).await.unwrap();
+    let declared = declare_learner(&learner, "run").await;
+    let evaluator = open_session(&connecting_to(&endpoint)).await.unwrap();
+    let learners = evaluator.liveliness().declare_subscriber("quad/*/live/learner").history(true).await.unwrap();
+    let weights = evaluator.declare_subscriber("quad/run/weights").await.unwrap();
+    let key = "quad/run/live/learner".to_owned();
+    assert_eq!(next(&learners).await, (SampleKind::Put, key.clone()));
+    drop(declared);
+    learner.close().await.unwrap();
+    assert_eq!(next(&learners).await, (SampleKind::Delete, key.clone()));
+    assert_eq!(ask(&evaluator, "run", vec![1]).await, None, "nobody is there to answer");
+
+    let learner = open_session(&listening_at(&endpoint)).await.unwrap();
+    let _declared = declare_learner(&learner, "run").await;
+    assert_eq!(next(&learners).await, (SampleKind::Put, key));
+    assert_eq!(ask(&evaluator, "run", vec![1, 2]).await.unwrap(), [2, 1]);
+    let deadline = Instant::now() + PATIENCE;
+    while weights.try_recv().unwrap().is_none() {
+        assert!(Instant::now() < deadline, "the subscription did not come back");
+        learner.put("quad/run/weights", "new").await.unwrap();
+        tokio::time::sleep(Duration::from_millis(50)).await;
+    }
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn what_cannot_work_is_an_error_at_once() {
+    let (_session, endpoint) = meeting_point().await;
+    let open = async |endpoints: Endpoints| timeout(PATIENCE, open_session(&endpoints)).await.unwrap().err().unwrap();
+    assert!(matches!(open(Endpoints::default()).await, SessionError::NoEndpoint));
+    let taken = open(listening_at(&endpoint)).await;
+    let text = taken.to_string();
+    assert!(text.contains(&endpoint) && text.contains("in use") && !text.contains(".rs:"), "{text}");
+    for wrong in ["127.0.0.1:7447", "smoke/signals:1", "tcp", ""] {
+        let error = open(connecting_to(wrong)).await;
+        assert!(matches!(&error, SessionError::Protocol { endpoint } if endpoint == wrong), "{error}");
+    }
+}
