@@ -1,0 +1,108 @@
+//! The training loop: what it hands over and when, and how it ends.
+#![allow(clippy::unwrap_used, clippy::expect_used)]
+
+use std::cell::RefCell;
+use std::sync::atomic::AtomicBool;
+use std::sync::mpsc::{Receiver, sync_channel};
+
+use quad_dataset::{BatchSampler, D4rlWriter, Metadata, ReadOptions, RewardRule, Row, Transitions, environment};
+use quad_learner::agent::{Agent, AgentConfig};
+use quad_learner::config::{Overrides, resolve};
+use quad_learner::metrics::Metrics;
+use quad_learner::train::{self, Outcome, Outlets, Plan, TrainError, train};
+use quad_protocol::Name;
+
+struct Result {
+    outcome: std::result::Result<Outcome, TrainError>,
+    /// Step, whether it is to be evaluated.
+    snapshots: Vec<(u64, bool)>,
+    rows: Receiver<train::Row>,
+    metrics: Metrics,
+}
+
+fn transitions() -> Transitions {
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("tiny.hdf5");
+    let hopper = environment::find("hopper").unwrap();
+    let mut writer = D4rlWriter::create(&path, hopper).unwrap();
+    for step in 0..100 {
+        let observation = |step: usize| Vec::from_iter((0..11).map(|i| ((step + 3 * i) as f64 * 0.1).sin()));
+        let row = Row {
+            observation: &observation(step),
+            action: &[0.1, -0.2, 0.3],
+            next_observation: &observation(step + 1),
+            reward: if step < 50 { 1.0 } else { 2.0 },
+            terminal: false,
+            timeout: step % 50 == 49,
+            qpos: &[0.0; 6],
+            qvel: &[0.0; 6],
+        };
+        writer.push(&row).unwrap();
+    }
+    writer.finish(&Metadata { algorithm: "made up", iteration: 0, seed: 0 }).unwrap();
+    Transitions::read(&path, &ReadOptions { environment: hopper, reward: RewardRule::Locomotion }).unwrap()
+}
+
+fn small() -> AgentConfig {
+    let demo = resolve("hopper-demo", &Overrides::default()).unwrap().agent;
+    AgentConfig { hidden: 8, critics: 2, diffusion_steps: 2, batch_size: 4, ..demo }
+}
+
+fn run(plan: Plan, config: &AgentConfig, stop: bool) -> Result {
+    let transitions = transitions();
+    let mut agent = Agent::new(config.architecture(11, 3), config, plan.steps, 0).unwrap();
+    let mut sampler = BatchSampler::new(transitions.len(), config.batch_size, 0);
+    let (metrics, _) = Metrics::new(&Name::new("run").unwrap(), plan.steps).unwrap();
+    // Nobody takes the rows, as with a disk that hangs: training must end all the same.
+    let (sender, rows) = sync_channel(2);
+    let snapshots = RefCell::new(Vec::new());
+    let outlets = Outlets {
+        metrics: metrics.training.clone(),
+        rows: sender,
+        snapshot: &|snapshot| snapshots.borrow_mut().push((snapshot.step, snapshot.evaluate)),
+        stop: &AtomicBool::new(stop),
+    };
+    let outcome = train(&mut agent, &transitions, &mut sampler, plan, &outlets);
+    drop(outlets);
+    Result { outcome, snapshots: snapshots.into_inner(), rows, metrics }
+}
+
+#[test]
+fn snapshots_come_at_every_interval_and_at_the_end() {
+    let result = run(Plan { steps: 25, eval_interval: 10 }, &small(), false);
+    assert_eq!(result.outcome.unwrap(), Outcome::Completed);
+    assert_eq!(result.snapshots, [(10, true), (20, true), (25, true)]);
+    assert_eq!(result.metrics.training.gradient_steps.get(), 25);
+    assert_eq!(result.metrics.training.step_duration.get_sample_count(), 25);
+}
+
+#[test]
+fn without_evaluations_the_last_snapshot_is_kept_all_the_same() {
+    let result = run(Plan { steps: 25, eval_interval: 0 }, &small(), false);
+    assert_eq!(result.snapshots, [(25, false)]);
+}
+
+#[test]
+fn rows_average_a_hundred_steps_and_those_that_nobody_takes_are_dropped() {
+    let result = run(Plan { steps: 450, eval_interval: 0 }, &small(), false);
+    assert_eq!(result.outcome.unwrap(), Outcome::Completed);
+    let rows: Vec<_> = result.rows.try_iter().collect();
+    assert_eq!(rows.iter().map(|row| row.step).collect::<Vec<_>>(), [100, 200]);
+    assert!(rows.iter().all(|row| row.eta == 1.0 && (0.0..=1.0).contains(&row.lambda_mean) && row.bc_loss > 0.0));
+}
+
+#[test]
+fn a_stop_ends_after_the_step_and_keeps_what_there_is() {
+    let result = run(Plan { steps: 25, eval_interval: 10 }, &small(), true);
+    assert_eq!(result.outcome.unwrap(), Outcome::Stopped { step: 1 });
+    assert_eq!(result.snapshots, [(1, false)]);
+}
+
+#[test]
+fn divergence_is_an_error_that_says_where_and_what() {
+    let config = AgentConfig { critic_learning_rate: 1e30, gradient_clip: 1e30, ..small() };
+    let result = run(Plan { steps: 25, eval_interval: 10 }, &config, false);
+    let error = result.outcome.unwrap_err();
+    assert!(matches!(error, TrainError::Diverged { step: 1..10, .. }), "{error}");
+    assert!(result.snapshots.is_empty(), "nothing broken is handed to evaluation");
+}
