@@ -88,6 +88,8 @@ enum Rejection {
     Codec(#[from] CodecError),
     #[error("refused: {0}")]
     Refused(#[from] Refusal),
+    #[error("an evaluator announces itself under a name that is not allowed")]
+    Name,
     #[error("there are too many evaluators")]
     Crowd,
     #[error("the scores could not be saved, try again: {0}")]
@@ -100,6 +102,7 @@ impl Rejection {
             Self::Empty => "empty",
             Self::Codec(error) => error.label(),
             Self::Refused(refusal) => refusal.label(),
+            Self::Name => "invalid_name",
             Self::Crowd => "too_many_evaluators",
             Self::Disk(_) => "not_saved",
         }
@@ -254,7 +257,7 @@ impl Hub {
     }
 
     fn liveliness(&mut self, sample: &Sample) -> Result<(), Rejection> {
-        let Some(evaluator) = keys::evaluator_of(sample.key_expr().as_str()) else { return Err(Rejection::Empty) };
+        let evaluator = keys::evaluator_of(sample.key_expr().as_str()).ok_or(Rejection::Name)?;
         match sample.kind() {
             SampleKind::Put if self.present.len() >= MOST_EVALUATORS => return Err(Rejection::Crowd),
             SampleKind::Put => {
