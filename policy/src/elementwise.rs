@@ -212,8 +212,8 @@ vectorised! {
                     slope[l] *= acc[l];
                 }
             }
-            for at in whole..width {
-                slope[at] *= combine_one(0.0, c, vectors, width, at);
+            for (at, slope) in slope.iter_mut().enumerate().skip(whole) {
+                *slope *= combine_one(0.0, c, vectors, width, at);
             }
         }
     }
