@@ -1,5 +1,7 @@
 //! Gradient steps at Hopper's shapes: the paper's sizes with 10 and with 1 next action per state, and the demo's.
 
+#![allow(clippy::expect_used)] // what cannot be had ends the run
+
 use criterion::{Criterion, criterion_group, criterion_main};
 use quad_dataset::Batch;
 use quad_learner::agent::{Agent, AgentConfig, EtaConfig, Guidance, TargetReduce};

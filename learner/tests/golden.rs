@@ -2,6 +2,8 @@
 //!
 //! The folders' format is in docs/golden.md. `GOLDEN_DIR=FOLDER` reads another folder in place of the committed ones.
 
+#![allow(clippy::unwrap_used)] // what cannot be had ends the run
+
 use quad_dataset::Batch;
 use quad_learner::agent::reference::{Reference, ReferenceState};
 use quad_learner::agent::{Agent, AgentConfig, AgentState, Guidance, Moments, StepMetrics, StepNoise};

@@ -1,5 +1,7 @@
 //! Properties of the update on random inputs.
 
+#![allow(clippy::unwrap_used)] // what cannot be had ends the run
+
 use quad_dataset::Batch;
 use quad_learner::agent::reference::{Reference, ReferenceState};
 use quad_learner::agent::{Agent, AgentConfig, AgentState, EtaConfig, Guidance, StepNoise, TargetReduce};
