@@ -6,6 +6,7 @@ use std::path::PathBuf;
 use clap::{Args, Parser, Subcommand};
 use quad_dataset::EnvironmentSpec;
 use quad_dataset::environment;
+use quad_service::Hint;
 
 use crate::collect::{self, Summary};
 use crate::serve::{self, ServeArgs};
@@ -75,7 +76,10 @@ impl Cli {
                 Ok(())
             }
             Command::VerifyDataset(args) => {
-                let report = verify::verify(&args.file, args.env)?;
+                let report = verify::verify(&args.file, args.env).hint(format!(
+                    "a file that can be replayed is what `evaluator collect --env {} --out FILE` writes",
+                    args.env.name
+                ))?;
                 print(&if args.json { serde_json::to_string(&report)? } else { verified(&report) });
                 Ok(())
             }

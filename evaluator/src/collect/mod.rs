@@ -16,19 +16,11 @@ use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;
 use serde::Serialize;
 use thiserror::Error;
-use tracing::info;
 
 use crate::environment::EnvironmentError;
-use search::Search;
 
-/// Steps that the search may take for each transition that is to be recorded…
-const SEARCH_STEPS_PER_TRANSITION: u64 = 8;
-/// …up to this many: by then it hops well for most seeds, and a minute of two cores is over.
-const MAX_SEARCH_STEPS: u64 = 800_000;
-
-/// The streams of the file's seed.
-const SEARCH_STREAM: u64 = 0;
-const RECORD_STREAM: u64 = 1;
+/// The streams of the file's seed: one for recording, the next ones for the searches.
+const RECORD_STREAM: u64 = 0;
 
 /// What was recorded.
 #[derive(Debug, Serialize)]
@@ -68,21 +60,7 @@ pub fn collect(
     let start = Instant::now();
     let mut writer = D4rlWriter::create(path, spec)?;
 
-    let budget = (SEARCH_STEPS_PER_TRANSITION * transitions as u64).min(MAX_SEARCH_STEPS);
-    let mut search = Search::new(spec, stream(seed, SEARCH_STREAM))?;
-    let mut policies = vec![search.policy().clone()];
-    let mut announced = 0;
-    while search.environment_steps() < budget {
-        let mean_return = search.iterate();
-        policies.push(search.policy().clone());
-        let percent = 100 * search.environment_steps() / budget;
-        if percent >= announced + 10 {
-            announced = percent;
-            let (iterations, score) = (policies.len() - 1, spec.normalised_score(mean_return));
-            info!("training: {percent} % of its steps, {iterations} iterations, normalised score {score:.1}");
-        }
-    }
-
+    let policies = search::train(spec, search::budget(transitions), |index| stream(seed, RECORD_STREAM + 1 + index))?;
     let mut scores = record::record(spec, &policies, transitions, stream(seed, RECORD_STREAM), &mut writer)?;
     let rows = writer.rows();
     let iteration = policies.len() as i64 - 1;

@@ -10,6 +10,7 @@ use rand::Rng;
 use rand_chacha::ChaCha8Rng;
 use rand_distr::{Distribution, StandardNormal};
 use rayon::prelude::*;
+use tracing::info;
 
 use super::linear::{LinearPolicy, Moments};
 use crate::environment::{self, Environment, EnvironmentError};
@@ -25,9 +26,60 @@ const STEP_SIZE: f64 = 0.02;
 /// Taken off each step's reward.
 const ALIVE_BONUS: f64 = 1.0;
 
-/// A search and the policy it has come to.
-pub struct Search {
+/// Searches that are tried out. One in three or four takes long to find a gait…
+const CANDIDATES: u64 = 3;
+/// …so each gets this part of the steps, and the one that is best then gets the rest.
+const TRYOUT_PART: u64 = 8;
+
+/// Steps that a search may take for each transition that is to be recorded…
+const STEPS_PER_TRANSITION: u64 = 8;
+/// …up to this many: by then it hops well, and half a minute of two cores is over.
+const MAX_STEPS: u64 = 800_000;
+
+/// Steps to train for when `transitions` are to be recorded.
+pub fn budget(transitions: usize) -> u64 {
+    (STEPS_PER_TRANSITION * transitions as u64).min(MAX_STEPS)
+}
+
+/// Trains for about `budget` environment steps; answers with the policies of all iterations, `random` being asked for a
+/// generator for each search.
+pub fn train(
+    spec: &EnvironmentSpec,
+    budget: u64,
+    random: impl Fn(u64) -> ChaCha8Rng,
+) -> Result<Vec<LinearPolicy>, EnvironmentError> {
+    let tryout = budget / TRYOUT_PART;
+    let mut searches = Vec::new();
+    for index in 0..CANDIDATES {
+        let mut search = Search::new(spec, random(index))?;
+        search.run(tryout);
+        let score = spec.normalised_score(search.recent_return());
+        info!(
+            "training, try {} of {CANDIDATES}: normalised score {score:.1} after {} steps",
+            index + 1,
+            search.environment_steps
+        );
+        searches.push(search);
+    }
+    let best = searches.iter_mut().max_by(|a, b| a.recent_return().total_cmp(&b.recent_return()));
+    if let Some(best) = best {
+        let rest = budget - CANDIDATES * tryout;
+        for part in 1..=4 {
+            best.run(tryout + rest * part / 4);
+            let score = spec.normalised_score(best.recent_return());
+            info!("training the best of them: normalised score {score:.1} after {} steps", best.environment_steps);
+        }
+    }
+    Ok(searches.into_iter().flat_map(|search| search.policies).collect())
+}
+
+/// A search and the policies it has come by.
+struct Search {
     policy: LinearPolicy,
+    /// Of all iterations; the first is the one that never moves.
+    policies: Vec<LinearPolicy>,
+    /// Mean return of each iteration's trials.
+    returns: Vec<f64>,
     moments: Moments,
     random: ChaCha8Rng,
     trials: Vec<Trial>,
@@ -47,7 +99,7 @@ struct Trial {
 
 impl Search {
     /// Starts from the policy that never moves.
-    pub fn new(spec: &EnvironmentSpec, random: ChaCha8Rng) -> Result<Self, EnvironmentError> {
+    fn new(spec: &EnvironmentSpec, random: ChaCha8Rng) -> Result<Self, EnvironmentError> {
         let policy = LinearPolicy::zero(spec.observation_dim, spec.action_dim);
         let trial = |_| {
             Ok(Trial {
@@ -61,24 +113,35 @@ impl Search {
             })
         };
         let trials = (0..2 * DIRECTIONS).map(trial).collect::<Result<_, EnvironmentError>>()?;
-        Ok(Self { policy, moments: Moments::new(spec.observation_dim), random, trials, environment_steps: 0 })
+        Ok(Self {
+            policies: vec![policy.clone()],
+            returns: Vec::new(),
+            policy,
+            moments: Moments::new(spec.observation_dim),
+            random,
+            trials,
+            environment_steps: 0,
+        })
     }
 
-    /// The policy as it is now.
-    pub fn policy(&self) -> &LinearPolicy {
-        &self.policy
+    /// Iterates until `environment_steps` have been taken, to the end of the last iteration.
+    fn run(&mut self, environment_steps: u64) {
+        while self.environment_steps < environment_steps {
+            self.iterate();
+        }
     }
 
-    /// Steps taken in all trials so far.
-    pub fn environment_steps(&self) -> u64 {
-        self.environment_steps
+    /// Mean return of the trials of the last few iterations.
+    fn recent_return(&self) -> f64 {
+        let recent = &self.returns[self.returns.len().saturating_sub(5)..];
+        recent.iter().sum::<f64>() / recent.len().max(1) as f64
     }
 
-    /// One iteration; answers with the mean return of its trials.
+    /// One iteration.
     ///
     /// Trials run in parallel, but everything random is drawn and everything learned is summed in their order, so the
     /// result does not depend on the number of threads.
-    pub fn iterate(&mut self) -> f64 {
+    fn iterate(&mut self) {
         let normal = StandardNormal;
         let directions: Vec<Vec<f64>> = (0..DIRECTIONS)
             .map(|_| (0..self.policy.weights.len()).map(|_| normal.sample(&mut self.random)).collect())
@@ -117,7 +180,8 @@ impl Search {
             }
         }
         self.policy.normaliser = self.moments.normaliser();
-        self.trials.iter().map(|trial| trial.episode_return).sum::<f64>() / self.trials.len() as f64
+        self.policies.push(self.policy.clone());
+        self.returns.push(self.trials.iter().map(|trial| trial.episode_return).sum::<f64>() / self.trials.len() as f64);
     }
 }
 

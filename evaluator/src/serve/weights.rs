@@ -150,3 +150,66 @@ impl NewestWeights {
         self.newest.lock().unwrap_or_else(PoisonError::into_inner).as_ref().filter(named).cloned()
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use quad_protocol::Hash;
+
+    use super::*;
+
+    fn job_and_snapshot() -> (Job, Snapshot) {
+        let run = Name::new("run").unwrap();
+        let tensors = b"not looked into here".to_vec();
+        let weights = Hash::of(&tensors);
+        let schema = Schema {
+            environment: "hopper".to_owned(),
+            observation_dim: 11,
+            action_dim: 3,
+            hidden: 8,
+            critics: 2,
+            diffusion_steps: 5,
+        };
+        let job = Job {
+            id: 1,
+            run: run.clone(),
+            epoch: 3,
+            step: 100,
+            weights,
+            environment: "hopper".to_owned(),
+            seeds: vec![1],
+            candidates: 1,
+            lease_milliseconds: 1000,
+        };
+        (job, Snapshot { run, epoch: 3, step: 100, schema, hash: weights, tensors })
+    }
+
+    fn label(change: impl Fn(&mut Job, &mut Snapshot)) -> &'static str {
+        let (mut job, mut snapshot) = job_and_snapshot();
+        change(&mut job, &mut snapshot);
+        policy_for(&job, &snapshot).err().unwrap().label()
+    }
+
+    #[test]
+    fn only_the_snapshot_that_the_job_names_is_used() {
+        assert_eq!(label(|job, _| job.run = Name::new("other").unwrap()), "other_snapshot");
+        assert_eq!(label(|job, _| job.epoch += 1), "other_snapshot");
+        assert_eq!(label(|job, _| job.step += 1), "other_snapshot");
+        assert_eq!(label(|job, _| job.weights = Hash::of(b"others")), "other_snapshot");
+        assert_eq!(label(|job, _| job.environment = "walker2d".to_owned()), "other_snapshot");
+        assert_eq!(label(|_, _| ()), "tensors", "the right one gets as far as its tensors");
+    }
+
+    #[test]
+    fn a_schema_that_does_not_suit_the_environment_is_refused() {
+        assert_eq!(label(|_, snapshot| snapshot.schema.observation_dim = 17), "schema");
+        assert_eq!(label(|_, snapshot| snapshot.schema.action_dim = 6), "schema");
+        assert_eq!(label(|_, snapshot| snapshot.schema.hidden = 0), "schema");
+        assert_eq!(label(|_, snapshot| snapshot.schema.critics = u32::MAX), "schema");
+        assert_eq!(label(|_, snapshot| snapshot.schema.diffusion_steps = u32::MAX), "schema");
+        let moon = |job: &mut Job, snapshot: &mut Snapshot| {
+            job.environment = "moon".to_owned();
+            snapshot.schema.environment = "moon".to_owned();
+        };
+        assert_eq!(label(moon), "schema");
+    }
+}

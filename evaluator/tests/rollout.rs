@@ -1,0 +1,79 @@
+//! Episodes do not depend on the batch they run in, and are what stepping an environment by hand gives.
+
+use quad_dataset::environment::find;
+use quad_evaluator::environment::make;
+use quad_evaluator::rollout::{EpisodeOutcome, Rollout};
+use rand::{Rng, SeedableRng};
+use rand_chacha::ChaCha8Rng;
+
+/// Acts at random around a crude upright stance, from each episode's own stream.
+fn act(observation: &[f32], noise: &mut ChaCha8Rng, action: &mut [f32]) {
+    for (i, value) in action.iter_mut().enumerate() {
+        *value = -2.0 * observation[1] - observation[2 + i] + noise.random_range(-0.8..0.8);
+    }
+}
+
+fn select(observations: &[f32], noise: &mut [ChaCha8Rng], actions: &mut [f32]) {
+    assert_eq!(observations.len(), 11 * noise.len());
+    assert_eq!(actions.len(), 3 * noise.len());
+    for ((observation, noise), action) in observations.chunks(11).zip(noise).zip(actions.chunks_mut(3)) {
+        act(observation, noise, action);
+    }
+}
+
+fn run(seeds: &[u64]) -> Vec<EpisodeOutcome> {
+    let mut rollout = Rollout::new(find("hopper").unwrap(), seeds, ChaCha8Rng::seed_from_u64).unwrap();
+    let mut steps = 0;
+    while !rollout.is_done() {
+        rollout.step(select);
+        steps += 1;
+        assert!(steps <= 1000, "an episode outlived the time limit");
+    }
+    assert_eq!(rollout.episodes_done(), seeds.len());
+    let environment_steps = rollout.environment_steps();
+    let outcomes = rollout.into_outcomes();
+    assert_eq!(environment_steps, outcomes.iter().map(|outcome| u64::from(outcome.length)).sum::<u64>());
+    outcomes
+}
+
+#[test]
+fn an_outcome_depends_on_its_seed_alone() {
+    let seeds: Vec<u64> = (0..12).map(|i| i * 7919 + 3).collect();
+    let together = run(&seeds);
+    assert_eq!(together.iter().map(|outcome| outcome.seed).collect::<Vec<_>>(), seeds);
+    for (outcome, &seed) in together.iter().zip(&seeds) {
+        let alone = run(&[seed])[0];
+        assert_eq!(alone, EpisodeOutcome { index: 0, ..*outcome });
+    }
+    let lengths: std::collections::HashSet<u32> = together.iter().map(|outcome| outcome.length).collect();
+    assert!(lengths.len() > 1, "episodes of one length only prove nothing about leaving the batch");
+}
+
+#[test]
+fn an_outcome_is_what_stepping_by_hand_gives() {
+    let spec = find("hopper").unwrap();
+    let mut hopper = make(spec).unwrap();
+    for outcome in run(&[5, 6]) {
+        let mut noise = ChaCha8Rng::seed_from_u64(outcome.seed);
+        let (mut episode_return, mut length) = (0.0, 0);
+        hopper.reset(outcome.seed);
+        loop {
+            let observation: Vec<f32> = hopper.observation().iter().map(|&value| value as f32).collect();
+            let mut action = [0.0; 3];
+            act(&observation, &mut noise, &mut action);
+            let step = hopper.step(&action);
+            episode_return += step.reward;
+            length += 1;
+            if step.terminated || step.truncated {
+                break;
+            }
+        }
+        assert_eq!((outcome.episode_return, outcome.length), (episode_return, length));
+        assert_eq!(outcome.score, 100.0 * (episode_return + 20.272305) / (3234.3 + 20.272305));
+    }
+}
+
+#[test]
+fn no_seeds_are_done_at_once() {
+    assert!(run(&[]).is_empty());
+}
