@@ -125,7 +125,7 @@ impl Parameters {
 
     /// Reads the tensors whose names carry `prefix` from a file that may hold others too.
     pub fn read(architecture: &Architecture, file: &SafeTensors<'_>, prefix: &str) -> Result<Self, PolicyError> {
-        let mut parameters = Self::zeros(architecture);
+        let mut tensors = Vec::new();
         for place in places(architecture) {
             let name = format!("{prefix}{}", place.name);
             let Ok(tensor) = file.tensor(&name) else { return Err(PolicyError::Missing(name)) };
@@ -135,6 +135,11 @@ impl Parameters {
             if tensor.shape() != place.shape {
                 return Err(PolicyError::Shape { name, found: tensor.shape().to_vec(), expected: place.shape });
             }
+            tensors.push((place, name, tensor));
+        }
+        // Not before: an architecture that somebody made up could ask for any amount of memory.
+        let mut parameters = Self::zeros(architecture);
+        for (place, name, tensor) in tensors {
             let mut numbers = tensor.data().chunks_exact(4).map(|b| f32::from_le_bytes([b[0], b[1], b[2], b[3]]));
             if !numbers.clone().all(f32::is_finite) {
                 return Err(PolicyError::NotFinite(name));

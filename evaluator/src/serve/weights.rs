@@ -153,13 +153,16 @@ impl NewestWeights {
 
 #[cfg(test)]
 mod tests {
+    use quad_policy::Parameters;
     use quad_protocol::Hash;
 
     use super::*;
 
     fn job_and_snapshot() -> (Job, Snapshot) {
         let run = Name::new("run").unwrap();
-        let tensors = b"not looked into here".to_vec();
+        let architecture =
+            Architecture { observation_dim: 11, action_dim: 3, hidden: 8, critics: 2, diffusion_steps: 5 };
+        let tensors = Parameters::zeros(&architecture).to_safetensors().unwrap();
         let weights = Hash::of(&tensors);
         let schema = Schema {
             environment: "hopper".to_owned(),
@@ -191,12 +194,13 @@ mod tests {
 
     #[test]
     fn only_the_snapshot_that_the_job_names_is_used() {
+        let (job, snapshot) = job_and_snapshot();
+        assert!(policy_for(&job, &snapshot).is_ok());
         assert_eq!(label(|job, _| job.run = Name::new("other").unwrap()), "other_snapshot");
         assert_eq!(label(|job, _| job.epoch += 1), "other_snapshot");
         assert_eq!(label(|job, _| job.step += 1), "other_snapshot");
         assert_eq!(label(|job, _| job.weights = Hash::of(b"others")), "other_snapshot");
         assert_eq!(label(|job, _| job.environment = "walker2d".to_owned()), "other_snapshot");
-        assert_eq!(label(|_, _| ()), "tensors", "the right one gets as far as its tensors");
     }
 
     #[test]
@@ -211,5 +215,15 @@ mod tests {
             snapshot.schema.environment = "moon".to_owned();
         };
         assert_eq!(label(moon), "schema");
+    }
+
+    #[test]
+    fn a_schema_larger_than_its_tensors_costs_no_memory() {
+        let petabytes = |_: &mut Job, snapshot: &mut Snapshot| {
+            snapshot.schema.hidden = u16::MAX.into();
+            snapshot.schema.critics = u16::MAX.into();
+        };
+        assert_eq!(label(petabytes), "tensors");
+        assert_eq!(label(|_, snapshot| snapshot.tensors.truncate(100)), "tensors");
     }
 }
