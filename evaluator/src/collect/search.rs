@@ -20,7 +20,7 @@ const DIRECTIONS: usize = 8;
 /// b: the directions that count, by the better of their two returns.
 const BEST: usize = 4;
 /// ν: how far the weights are perturbed.
-const PERTURBATION: f64 = 0.05;
+const PERTURBATION: f64 = 0.025;
 /// α: length of a step.
 const STEP_SIZE: f64 = 0.02;
 /// Taken off each step's reward.
