@@ -16,6 +16,7 @@ use serde_json::Value;
 const EVALUATORS: usize = 4;
 const EPISODES: usize = 8;
 const PATIENCE: Duration = Duration::from_secs(240);
+const TRAINING: Duration = Duration::from_secs(1800);
 
 #[test]
 #[ignore = "builds the images, which takes minutes: cargo test --release -p quad-tests --test docker -- --ignored"]
@@ -47,7 +48,11 @@ fn compose_runs_the_whole_system() {
         assert!(!["", "0", "root"].contains(&user), "{container} runs as {user:?}");
     }
 
-    assert_eq!(docker(&["wait", &learner]).trim(), "0", "{}", docker(&["logs", "--tail", "30", &learner]));
+    let exit_code = eventually("the learner ended", TRAINING, || {
+        let state = docker(&["inspect", "--format", "{{.State.Status}} {{.State.ExitCode}}", &learner]);
+        state.trim().strip_prefix("exited ").map(str::to_owned)
+    });
+    assert_eq!(exit_code, "0", "the learner's exit code");
     let scores =
         compose.run(&["run", "--rm", "--no-deps", "--entrypoint", "cat", "learner", "/runs/test/scores.jsonl"]);
     let scores: Vec<Value> = scores.lines().map(|line| serde_json::from_str(line).expect("a JSON object")).collect();
