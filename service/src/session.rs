@@ -15,6 +15,9 @@ const MAX_MESSAGE_SIZE: u64 = 65 << 20;
 /// First and longest pause between two tries to connect. A learner or router that comes back should not be waited for
 /// longer than it takes to notice.
 const RETRY: [Duration; 2] = [Duration::from_millis(250), Duration::from_secs(2)];
+/// How long a large message that may be dropped waits for a receiver that does not keep up. Zenoh's 50 ms are not
+/// enough for a snapshot when training has taken all cores; a receiver that hangs must not hold up the others for long.
+const DROP_AFTER: Duration = Duration::from_millis(500);
 /// A session asks itself what it listens at, so there is no network in between.
 const SELF_QUERY_TIMEOUT: Duration = Duration::from_secs(5);
 
@@ -97,6 +100,10 @@ fn config(endpoints: &Endpoints) -> zenoh::Result<Config> {
         ("scouting/multicast/enabled", json!(false)),
         ("scouting/gossip/enabled", json!(false)),
         ("transport/link/tx/lease", json!(LEASE.as_millis() as u64)),
+        (
+            "transport/link/tx/queue/congestion_control/drop/max_wait_before_drop_fragments",
+            json!(DROP_AFTER.as_micros() as u64),
+        ),
         ("transport/link/rx/max_message_size", json!(MAX_MESSAGE_SIZE)),
         // The only stable way to learn a port that the system chose. Others could read the configuration there, so it
         // is closed where it is not needed.

@@ -1,14 +1,17 @@
 //! Sessions over real TCP: what learner and evaluators need of each other, whoever comes first, goes, or comes back.
 #![allow(clippy::unwrap_used, clippy::expect_used)]
 
-use std::net::TcpListener;
+use std::net::{Ipv4Addr, TcpListener};
+use std::sync::atomic::{AtomicU8, Ordering};
 use std::time::{Duration, Instant};
 
 use quad_service::{Endpoints, SessionError, open_session, reachable_at};
+use tokio::task::JoinSet;
 use tokio::time::timeout;
 use zenoh::Session;
 use zenoh::handlers::FifoChannelHandler;
 use zenoh::pubsub::Subscriber;
+use zenoh::qos::CongestionControl;
 use zenoh::sample::{Sample, SampleKind};
 
 /// For whatever must happen; on a machine busy with other things.
@@ -36,9 +39,12 @@ async fn meeting_point() -> (Session, String) {
     (session, reachable[0].clone())
 }
 
-/// An endpoint that nobody listens at for now.
+/// An endpoint that nobody listens at for now; its loopback address is not used by anything else, so that nobody takes
+/// the port before the test does.
 fn free_endpoint() -> String {
-    let listener = TcpListener::bind("127.0.0.1:0").unwrap();
+    static LAST: AtomicU8 = AtomicU8::new(1);
+    let address = Ipv4Addr::new(127, 0, 0, 1 + LAST.fetch_add(1, Ordering::Relaxed));
+    let listener = TcpListener::bind((address, 0)).unwrap();
     format!("tcp/{}", listener.local_addr().unwrap())
 }
 
@@ -49,14 +55,18 @@ async fn next(samples: &Subscriber<FifoChannelHandler<Sample>>) -> (SampleKind, 
 
 /// What a learner declares; ends when dropped.
 async fn declare_learner(session: &Session, run: &str) -> impl Sized + use<> {
-    let answer = |query: zenoh::query::Query| {
-        let mut bytes = query.payload().unwrap().to_bytes().into_owned();
-        bytes.reverse();
-        zenoh::Wait::wait(query.reply(query.key_expr().clone(), bytes)).unwrap();
-    };
-    let queryable = session.declare_queryable(format!("quad/{run}/jobs")).callback(answer).await.unwrap();
+    let queryable = session.declare_queryable(format!("quad/{run}/jobs")).await.unwrap();
     let token = session.liveliness().declare_token(format!("quad/{run}/live/learner")).await.unwrap();
-    (queryable, token)
+    let mut answers = JoinSet::new();
+    // Not in a callback: one that sends megabytes holds a thread that all sessions here need to receive them.
+    answers.spawn(async move {
+        while let Ok(query) = queryable.recv_async().await {
+            let mut bytes = query.payload().unwrap().to_bytes().into_owned();
+            bytes.reverse();
+            query.reply(query.key_expr().clone(), bytes).await.unwrap();
+        }
+    });
+    (answers, token)
 }
 
 async fn ask(session: &Session, run: &str, question: Vec<u8>) -> Option<Vec<u8>> {
@@ -85,7 +95,8 @@ async fn talk(learner: &Session, evaluator: &Session, run: &str) {
 
     // The evaluator said that it is there after it subscribed, so nothing is lost from here on.
     let snapshot: Vec<u8> = (0..SNAPSHOT).map(|i| (i % 251) as u8).collect();
-    learner.put(&weights_key, snapshot.clone()).await.unwrap();
+    // May be dropped otherwise, should this machine be busy.
+    learner.put(&weights_key, snapshot.clone()).congestion_control(CongestionControl::Block).await.unwrap();
     let sample = timeout(PATIENCE, weights.recv_async()).await.expect("no weights arrived").unwrap();
     assert!(sample.payload().to_bytes() == snapshot, "the weights arrived changed");
     assert_eq!(ask(evaluator, run, snapshot.clone()).await.unwrap().len(), SNAPSHOT);
