@@ -23,7 +23,7 @@ const MIXTURE: [(f64, f64); 6] =
 
 /// Each episode adds Gaussian noise to its actions (which span ±1), of a standard deviation drawn uniformly from 0 to
 /// this: from the bare policy, whose actions say nothing about others, to noise that few gaits survive.
-const MAX_NOISE: f64 = 0.5;
+const MAX_NOISE: f64 = 0.3;
 
 /// Episodes run at a time, in parallel.
 const ROUND: usize = 32;

@@ -26,15 +26,14 @@ const STEP_SIZE: f64 = 0.02;
 /// Taken off each step's reward.
 const ALIVE_BONUS: f64 = 1.0;
 
-/// Searches that are tried out. One in three or four takes long to find a gait…
-const CANDIDATES: u64 = 3;
-/// …so each gets this part of the steps, and the one that is best then gets the rest.
-const TRYOUT_PART: u64 = 8;
+/// Independent searches. Each comes by a gait of its own, so that the recorded actions in a state differ as those of
+/// different people do, not only by noise. One in three or four searches takes long to find any.
+const SEARCHES: u64 = 4;
 
-/// Steps that a search may take for each transition that is to be recorded…
-const STEPS_PER_TRANSITION: u64 = 8;
-/// …up to this many: by then it hops well, and half a minute of two cores is over.
-const MAX_STEPS: u64 = 800_000;
+/// Steps that the searches may take for each transition that is to be recorded…
+const STEPS_PER_TRANSITION: u64 = 10;
+/// …up to this many: by then most of them hop, and half a minute of two cores is over.
+const MAX_STEPS: u64 = 1_000_000;
 
 /// Steps to train for when `transitions` are to be recorded.
 pub fn budget(transitions: usize) -> u64 {
@@ -48,29 +47,16 @@ pub fn train(
     budget: u64,
     random: impl Fn(u64) -> ChaCha8Rng,
 ) -> Result<Vec<LinearPolicy>, EnvironmentError> {
-    let tryout = budget / TRYOUT_PART;
-    let mut searches = Vec::new();
-    for index in 0..CANDIDATES {
+    let mut policies = Vec::new();
+    for index in 0..SEARCHES {
         let mut search = Search::new(spec, random(index))?;
-        search.run(tryout);
+        search.run(budget / SEARCHES);
         let score = spec.normalised_score(search.recent_return());
-        info!(
-            "training, try {} of {CANDIDATES}: normalised score {score:.1} after {} steps",
-            index + 1,
-            search.environment_steps
-        );
-        searches.push(search);
+        let steps = search.environment_steps;
+        info!("training, search {} of {SEARCHES}: normalised score {score:.1} after {steps} steps", index + 1);
+        policies.extend(search.policies);
     }
-    let best = searches.iter_mut().max_by(|a, b| a.recent_return().total_cmp(&b.recent_return()));
-    if let Some(best) = best {
-        let rest = budget - CANDIDATES * tryout;
-        for part in 1..=4 {
-            best.run(tryout + rest * part / 4);
-            let score = spec.normalised_score(best.recent_return());
-            info!("training the best of them: normalised score {score:.1} after {} steps", best.environment_steps);
-        }
-    }
-    Ok(searches.into_iter().flat_map(|search| search.policies).collect())
+    Ok(policies)
 }
 
 /// A search and the policies it has come by.
