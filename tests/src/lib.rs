@@ -24,6 +24,9 @@ pub mod system;
 
 use std::time::{Duration, Instant};
 
+/// How long anything is waited for: far beyond what it takes, unless others keep the machine busy.
+pub const PATIENCE: Duration = Duration::from_secs(120);
+
 /// Polls until `condition` gives something; panics after `patience`.
 pub fn eventually<T>(what: &str, patience: Duration, mut condition: impl FnMut() -> Option<T>) -> T {
     let deadline = Instant::now() + patience;

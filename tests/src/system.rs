@@ -4,18 +4,14 @@ use std::fs;
 use std::net::TcpListener;
 use std::path::{Path, PathBuf};
 use std::process::Command;
-use std::time::Duration;
 
 use quad_dataset::{D4rlWriter, Metadata, Row, environment};
 use quad_protocol::Hash;
 use serde_json::Value;
 use tempfile::TempDir;
 
-use crate::eventually;
 use crate::process::{Process, binary};
-
-/// How long a process may take to start on a busy machine.
-const START: Duration = Duration::from_secs(20);
+use crate::{PATIENCE, eventually};
 
 /// What a test may choose of a training run; the rest of the preset is fixed and small.
 #[derive(Clone, Copy)]
@@ -97,7 +93,11 @@ impl Scratch {
     /// Makes it, with a dataset of a few thousand made-up transitions.
     pub fn new() -> Scratch {
         let folder = tempfile::tempdir().expect("there is room for a scratch folder");
-        write_dataset(&folder.path().join("tiny.hdf5"));
+        let written = folder.path().join("written.hdf5");
+        write_dataset(&written);
+        // HDF5 locks the file it writes, and every process that another test starts meanwhile inherits the lock for as
+        // long as it lives. A copy has none.
+        fs::copy(&written, folder.path().join("tiny.hdf5")).expect("there is room for the dataset");
         Scratch { folder }
     }
 
@@ -167,7 +167,7 @@ impl Learner {
 
     fn endpoints(&self) -> Value {
         let path = self.run_dir.join("endpoints.json");
-        eventually("the learner wrote endpoints.json", START, || serde_json::from_slice(&fs::read(&path).ok()?).ok())
+        eventually("the learner wrote endpoints.json", PATIENCE, || serde_json::from_slice(&fs::read(&path).ok()?).ok())
     }
 
     /// The lines of scores.jsonl so far.
@@ -237,7 +237,7 @@ pub struct Evaluator {
 impl Evaluator {
     /// Address of its metrics page, which it logs.
     pub fn metrics(&self) -> String {
-        let line = self.process.wait_for_log("/metrics", START);
+        let line = self.process.wait_for_log("/metrics", PATIENCE);
         let address = line.split_once("http://").and_then(|(_, rest)| rest.split_once("/metrics"));
         address.expect("the log line has the page's address").0.to_owned()
     }

@@ -2,12 +2,10 @@
 #![allow(clippy::unwrap_used, clippy::expect_used)]
 
 use std::fs;
-use std::time::Duration;
 
 use quad_protocol::Hash;
+use quad_tests::PATIENCE;
 use quad_tests::system::{Scratch, Setting};
-
-const PATIENCE: Duration = Duration::from_secs(60);
 
 type Outcome = (Vec<Hash>, Vec<(u64, u64, u64, u64)>);
 

@@ -4,9 +4,7 @@
 use std::time::Duration;
 
 use quad_tests::system::{Scratch, Setting, free_port};
-use quad_tests::{eventually, http};
-
-const PATIENCE: Duration = Duration::from_secs(60);
+use quad_tests::{PATIENCE, eventually, http};
 
 /// Jobs of about a second, so that there is a middle to be killed in.
 const LONG_JOBS: Setting =
@@ -28,7 +26,7 @@ fn every_episode_is_scored_once_though_an_evaluator_is_killed_in_a_job_and_anoth
     let _survivor = scratch.evaluator("survivor", &endpoint);
     eventually("the survivor scored something", PATIENCE, || (!learner.scores().is_empty()).then_some(()));
     let _late = scratch.evaluator("late", &endpoint);
-    let status = learner.process.wait(2 * PATIENCE);
+    let status = learner.process.wait(PATIENCE);
 
     assert!(status.success(), "the learner ended with {status}");
     learner.assert_complete(&LONG_JOBS);

@@ -4,14 +4,11 @@
 use std::fs;
 use std::io::Write;
 use std::process::{Command, Stdio};
-use std::time::Duration;
 
 use quad_tests::process::{Process, binary};
 use quad_tests::system::{Scratch, Setting};
-use quad_tests::{eventually, http, peers, prometheus};
+use quad_tests::{PATIENCE, eventually, http, peers, prometheus};
 use serde_json::Value;
-
-const PATIENCE: Duration = Duration::from_secs(60);
 
 #[test]
 fn python_reads_a_snapshot() {
@@ -46,7 +43,7 @@ fn h5py_reads_a_recorded_dataset_and_the_learner_trains_on_it() {
     fs::remove_file(&recorded).unwrap();
     let mut command = Command::new(binary("evaluator"));
     command.args(["collect", "--env", "hopper", "--transitions", "3000", "--seed", "3", "--out"]).arg(&recorded);
-    let status = Process::start("collect", scratch.path(), command).wait(2 * PATIENCE);
+    let status = Process::start("collect", scratch.path(), command).wait(PATIENCE);
     assert!(status.success(), "collect ended with {status}");
 
     let printed = peers::run_python(&python, "dataset_layout.py", &[&recorded]);

@@ -1,13 +1,9 @@
 //! Several runs behind one router, one evaluator for all of them.
 #![allow(clippy::unwrap_used, clippy::expect_used)]
 
-use std::time::Duration;
-
 use quad_tests::router::router;
 use quad_tests::system::{Scratch, Setting, free_port};
-use quad_tests::{eventually, http};
-
-const PATIENCE: Duration = Duration::from_secs(60);
+use quad_tests::{PATIENCE, eventually, http};
 
 #[tokio::test(flavor = "multi_thread")]
 async fn one_evaluator_serves_two_runs_in_turn_and_survives_the_routers_restart() {

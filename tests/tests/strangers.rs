@@ -7,10 +7,8 @@ use std::time::Duration;
 use quad_protocol::{Hash, Job, JobReply, JobRequest, Name, Schema, Snapshot, decode, encode, keys};
 use quad_tests::router::router;
 use quad_tests::system::{Scratch, Setting, free_port};
-use quad_tests::{eventually, http};
+use quad_tests::{PATIENCE, eventually, http};
 use zenoh::Session;
-
-const PATIENCE: Duration = Duration::from_secs(60);
 
 /// Payloads that no receiver may take for a message, derived from a real one.
 fn garbage(real: &[u8]) -> Vec<Vec<u8>> {
