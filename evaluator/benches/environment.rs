@@ -1,4 +1,5 @@
 //! Hopper's control periods a second, one thread, actions uniform at random.
+#![allow(clippy::expect_used, missing_docs)]
 
 use criterion::{Criterion, Throughput, criterion_group, criterion_main};
 use quad_dataset::environment::find;

@@ -1,4 +1,5 @@
 //! What Hopper does at the edges: limits, clipping, numbers that are none.
+#![allow(clippy::unwrap_used)]
 
 use quad_dataset::environment::find;
 use quad_evaluator::environment::{Environment, Step, make};

@@ -1,4 +1,5 @@
 //! Episodes do not depend on the batch they run in, and are what stepping an environment by hand gives.
+#![allow(clippy::unwrap_used)]
 
 use quad_dataset::environment::find;
 use quad_evaluator::environment::make;

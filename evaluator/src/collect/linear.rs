@@ -91,3 +91,36 @@ impl Moments {
         Normaliser { mean: self.mean.clone(), inverse_deviation: self.squares.iter().map(inverse).collect() }
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn moments_merge_to_those_of_all_observations() {
+        let values = [[1.0, 5.0], [2.0, 5.0], [4.0, 5.0], [9.0, 5.0]];
+        let (mut all, mut merged) = (Moments::new(2), Moments::new(2));
+        values.iter().for_each(|value| all.push(value));
+        for half in [&values[..1], &values[1..], &[]] {
+            let mut moments = Moments::new(2);
+            half.iter().for_each(|value| moments.push(value));
+            merged.merge(&moments);
+        }
+        for Normaliser { mean, inverse_deviation } in [all.normaliser(), merged.normaliser()] {
+            assert_eq!(mean, [4.0, 5.0]);
+            // Variance 38 / 3; the second value never changed.
+            assert!((inverse_deviation[0] - (3.0_f64 / 38.0).sqrt()).abs() < 1e-12);
+            assert_eq!(inverse_deviation[1], 1.0);
+        }
+    }
+
+    #[test]
+    fn actions_are_linear_in_the_normalised_observation() {
+        let mut policy = LinearPolicy::zero(2, 2);
+        policy.weights = vec![1.0, 2.0, 0.0, -1.0];
+        policy.normaliser = Normaliser { mean: vec![1.0, 1.0], inverse_deviation: vec![1.0, 0.5] };
+        let mut action = [0.0; 2];
+        policy.act(&[4.0, 5.0], &mut action);
+        assert_eq!(action, [3.0 + 4.0, -2.0]);
+    }
+}
