@@ -28,12 +28,12 @@ const ALIVE_BONUS: f64 = 1.0;
 
 /// Independent searches. Each comes by a gait of its own, so that the recorded actions in a state differ as those of
 /// different people do, not only by noise. One in three or four searches takes long to find any.
-const SEARCHES: u64 = 4;
+const SEARCHES: u64 = 8;
 
 /// Steps that the searches may take for each transition that is to be recorded…
-const STEPS_PER_TRANSITION: u64 = 10;
-/// …up to this many: by then most of them hop, and half a minute of two cores is over.
-const MAX_STEPS: u64 = 1_000_000;
+const STEPS_PER_TRANSITION: u64 = 16;
+/// …up to this many: by then most of them hop, and a minute of two cores is over.
+const MAX_STEPS: u64 = 1_600_000;
 
 /// Steps to train for when `transitions` are to be recorded.
 pub fn budget(transitions: usize) -> u64 {

@@ -306,7 +306,7 @@ impl Agent {
             bc_loss,
             actor_loss: eta * bc_loss + guidance_loss,
             eta: state.eta,
-            lambda_mean: seen.lambda.iter().sum::<f32>() / seen.lambda.len().max(1) as f32,
+            lambda_mean: seen.lambda.iter().fold(0.0, |sum, lambda| sum + lambda) / seen.lambda.len().max(1) as f32,
             nu_squared: state.nu_squared.unwrap_or(0.0),
             actor_gradient_norm: norm,
             learning_rate,
