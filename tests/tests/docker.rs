@@ -80,6 +80,7 @@ impl Compose {
         command.envs([
             ("QUAD_ROUTER_PORT", "0"),
             ("QUAD_PROMETHEUS_PORT", "0"),
+            ("QUAD_GRAFANA_PULL", "never"),
             ("QUAD_RUN", "test"),
             ("QUAD_COLLECT_ARGS", "--transitions 20000"),
             ("QUAD_TRAIN_ARGS", &format!("--steps 12000 --eval-interval 1000 --episodes {EPISODES}")),
