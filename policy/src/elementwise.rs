@@ -8,7 +8,9 @@ use multiversion::multiversion;
 /// Lanes that the loops work on at a time: one AVX-512 register of f32.
 const LANES: usize = 16;
 
-/// Above this, exp(x) is taken at the bound: Mish is x and its slope 1 to the last bit of f32.
+/// Below this, Mish and its slope are 0 to the last normal number of f32; it keeps e^x one.
+const MISH_ZERO: f32 = -87.0;
+/// Above this, Mish is x and its slope 1 to the last bit of f32; it keeps squares of e^x finite.
 const MISH_LINEAR: f32 = 20.0;
 
 /// e^x for x in [-87, 20], relative error below 2e-7.
@@ -34,7 +36,8 @@ fn exp(x: f32) -> f32 {
 /// x·tanh(ln(1 + e^x)), by n/(n + 2) with n = e^x (e^x + 2).
 #[inline(always)]
 fn mish(x: f32) -> f32 {
-    let e = exp(x.clamp(-87.0, MISH_LINEAR));
+    let x = x.clamp(MISH_ZERO, f32::INFINITY);
+    let e = exp(x.clamp(MISH_ZERO, MISH_LINEAR));
     let n = e * (e + 2.0);
     x * (n / (n + 2.0))
 }
@@ -42,11 +45,13 @@ fn mish(x: f32) -> f32 {
 /// Mish and its derivative. Finite for every finite x.
 #[inline(always)]
 fn mish_and_slope(x: f32) -> (f32, f32) {
-    let e = exp(x.clamp(-87.0, MISH_LINEAR));
+    let x = x.clamp(MISH_ZERO, f32::INFINITY);
+    let bounded = x.clamp(MISH_ZERO, MISH_LINEAR);
+    let e = exp(bounded);
     let n = e * (e + 2.0);
     let r = 1.0 / (n + 2.0);
     let t = n * r;
-    (x * t, (4.0 * x * r) * (e * (e + 1.0) * r) + t)
+    (x * t, (4.0 * bounded * r) * (e * (e + 1.0) * r) + t)
 }
 
 macro_rules! vectorised {
@@ -295,6 +300,15 @@ mod tests {
             mish_slope(&[x], &mut y, &mut slope);
             assert!(y[0].is_finite() && slope[0].is_finite(), "at {x}: {} {}", y[0], slope[0]);
         }
+    }
+
+    #[test]
+    fn a_nan_is_not_hidden() {
+        let (mut y, mut slope) = ([0.0], [0.0]);
+        mish_slope(&[f32::NAN], &mut y, &mut slope);
+        assert!(y[0].is_nan());
+        mish_in_place(&mut y);
+        assert!(y[0].is_nan());
     }
 
     #[test]
