@@ -4,8 +4,9 @@ use std::io::IsTerminal;
 
 use tracing_subscriber::EnvFilter;
 
-/// Without RUST_LOG: our own progress, and Zenoh's complaints (`zenoh` is the prefix of all of its crates).
-const DEFAULT_FILTER: &str = "info,zenoh=warn";
+/// Without RUST_LOG: our own progress, and Zenoh's complaints (`zenoh` is the prefix of all of its crates), but for its
+/// warning that scouting by gossip is off, which it is on purpose.
+const DEFAULT_FILTER: &str = "info,zenoh=warn,zenoh::net::routing::hat::peer=error";
 
 /// Sends log lines to stderr, coloured on a terminal; the environment variable RUST_LOG chooses which.
 ///
