@@ -147,6 +147,18 @@ pub(crate) struct FirstLayer<'a> {
     pub kernel: &'a [f32],
 }
 
+impl FirstLayer<'_> {
+    /// base + shift + a · kernel of one row, [`LANES`] columns from `at` on.
+    #[inline(always)]
+    fn before_activation(&self, base: &[f32], a: &[f32], at: usize) -> [f32; LANES] {
+        let (mut sum, shift) = (load(base, at), load(self.shift, at));
+        for l in 0..LANES {
+            sum[l] += shift[l];
+        }
+        combine(sum, a, self.kernel, self.shift.len(), at)
+    }
+}
+
 vectorised! {
     /// `out = mish(base + shift + actions · kernel)`, `rows × width`.
     pub(crate) fn first_layer(layer: &FirstLayer<'_>, out: &mut [f32]) {
@@ -156,12 +168,7 @@ vectorised! {
             let base = &layer.base[row / layer.repeat * width..][..width];
             let whole = width - width % LANES;
             for at in (0..whole).step_by(LANES) {
-                let (b, s) = (load(base, at), load(layer.shift, at));
-                let mut acc = [0.0; LANES];
-                for l in 0..LANES {
-                    acc[l] = b[l] + s[l];
-                }
-                let acc = combine(acc, a, layer.kernel, width, at);
+                let acc = layer.before_activation(base, a, at);
                 let out = &mut out[at..at + LANES];
                 for l in 0..LANES {
                     out[l] = mish(acc[l]);
@@ -184,12 +191,7 @@ vectorised! {
             let base = &layer.base[row / layer.repeat * width..][..width];
             let whole = width - width % LANES;
             for at in (0..whole).step_by(LANES) {
-                let (b, s) = (load(base, at), load(layer.shift, at));
-                let mut acc = [0.0; LANES];
-                for l in 0..LANES {
-                    acc[l] = b[l] + s[l];
-                }
-                let acc = combine(acc, a, layer.kernel, width, at);
+                let acc = layer.before_activation(base, a, at);
                 let (out, slope) = (&mut out[at..at + LANES], &mut slope[at..at + LANES]);
                 for l in 0..LANES {
                     (out[l], slope[l]) = mish_and_slope(acc[l]);
