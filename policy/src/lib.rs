@@ -15,6 +15,8 @@
 //! numbers takes them as an argument or from a seeded generator.
 
 mod architecture;
+#[cfg(target_arch = "x86_64")]
+mod avx512;
 mod elementwise;
 mod ensemble;
 mod error;

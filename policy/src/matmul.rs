@@ -1,8 +1,17 @@
-//! Dense products on one thread, by the `gemm` crate. All matrices are row-major.
+//! Dense products on one thread, all matrices row-major.
 //!
 //! The callers split work into tiles that run in parallel, so a single product never does.
 
 use gemm::{Parallelism, gemm};
+use std::cell::RefCell;
+
+#[cfg(target_arch = "x86_64")]
+use crate::avx512;
+
+thread_local! {
+    /// Where [`avx512::multiply_transposed`] transposes to.
+    static BLOCK: RefCell<Vec<f32>> = RefCell::default();
+}
 
 /// A row-major matrix or its transpose, as `gemm` wants it: first element, column stride, row stride.
 type Operand = (*const f32, isize, isize);
@@ -36,17 +45,37 @@ fn multiply(m: usize, n: usize, k: usize, out: &mut [f32], a: Operand, b: Operan
     }
 }
 
+/// By AVX-512 where the CPU has it and the result is whole blocks wide, else by `gemm`.
+fn multiply_row_major(m: usize, n: usize, k: usize, out: &mut [f32], a: Operand, b: &[f32]) {
+    #[cfg(target_arch = "x86_64")]
+    if avx512::serves(n) {
+        assert_eq!(out.len(), m * n, "the product's shape");
+        let a = avx512::Strided { first: a.0, row: a.2 as usize, column: a.1 as usize };
+        // SAFETY: as in `multiply`.
+        return unsafe { avx512::multiply(m, n, k, a, b.as_ptr(), out.as_mut_ptr()) };
+    }
+    multiply(m, n, k, out, a, (b.as_ptr(), 1, n as isize));
+}
+
 /// `out[m × n] = x[m × k] · w[k × n]`.
 pub(crate) fn product(x: &[f32], w: &[f32], out: &mut [f32], k: usize, n: usize) {
     let m = x.len() / k;
     assert!(x.len() == m * k && w.len() == k * n, "operands of a product");
-    multiply(m, n, k, out, (x.as_ptr(), 1, k as isize), (w.as_ptr(), 1, n as isize));
+    multiply_row_major(m, n, k, out, (x.as_ptr(), 1, k as isize), w);
 }
 
 /// `out[m × k] = g[m × n] · w[k × n]ᵀ`: a gradient's way back through `product`.
 pub(crate) fn product_transposed(g: &[f32], w: &[f32], out: &mut [f32], k: usize, n: usize) {
     let m = g.len() / n;
     assert!(g.len() == m * n && w.len() == k * n, "operands of a product");
+    #[cfg(target_arch = "x86_64")]
+    if avx512::serves(n) && avx512::serves(k) {
+        assert_eq!(out.len(), m * k, "the product's shape");
+        // SAFETY: as in `multiply`.
+        return BLOCK.with_borrow_mut(|block| unsafe {
+            avx512::multiply_transposed((m, k, n), g.as_ptr(), w.as_ptr(), out.as_mut_ptr(), block);
+        });
+    }
     multiply(m, k, n, out, (g.as_ptr(), 1, n as isize), (w.as_ptr(), n as isize, 1));
 }
 
@@ -54,5 +83,41 @@ pub(crate) fn product_transposed(g: &[f32], w: &[f32], out: &mut [f32], k: usize
 pub(crate) fn outer(x: &[f32], g: &[f32], out: &mut [f32], k: usize, n: usize) {
     let m = x.len() / k;
     assert!(x.len() == m * k && g.len() == m * n, "operands of a product");
-    multiply(k, n, m, out, (x.as_ptr(), k as isize, 1), (g.as_ptr(), 1, n as isize));
+    multiply_row_major(k, n, m, out, (x.as_ptr(), k as isize, 1), g);
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use rand::{Rng, SeedableRng};
+    use rand_chacha::ChaCha8Rng;
+
+    fn assert_close(out: &[f32], expected: impl Fn(usize) -> f64, shape: &str) {
+        for (i, x) in out.iter().enumerate() {
+            let exact = expected(i);
+            assert!((f64::from(*x) - exact).abs() < 1e-5 * exact.abs().max(1.0), "{shape} at {i}: {x} for {exact}");
+        }
+    }
+
+    /// Rows that are whole blocks and that are not; columns that AVX-512 serves and that it does not.
+    #[test]
+    fn products_match_their_definition() {
+        let mut generator = ChaCha8Rng::seed_from_u64(0);
+        let mut numbers = |len: usize| (0..len).map(|_| generator.random_range(-1.0..1.0)).collect::<Vec<f32>>();
+        for (m, k, n) in [(1, 3, 1), (5, 14, 32), (7, 11, 23), (12, 32, 64), (29, 64, 96), (41, 96, 32), (16, 33, 32)] {
+            let (x, w, g) = (numbers(m * k), numbers(k * n), numbers(m * n));
+            let sum = |len: usize, term: &dyn Fn(usize) -> (f32, f32)| -> f64 {
+                (0..len).map(term).map(|(a, b)| f64::from(a) * f64::from(b)).sum()
+            };
+            let mut out = vec![f32::NAN; m * n];
+            product(&x, &w, &mut out, k, n);
+            assert_close(&out, |i| sum(k, &|p| (x[i / n * k + p], w[p * n + i % n])), &format!("{m} × {k} × {n}"));
+            let mut out = vec![f32::NAN; m * k];
+            product_transposed(&g, &w, &mut out, k, n);
+            assert_close(&out, |i| sum(n, &|p| (g[i / k * n + p], w[i % k * n + p])), &format!("{m} × {n} × {k}ᵀ"));
+            let mut out = vec![f32::NAN; k * n];
+            outer(&x, &g, &mut out, k, n);
+            assert_close(&out, |i| sum(m, &|p| (x[p * k + i / n], g[p * n + i % n])), &format!("{k} × {m}ᵀ × {n}"));
+        }
+    }
 }

@@ -195,6 +195,11 @@ impl Agent {
     /// One pass through Algorithm 1's loop with the noise given.
     pub fn step(&mut self, batch: &Batch, noise: &StepNoise) -> Result<StepMetrics, AgentError> {
         self.check(batch)?;
+        // As a whole on a thread of the pool: else each of its parallel parts would wake one up and wait for it.
+        Ok(rayon::scope(|_| self.step_checked(batch, noise)))
+    }
+
+    fn step_checked(&mut self, batch: &Batch, noise: &StepNoise) -> StepMetrics {
         let decay = cosine_decay(self.state.step, self.total_steps);
         let (critic_loss, critic_gradient_norm) = self.update_critics(batch, noise, decay);
         let actor = self.update_actor(batch, noise, decay);
@@ -204,12 +209,12 @@ impl Agent {
             ema(&mut self.state.target.actor, &self.state.online.actor, self.config.ema_rate);
         }
         let targets = &self.seen.targets;
-        Ok(StepMetrics {
+        StepMetrics {
             critic_loss,
             critic_gradient_norm,
             q_mean: targets.iter().sum::<f32>() / targets.len() as f32,
             ..actor
-        })
+        }
     }
 
     fn check(&self, batch: &Batch) -> Result<(), AgentError> {

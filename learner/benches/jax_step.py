@@ -1,0 +1,135 @@
+"""The gradient step in JAX, timed: what `deploy/bench.sh` sets the learner's beside.
+
+    jax_step.py [--seconds S]
+
+The step is the one of tests/golden/make.py in float32, compiled as a whole, its noise drawn inside. It is run in four
+ways: called from Python or by `lax.scan`, with Mish as `jax.nn` would write it (plain) or with a single exponential
+(tuned). Prints a JSON object: {configuration: {way: seconds per step}}, medians of calls of about a second.
+"""
+
+import argparse
+import functools
+import json
+import os
+import statistics
+import sys
+import time
+from pathlib import Path
+
+# Large arrays are otherwise given back to the system and faulted in again at every step.
+MALLOC = {"MALLOC_MMAP_THRESHOLD_": "4294967296", "MALLOC_TRIM_THRESHOLD_": "8589934592", "MALLOC_TOP_PAD_": "268435456"}
+if any(name not in os.environ for name in MALLOC):
+    os.execve(sys.executable, [sys.executable, *sys.argv], os.environ | MALLOC)
+
+sys.path.insert(0, str(Path(__file__).parents[2] / "tests" / "golden"))
+
+import jax
+import jax.numpy as jnp
+import make
+import numpy as np
+
+jax.config.update("jax_enable_x64", False)
+
+CONFIGURATIONS = {
+    "paper, 10 samples": {"hidden": 256, "critics": 10, "batch_size": 256, "samples": 10},
+    "paper, 1 sample": {"hidden": 256, "critics": 10, "batch_size": 256, "samples": 1},
+    "demo": {"hidden": 128, "critics": 5, "batch_size": 256, "samples": 1},
+}
+
+
+def tuned_mish(x):
+    e = jnp.exp(jnp.minimum(x, 20.0))
+    n = e * (e + 2)
+    return x * (n / (n + 2))
+
+
+def single(tree):
+    return jax.tree.map(lambda x: jnp.asarray(x, jnp.float32), tree)
+
+
+def prepare(sizes):
+    """The compiled step `(state, batch, key) -> state`, and what it starts from."""
+    config = make.make_config("quad", "hopper")
+    config["agent"] |= sizes
+    agent, o, a = config["agent"], config["observation_dim"], config["action_dim"]
+    rng = np.random.default_rng(0)
+    state = single(make.random_state(config, rng))
+    b, steps = agent["batch_size"], agent["diffusion_steps"]
+    batch = {
+        "observations": rng.normal(size=(b, o)),
+        "actions": rng.uniform(-1, 1, (b, a)),
+        "rewards": rng.normal(size=b),
+        "next_observations": rng.normal(size=(b, o)),
+        "masks": np.ones(b),
+    }
+
+    def step(state, batch, key):
+        next_key, t_key, epsilon_key = jax.random.split(key, 3)
+        draws = {
+            "next_noise": jax.random.normal(next_key, (steps, b, agent["samples"], a)),
+            "t": jax.random.randint(t_key, (b,), 1, steps + 1),
+            "epsilon": jax.random.normal(epsilon_key, (b, a)),
+        }
+        out = make.update(config, state, batch | draws)
+        return {name: jnp.reshape(out[name], (1,)) if name in ("eta", "nu_squared") else out[name] for name in state}
+
+    return step, state, single(batch)
+
+
+def seconds_per_step(run, count, budget):
+    """Median over calls of `run`, which makes `count` steps."""
+    run()
+    times = []
+    deadline = time.perf_counter() + budget
+    while len(times) < 3 or time.perf_counter() < deadline:
+        start = time.perf_counter()
+        run()
+        times.append((time.perf_counter() - start) / count)
+    return statistics.median(times)
+
+
+def called(step, state, batch, budget):
+    compiled, key = jax.jit(step, donate_argnums=0), jax.random.key(0)
+    state = jax.tree.map(jnp.copy, state)
+
+    def run():
+        nonlocal state, key
+        for _ in range(5):
+            key, now = jax.random.split(key)
+            state = compiled(state, batch, now)
+        jax.block_until_ready(state)
+
+    return seconds_per_step(run, 5, budget)
+
+
+def scanned(step, state, batch, budget):
+    @functools.partial(jax.jit, donate_argnums=0)
+    def steps(state, batch, key):
+        return jax.lax.scan(lambda state, key: (step(state, batch, key), None), state, jax.random.split(key, 5))[0]
+
+    state = jax.tree.map(jnp.copy, state)
+
+    def run():
+        nonlocal state
+        state = jax.block_until_ready(steps(state, batch, jax.random.key(0)))
+
+    return seconds_per_step(run, 5, budget)
+
+
+def main():
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--seconds", type=float, default=5.0, help="for each way of each configuration")
+    budget = parser.parse_args().seconds
+    results, plain_mish = {}, make.mish
+    for name, sizes in CONFIGURATIONS.items():
+        step, state, batch = prepare(sizes)
+        results[name] = {}
+        for kind, mish in ("plain", plain_mish), ("tuned", tuned_mish):
+            make.mish = mish
+            results[name][f"{kind}, called"] = called(step, state, batch, budget)
+            results[name][f"{kind}, scanned"] = scanned(step, state, batch, budget)
+    print(json.dumps(results))
+
+
+if __name__ == "__main__":
+    main()

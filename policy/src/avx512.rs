@@ -1,0 +1,154 @@
+//! A dense product for CPUs with AVX-512 that reads its operands where they lie.
+//!
+//! The matrices of these networks fit into a core's own cache, so the copies into blocks that a general library makes
+//! first cost more than they gain (docs/performance.md): only the way back through a layer needs one, a transposition.
+
+use std::arch::x86_64::{
+    _MM_HINT_T0, _mm_prefetch, _mm512_castpd_ps, _mm512_castps_pd, _mm512_fmadd_ps, _mm512_loadu_ps, _mm512_set1_ps,
+    _mm512_setzero_ps, _mm512_shuffle_f32x4, _mm512_storeu_ps, _mm512_unpackhi_pd, _mm512_unpackhi_ps,
+    _mm512_unpacklo_pd, _mm512_unpacklo_ps,
+};
+
+/// Lanes of a register.
+const LANES: usize = 16;
+/// Columns of the result that are worked on together: two registers.
+pub(crate) const COLUMNS: usize = 2 * LANES;
+/// Rows of the result that are worked on together: their sums fill most of the 32 registers.
+const ROWS: usize = 12;
+
+/// Whether this CPU can, and results of this many columns are whole blocks.
+pub(crate) fn serves(columns: usize) -> bool {
+    columns.is_multiple_of(COLUMNS) && is_x86_feature_detected!("avx512f")
+}
+
+/// A matrix by its first element and the distances between rows and between columns.
+#[derive(Clone, Copy)]
+pub(crate) struct Strided {
+    pub first: *const f32,
+    pub row: usize,
+    pub column: usize,
+}
+
+/// `c = a·b` for `R` rows of `a` and one block of columns.
+#[inline]
+#[target_feature(enable = "avx512f")]
+unsafe fn block<const R: usize>(k: usize, a: Strided, b: *const f32, b_row: usize, c: *mut f32, c_row: usize) {
+    // SAFETY: as `multiply` asks of its caller; the block lies inside.
+    unsafe {
+        let mut sums = [[_mm512_setzero_ps(); 2]; R];
+        for p in 0..k {
+            let b = b.add(p * b_row);
+            let (left, right) = (_mm512_loadu_ps(b), _mm512_loadu_ps(b.add(LANES)));
+            // What the next block of columns reads; behind the last one it is an address that nobody reads.
+            _mm_prefetch::<_MM_HINT_T0>(b.wrapping_add(COLUMNS).cast());
+            _mm_prefetch::<_MM_HINT_T0>(b.wrapping_add(COLUMNS + LANES).cast());
+            for (i, sum) in sums.iter_mut().enumerate() {
+                let x = _mm512_set1_ps(*a.first.add(i * a.row + p * a.column));
+                sum[0] = _mm512_fmadd_ps(x, left, sum[0]);
+                sum[1] = _mm512_fmadd_ps(x, right, sum[1]);
+            }
+        }
+        for (i, sum) in sums.iter().enumerate() {
+            _mm512_storeu_ps(c.add(i * c_row), sum[0]);
+            _mm512_storeu_ps(c.add(i * c_row + LANES), sum[1]);
+        }
+    }
+}
+
+/// `c = a·b` for all `m` rows and one block of columns.
+#[target_feature(enable = "avx512f")]
+unsafe fn panel(m: usize, k: usize, a: Strided, b: *const f32, b_row: usize, c: *mut f32, c_row: usize) {
+    let mut i = 0;
+    // SAFETY: as `multiply` asks of its caller; rows i.. are inside as long as as many are left as a block has.
+    unsafe {
+        let from = |i: usize| Strided { first: a.first.add(i * a.row), ..a };
+        while m - i >= ROWS {
+            block::<ROWS>(k, from(i), b, b_row, c.add(i * c_row), c_row);
+            i += ROWS;
+        }
+        while m - i >= 4 {
+            block::<4>(k, from(i), b, b_row, c.add(i * c_row), c_row);
+            i += 4;
+        }
+        while i < m {
+            block::<1>(k, from(i), b, b_row, c.add(i * c_row), c_row);
+            i += 1;
+        }
+    }
+}
+
+/// `c[m × n] = a[m × k] · b[k × n]`, `b` and `c` row-major.
+///
+/// # Safety
+/// [`serves`] must hold for `n`, and the three matrices must span that many elements.
+#[target_feature(enable = "avx512f")]
+pub(crate) unsafe fn multiply(m: usize, n: usize, k: usize, a: Strided, b: *const f32, c: *mut f32) {
+    for j in (0..n).step_by(COLUMNS) {
+        // SAFETY: columns j.. of the matrices the caller vouches for.
+        unsafe { panel(m, k, a, b.add(j), n, c.add(j), n) };
+    }
+}
+
+/// `to = fromᵀ` for 16 × 16 numbers.
+#[inline]
+#[target_feature(enable = "avx512f")]
+unsafe fn transpose(from: *const f32, from_row: usize, to: *mut f32, to_row: usize) {
+    let mut rows = [_mm512_setzero_ps(); LANES];
+    for (i, row) in rows.iter_mut().enumerate() {
+        // SAFETY: the caller vouches for 16 rows of 16.
+        *row = unsafe { _mm512_loadu_ps(from.add(i * from_row)) };
+    }
+    // Quarter q of `quads[4·g + c]` is column 4·q + c of the rows 4·g..4·g + 4.
+    let mut quads = rows;
+    for g in (0..LANES).step_by(4) {
+        let low = [0, 2].map(|i| _mm512_castps_pd(_mm512_unpacklo_ps(rows[g + i], rows[g + i + 1])));
+        let high = [0, 2].map(|i| _mm512_castps_pd(_mm512_unpackhi_ps(rows[g + i], rows[g + i + 1])));
+        quads[g] = _mm512_castpd_ps(_mm512_unpacklo_pd(low[0], low[1]));
+        quads[g + 1] = _mm512_castpd_ps(_mm512_unpackhi_pd(low[0], low[1]));
+        quads[g + 2] = _mm512_castpd_ps(_mm512_unpacklo_pd(high[0], high[1]));
+        quads[g + 3] = _mm512_castpd_ps(_mm512_unpackhi_pd(high[0], high[1]));
+    }
+    const EVEN: i32 = 0b10_00_10_00;
+    const ODD: i32 = 0b11_01_11_01;
+    for c in 0..4 {
+        let even = [0, 8].map(|g| _mm512_shuffle_f32x4::<EVEN>(quads[g + c], quads[g + 4 + c]));
+        let odd = [0, 8].map(|g| _mm512_shuffle_f32x4::<ODD>(quads[g + c], quads[g + 4 + c]));
+        let columns = [
+            _mm512_shuffle_f32x4::<EVEN>(even[0], even[1]),
+            _mm512_shuffle_f32x4::<EVEN>(odd[0], odd[1]),
+            _mm512_shuffle_f32x4::<ODD>(even[0], even[1]),
+            _mm512_shuffle_f32x4::<ODD>(odd[0], odd[1]),
+        ];
+        for (q, column) in columns.into_iter().enumerate() {
+            // SAFETY: and for as many to write to.
+            unsafe { _mm512_storeu_ps(to.add((4 * q + c) * to_row), column) };
+        }
+    }
+}
+
+/// `c[m × k] = a[m × n] · b[k × n]ᵀ`, all row-major; `block_of_b` is room to work in.
+///
+/// # Safety
+/// [`serves`] must hold for `k` and `n`, and the three matrices must span that many elements.
+#[target_feature(enable = "avx512f")]
+pub(crate) unsafe fn multiply_transposed(
+    (m, k, n): (usize, usize, usize),
+    a: *const f32,
+    b: *const f32,
+    c: *mut f32,
+    block_of_b: &mut Vec<f32>,
+) {
+    block_of_b.resize(n * COLUMNS, 0.0);
+    let a = Strided { first: a, row: n, column: 1 };
+    for j in (0..k).step_by(COLUMNS) {
+        // SAFETY: rows j..j + 32 of `b` become the columns of a block, n × 32.
+        unsafe {
+            for p in (0..n).step_by(LANES) {
+                for half in [0, LANES] {
+                    transpose(b.add((j + half) * n + p), n, block_of_b.as_mut_ptr().add(p * COLUMNS + half), COLUMNS);
+                }
+            }
+            panel(m, n, a, block_of_b.as_ptr(), COLUMNS, c.add(j), k);
+        }
+    }
+}
