@@ -5,6 +5,7 @@
 use criterion::{Criterion, criterion_group, criterion_main};
 use quad_dataset::Batch;
 use quad_learner::agent::{Agent, AgentConfig, EtaConfig, Guidance, TargetReduce};
+use quad_policy::Precision;
 use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 
@@ -32,6 +33,7 @@ fn config(hidden: usize, critics: usize, samples: usize, threshold: Option<f32>)
         nu_ema_rate: 0.005,
         actor_ema_every: 5,
         actor_ema_start: 0,
+        precision: Precision::F32,
     }
 }
 

@@ -3,6 +3,7 @@
 use std::path::{Path, PathBuf};
 
 use quad_dataset::RewardRule;
+use quad_policy::Precision;
 use serde::{Deserialize, Serialize};
 
 use crate::agent::{self, AgentConfig, Guidance};
@@ -63,6 +64,7 @@ pub struct Overrides {
     pub seed: Option<u64>,
     pub guidance: Option<Guidance>,
     pub samples: Option<usize>,
+    pub precision: Option<Precision>,
     pub candidates: Option<u32>,
 }
 
@@ -195,6 +197,7 @@ impl Experiment {
         set(&mut self.candidates, overrides.candidates);
         set(&mut self.agent.guidance, overrides.guidance);
         set(&mut self.agent.samples, overrides.samples);
+        set(&mut self.agent.precision, overrides.precision);
     }
 
     /// The figures that tell runs apart, in one line.

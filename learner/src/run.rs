@@ -9,7 +9,7 @@ use quad_dataset::{EnvironmentSpec, ReadOptions, Transitions};
 use quad_protocol::Name;
 use quad_service::{Endpoints, Hint};
 use tokio::sync::mpsc;
-use tracing::{debug, info};
+use tracing::{debug, info, warn};
 
 use crate::cli::{Cli, Command, ReportArgs, TrainArgs};
 use crate::conduct::{Conductor, Ending, open_network};
@@ -70,6 +70,9 @@ fn train(args: &TrainArgs) -> anyhow::Result<()> {
     let DatasetInfo { transitions: count, episodes, mean_score, .. } = &config.dataset;
     info!("{count} transitions of {episodes} episodes, mean score {mean_score:.2}");
     info!("{}", config.experiment.summary());
+    if !config.experiment.agent.precision.is_available() {
+        warn!("this CPU has no AVX512-BF16: it computes in f32");
+    }
     debug!("{config:?}");
 
     // Zenoh and the training thread have threads of their own; this runtime serves the metrics and the main loop.

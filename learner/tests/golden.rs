@@ -7,7 +7,9 @@
 use quad_dataset::Batch;
 use quad_learner::agent::reference::{Reference, ReferenceState};
 use quad_learner::agent::{Agent, AgentConfig, AgentState, Guidance, Moments, StepMetrics, StepNoise};
-use quad_policy::{Architecture, NoisePredictor, NoisyActions, Parameters, Schedule, TargetPolicy, reference};
+use quad_policy::{
+    Architecture, NoisePredictor, NoisyActions, Parameters, Precision, Schedule, TargetPolicy, reference,
+};
 use safetensors::{Dtype, SafeTensors};
 use std::path::{Path, PathBuf};
 
@@ -210,7 +212,7 @@ fn golden_denoise_step() {
 #[test]
 fn golden_best_of_candidates() {
     for golden in goldens() {
-        let policy = TargetPolicy::new(golden.agent_state().target);
+        let policy = TargetPolicy::new(golden.agent_state().target, Precision::F32);
         let states = numbers(&golden.inputs, "select_observations");
         let candidates = golden.config.candidates;
         let selection = policy.select_with(&states, candidates, &numbers(&golden.inputs, "select_noise"));

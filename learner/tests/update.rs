@@ -6,7 +6,7 @@ use quad_dataset::Batch;
 use quad_learner::agent::reference::{Reference, ReferenceState};
 use quad_learner::agent::{Agent, AgentConfig, AgentState, EtaConfig, Guidance, StepNoise, TargetReduce};
 use quad_policy::reference::{Tensors, load};
-use quad_policy::{Architecture, Parameters};
+use quad_policy::{Architecture, Parameters, Precision};
 use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 use rand_distr::{Distribution, StandardNormal};
@@ -35,6 +35,7 @@ fn config(guidance: Guidance) -> AgentConfig {
         nu_ema_rate: 0.1,
         actor_ema_every: 2,
         actor_ema_start: 0,
+        precision: Precision::F32,
     }
 }
 
@@ -147,6 +148,22 @@ fn an_infinite_temperature_is_dac() {
         agent.state().clone()
     });
     assert_eq!(dac, quad);
+}
+
+#[test]
+fn bf16_is_close_to_f32() {
+    // As wide as one block of AVX-512's columns, so that the CPUs that can do use it.
+    let exact = AgentConfig { hidden: 64, ..config(Guidance::Quad) };
+    let rounded = AgentConfig { precision: Precision::Bf16, ..exact.clone() };
+    let [exact, rounded] = [exact, rounded].map(|config| {
+        let mut agent = Agent::from_state(fresh(&config).1, &config, 10, 0);
+        let mut generator = ChaCha8Rng::seed_from_u64(7);
+        agent.step(&batch(&config, &mut generator), &noise(&config, &mut generator)).unwrap();
+        agent.intermediates().targets.clone()
+    });
+    let difference = exact.iter().zip(&rounded).map(|(x, y)| (x - y).abs()).fold(0.0, f32::max);
+    assert_eq!(difference > 0.0, Precision::Bf16.is_available(), "rounding is seen where there is any");
+    assert!(difference < 0.02, "targets differ by {difference}");
 }
 
 #[test]

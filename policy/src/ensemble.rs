@@ -3,9 +3,9 @@
 //! Work is cut into (critic, tile of rows) and runs in parallel; the cut does not depend on the number of threads, so
 //! neither do the results.
 
-use crate::Architecture;
 use crate::mlp::Mlp;
 use crate::network::{Input, Network, TILE, concatenate, sized, with_workspace};
+use crate::{Architecture, Precision};
 use rayon::prelude::*;
 
 /// Shapes of an ensemble; its parameters are a flat slice, critic after critic.
@@ -54,7 +54,7 @@ impl CriticEnsemble {
     }
 
     /// `out[K × rows] = Q_k(s, a)`, a row for each action.
-    pub fn values(&self, parameters: &[f32], input: StateActions<'_>, out: &mut [f32]) {
+    pub fn values(&self, parameters: &[f32], input: StateActions<'_>, precision: Precision, out: &mut [f32]) {
         let network = &self.network;
         let rows = input.actions.len() / network.action_dim;
         let states = (TILE / input.repeat).max(1);
@@ -70,7 +70,7 @@ impl CriticEnsemble {
                     let len = observations.len() / network.observation_dim * network.hidden;
                     network.state_part(parameters, observations, sized(&mut base, len));
                     let input = Input { base: &base[..len], repeat: input.repeat, shift, actions };
-                    network.forward(parameters, input, work, out);
+                    network.forward(parameters, input, precision, work, out);
                     work.base = base;
                 });
             });

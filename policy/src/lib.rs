@@ -7,8 +7,9 @@
 //! - [`NoisePredictor`] (`noise_predictor`): ε_θ, its gradient, the sampler.
 //! - [`CriticEnsemble`] (`ensemble`): values, regression, gradients at actions.
 //! - [`TargetPolicy`] (`select`): acting by the best of N_a candidates.
+//! - [`Precision`] (`precision`): how exactly networks are evaluated that no gradient is taken of.
 //! - below them `network` (the MLP that actor and critics share), `mlp` (where its layers lie), `elementwise` (Mish and
-//!   what is fused with it) and `matmul`.
+//!   what is fused with it) and `matmul` (with `avx512`).
 //! - [`reference`]: the same networks as plain candle tensors, to read, to differentiate and to test against.
 //!
 //! Buffers are row-major `f32` slices; a name's shape is given as `rows × columns`. Everything that draws random
@@ -25,6 +26,7 @@ mod mlp;
 mod network;
 mod noise_predictor;
 mod parameters;
+mod precision;
 pub mod reference;
 mod schedule;
 mod select;
@@ -35,5 +37,6 @@ pub use ensemble::{CriticEnsemble, StateActions};
 pub use error::PolicyError;
 pub use noise_predictor::{NoisePredictor, NoisyActions};
 pub use parameters::Parameters;
+pub use precision::Precision;
 pub use schedule::Schedule;
 pub use select::{ActionNoise, Selection, TargetPolicy};

@@ -11,6 +11,8 @@ use crate::avx512;
 thread_local! {
     /// Where [`avx512::multiply_transposed`] transposes to.
     static BLOCK: RefCell<Vec<f32>> = RefCell::default();
+    /// Where [`avx512::bf16::multiply`] rounds to.
+    static ROUNDED: RefCell<avx512::bf16::Rounded> = RefCell::default();
 }
 
 /// A row-major matrix or its transpose, as `gemm` wants it: first element, column stride, row stride.
@@ -64,6 +66,20 @@ pub(crate) fn product(x: &[f32], w: &[f32], out: &mut [f32], k: usize, n: usize)
     multiply_row_major(m, n, k, out, (x.as_ptr(), 1, k as isize), w);
 }
 
+/// `product` with `x` and `w` rounded to bfloat16 where the CPU multiplies such numbers faster, else `product` itself.
+pub(crate) fn product_bf16(x: &[f32], w: &[f32], out: &mut [f32], k: usize, n: usize) {
+    #[cfg(target_arch = "x86_64")]
+    if avx512::bf16::serves(k, n) {
+        let m = x.len() / k;
+        assert!(x.len() == m * k && w.len() == k * n && out.len() == m * n, "the product's shape");
+        // SAFETY: as in `multiply`.
+        return ROUNDED.with_borrow_mut(|rounded| unsafe {
+            avx512::bf16::multiply((m, n, k), x.as_ptr(), w.as_ptr(), out.as_mut_ptr(), rounded);
+        });
+    }
+    product(x, w, out, k, n);
+}
+
 /// `out[m × k] = g[m × n] · w[k × n]ᵀ`: a gradient's way back through `product`.
 pub(crate) fn product_transposed(g: &[f32], w: &[f32], out: &mut [f32], k: usize, n: usize) {
     let m = g.len() / n;
@@ -111,7 +127,15 @@ mod tests {
             };
             let mut out = vec![f32::NAN; m * n];
             product(&x, &w, &mut out, k, n);
-            assert_close(&out, |i| sum(k, &|p| (x[i / n * k + p], w[p * n + i % n])), &format!("{m} × {k} × {n}"));
+            let exact = |i: usize| sum(k, &|p| (x[i / n * k + p], w[p * n + i % n]));
+            assert_close(&out, exact, &format!("{m} × {k} × {n}"));
+            let mut out = vec![f32::NAN; m * n];
+            product_bf16(&x, &w, &mut out, k, n);
+            // Each term is off by at most a part in 2^8: twice half a unit in the last of 8 bits.
+            let terms = |i: usize| sum(k, &|p| (x[i / n * k + p].abs(), w[p * n + i % n].abs()));
+            for (i, x) in out.iter().enumerate() {
+                assert!((f64::from(*x) - exact(i)).abs() <= terms(i) / 256.0 + 1e-5, "{m} × {k} × {n} in bf16 at {i}");
+            }
             let mut out = vec![f32::NAN; m * k];
             product_transposed(&g, &w, &mut out, k, n);
             assert_close(&out, |i| sum(n, &|p| (g[i / k * n + p], w[i % k * n + p])), &format!("{m} × {n} × {k}ᵀ"));

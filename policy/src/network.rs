@@ -4,11 +4,12 @@
 //! The first layer is taken apart: the state's part is computed once per state, whatever number of actions is tried in
 //! it, and the action's few columns are fused with the activation.
 
+use crate::Precision;
 use crate::elementwise::{
     FirstLayer, bias_mish, bias_mish_slope, column_sums, dots, first_layer, first_layer_slope, multiply,
     scale_by_combination,
 };
-use crate::matmul::{outer, product, product_transposed};
+use crate::matmul::{outer, product, product_bf16, product_transposed};
 use crate::mlp::Mlp;
 use std::cell::RefCell;
 
@@ -116,7 +117,18 @@ impl Network {
     }
 
     /// `out[rows × outputs]` of a tile.
-    pub fn forward(&self, parameters: &[f32], input: Input<'_>, work: &mut Workspace, out: &mut [f32]) {
+    pub fn forward(
+        &self,
+        parameters: &[f32],
+        input: Input<'_>,
+        precision: Precision,
+        work: &mut Workspace,
+        out: &mut [f32],
+    ) {
+        let product = match precision {
+            Precision::F32 => product,
+            Precision::Bf16 => product_bf16,
+        };
         let (h, len) = (self.hidden, input.actions.len() / self.action_dim * self.hidden);
         let [x, y, _] = &mut work.x;
         let (x, y) = (sized(x, len), sized(y, len));

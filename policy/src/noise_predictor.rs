@@ -5,7 +5,7 @@ use crate::ensemble::part;
 use crate::matmul::{outer, product, product_transposed};
 use crate::mlp::Mlp;
 use crate::network::{Input, Network, TILE, Workspace, concatenate, sized, with_workspace};
-use crate::{Architecture, Schedule};
+use crate::{Architecture, Precision, Schedule};
 use rayon::prelude::*;
 
 /// Shapes and constants of a noise predictor; its parameters are a flat slice: time embedding, then trunk.
@@ -98,7 +98,15 @@ impl NoisePredictor {
     ///
     /// `noise` is `T × rows × action_dim`, standard normal, rows being states × `repeat`: first a^T, then the noise of
     /// the reverse steps from t = T down to 2. `actions` is `rows × action_dim`.
-    pub fn sample(&self, parameters: &[f32], observations: &[f32], repeat: usize, noise: &[f32], actions: &mut [f32]) {
+    pub fn sample(
+        &self,
+        parameters: &[f32],
+        observations: &[f32],
+        repeat: usize,
+        noise: &[f32],
+        precision: Precision,
+        actions: &mut [f32],
+    ) {
         let a = self.trunk.action_dim;
         let (_, trunk) = self.split(parameters);
         let (embedding, all, steps) = (self.embed(parameters), actions.len(), self.schedule.steps());
@@ -117,7 +125,7 @@ impl NoisePredictor {
                     let shift = &embedding.shift[(t - 1) * self.trunk.hidden..][..self.trunk.hidden];
                     let input = Input { base: &base[..len], repeat, shift, actions };
                     let epsilon = sized(&mut out, actions.len());
-                    self.trunk.forward(trunk, input, work, epsilon);
+                    self.trunk.forward(trunk, input, precision, work, epsilon);
                     let z = if t > 1 { &noise[(steps - t + 1) * all + i * tile..][..actions.len()] } else { &[] };
                     self.schedule.reverse(t, actions, epsilon, z);
                 }
@@ -163,7 +171,7 @@ impl NoisePredictor {
         out.par_chunks_mut(TILE * self.trunk.action_dim).enumerate().for_each(|(i, out)| {
             with_workspace(|work| {
                 self.tile(trunk, &embedding, self.tile_of(input, i), work, |tile, work| {
-                    self.trunk.forward(trunk, tile, work, out);
+                    self.trunk.forward(trunk, tile, Precision::F32, work, out);
                 });
             });
         });

@@ -1,7 +1,7 @@
 //! Acting: the best of N_a candidates (Eq. 25), drawn from the target actor and valued by the target critics.
 
 use crate::ensemble::StateActions;
-use crate::{Architecture, CriticEnsemble, NoisePredictor, Parameters, PolicyError};
+use crate::{Architecture, CriticEnsemble, NoisePredictor, Parameters, PolicyError, Precision};
 use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;
 use rand_distr::{Distribution, StandardNormal};
@@ -31,6 +31,7 @@ pub struct TargetPolicy {
     actor: NoisePredictor,
     critics: CriticEnsemble,
     parameters: Parameters,
+    precision: Precision,
 }
 
 /// Candidates of a batch of states and what the critics say of them.
@@ -45,14 +46,19 @@ pub struct Selection {
 
 impl TargetPolicy {
     /// Takes weights as they are.
-    pub fn new(parameters: Parameters) -> Self {
+    pub fn new(parameters: Parameters, precision: Precision) -> Self {
         let architecture = *parameters.architecture();
-        Self { actor: NoisePredictor::new(&architecture), critics: CriticEnsemble::new(&architecture), parameters }
+        let (actor, critics) = (NoisePredictor::new(&architecture), CriticEnsemble::new(&architecture));
+        Self { actor, critics, parameters, precision }
     }
 
     /// Reads a snapshot's tensors: exactly those of the architecture, all finite.
-    pub fn from_safetensors(architecture: Architecture, bytes: &[u8]) -> Result<Self, PolicyError> {
-        Ok(Self::new(Parameters::from_safetensors(&architecture, bytes)?))
+    pub fn from_safetensors(
+        architecture: Architecture,
+        bytes: &[u8],
+        precision: Precision,
+    ) -> Result<Self, PolicyError> {
+        Ok(Self::new(Parameters::from_safetensors(&architecture, bytes)?, precision))
     }
 
     /// The shapes.
@@ -74,7 +80,7 @@ impl TargetPolicy {
             }
         }
         if candidates == 1 {
-            return self.actor.sample(&self.parameters.actor, observations, 1, &draws, actions);
+            return self.actor.sample(&self.parameters.actor, observations, 1, &draws, self.precision, actions);
         }
         let selection = self.select_with(observations, candidates, &draws);
         for (i, (action, chosen)) in actions.chunks_exact_mut(a).zip(&selection.chosen).enumerate() {
@@ -86,11 +92,11 @@ impl TargetPolicy {
     pub fn select_with(&self, observations: &[f32], candidates: usize, noise: &[f32]) -> Selection {
         let rows = observations.len() / self.architecture().observation_dim * candidates;
         let mut actions = vec![0.0; rows * self.architecture().action_dim];
-        self.actor.sample(&self.parameters.actor, observations, candidates, noise, &mut actions);
+        self.actor.sample(&self.parameters.actor, observations, candidates, noise, self.precision, &mut actions);
         let critics = self.architecture().critics;
         let mut each = vec![0.0; critics * rows];
         let input = StateActions { observations, actions: &actions, repeat: candidates };
-        self.critics.values(&self.parameters.critics, input, &mut each);
+        self.critics.values(&self.parameters.critics, input, self.precision, &mut each);
         let mut values = vec![0.0; rows];
         for critic in each.chunks_exact(rows) {
             values.iter_mut().zip(critic).for_each(|(sum, q)| *sum += q / critics as f32);

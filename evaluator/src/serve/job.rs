@@ -124,6 +124,18 @@ fn roll_out(
     shared: &Shared,
     metrics: &Metrics,
 ) -> Result<Option<Vec<EpisodeOutcome>>, EnvironmentError> {
+    // On a thread of the pool: else each parallel part of each step would wake one up and wait for it.
+    rayon::scope(|_| roll_out_here(spec, seeds, candidates, policy, shared, metrics))
+}
+
+fn roll_out_here(
+    spec: &'static EnvironmentSpec,
+    seeds: &[u64],
+    candidates: usize,
+    policy: &TargetPolicy,
+    shared: &Shared,
+    metrics: &Metrics,
+) -> Result<Option<Vec<EpisodeOutcome>>, EnvironmentError> {
     let mut rollout = Rollout::new(spec, seeds, ActionNoise::new)?;
     while !rollout.is_done() {
         if shared.cancelled.load(Relaxed) {

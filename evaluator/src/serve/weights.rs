@@ -3,7 +3,7 @@
 use std::sync::{Arc, Mutex, PoisonError};
 
 use quad_dataset::environment;
-use quad_policy::{Architecture, PolicyError, TargetPolicy};
+use quad_policy::{Architecture, PolicyError, Precision, TargetPolicy};
 use quad_protocol::{Job, Name, Schema, Snapshot, decode, keys};
 use tokio::sync::Notify;
 use tokio::task::JoinSet;
@@ -59,13 +59,13 @@ impl WeightsError {
 }
 
 /// Builds the policy of `snapshot` if it is exactly the one that `job` names. Its hash was verified by the codec.
-pub fn policy_for(job: &Job, snapshot: &Snapshot) -> Result<TargetPolicy, WeightsError> {
+pub fn policy_for(job: &Job, snapshot: &Snapshot, precision: Precision) -> Result<TargetPolicy, WeightsError> {
     same("run", &job.run, &snapshot.run)?;
     same("epoch", &job.epoch, &snapshot.epoch)?;
     same("step", &job.step, &snapshot.step)?;
     same("hash", &job.weights, &snapshot.hash)?;
     same("environment", &job.environment, &snapshot.schema.environment)?;
-    Ok(TargetPolicy::from_safetensors(architecture(&snapshot.schema)?, &snapshot.tensors)?)
+    Ok(TargetPolicy::from_safetensors(architecture(&snapshot.schema)?, &snapshot.tensors, precision)?)
 }
 
 fn same<T: PartialEq + ToString>(field: &'static str, wanted: &T, found: &T) -> Result<(), WeightsError> {
@@ -189,13 +189,13 @@ mod tests {
     fn label(change: impl Fn(&mut Job, &mut Snapshot)) -> &'static str {
         let (mut job, mut snapshot) = job_and_snapshot();
         change(&mut job, &mut snapshot);
-        policy_for(&job, &snapshot).err().unwrap().label()
+        policy_for(&job, &snapshot, Precision::F32).err().unwrap().label()
     }
 
     #[test]
     fn only_the_snapshot_that_the_job_names_is_used() {
         let (job, snapshot) = job_and_snapshot();
-        assert!(policy_for(&job, &snapshot).is_ok());
+        assert!(policy_for(&job, &snapshot, Precision::F32).is_ok());
         assert_eq!(label(|job, _| job.run = Name::new("other").unwrap()), "other_snapshot");
         assert_eq!(label(|job, _| job.epoch += 1), "other_snapshot");
         assert_eq!(label(|job, _| job.step += 1), "other_snapshot");

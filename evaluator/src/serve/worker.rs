@@ -6,7 +6,7 @@ use std::time::{Duration, Instant};
 
 use anyhow::Context;
 use quad_dataset::environment::EnvironmentSpec;
-use quad_policy::TargetPolicy;
+use quad_policy::{Precision, TargetPolicy};
 use quad_protocol::{EpisodeScore, Hash, Job, Name, Progress, ScoreReport};
 use tokio::sync::{Notify, watch};
 use tracing::{info, warn};
@@ -26,6 +26,7 @@ const KEEP_SCORES: Duration = Duration::from_secs(600);
 /// Serves every run that is found, one job at a time, in turn.
 pub struct Worker {
     name: Name,
+    precision: Precision,
     metrics: Metrics,
     found: watch::Receiver<Runs>,
     runs: BTreeMap<RunKey, RunClient>,
@@ -40,9 +41,10 @@ pub struct Worker {
 
 impl Worker {
     /// A worker for the runs that `found` names.
-    pub fn new(name: Name, metrics: Metrics, found: watch::Receiver<Runs>) -> Worker {
+    pub fn new(name: Name, precision: Precision, metrics: Metrics, found: watch::Receiver<Runs>) -> Worker {
         Worker {
             name,
+            precision,
             metrics,
             found,
             runs: BTreeMap::new(),
@@ -177,8 +179,8 @@ impl Worker {
         self.policy = None;
         let snapshot = run.snapshot(job).await?;
         let built = tokio::task::spawn_blocking({
-            let job = job.clone();
-            move || policy_for(&job, &snapshot)
+            let (job, precision) = (job.clone(), self.precision);
+            move || policy_for(&job, &snapshot, precision)
         });
         let policy = built.await?.inspect_err(|error| self.metrics.rejected(error.label()))?;
         Ok(self.policy.insert((job.weights, Arc::new(policy))).1.clone())

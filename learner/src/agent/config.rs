@@ -1,6 +1,6 @@
 //! Hyper-parameters of the update: the `[agent]` table of a preset.
 
-use quad_policy::Architecture;
+use quad_policy::{Architecture, Precision};
 use serde::{Deserialize, Serialize};
 
 /// What pulls the policy away from the data.
@@ -84,6 +84,9 @@ pub struct AgentConfig {
     pub actor_ema_every: u64,
     /// Updates after which the target actor starts to follow.
     pub actor_ema_start: u64,
+    /// Arithmetic of what no gradient is taken of: the sampled next actions, and the target critics' values.
+    #[serde(default)]
+    pub precision: Precision,
 }
 
 /// A hyper-parameter outside its range.

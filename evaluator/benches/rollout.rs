@@ -1,0 +1,89 @@
+//! Ten Hopper episodes at the paper's sizes: a step of all of them together, and what it is made of.
+
+#![allow(clippy::expect_used)] // what cannot be had ends the run
+
+use criterion::{BatchSize, Criterion, criterion_group, criterion_main};
+use quad_dataset::environment::find;
+use quad_evaluator::environment::make;
+use quad_evaluator::rollout::Rollout;
+use quad_policy::{ActionNoise, Architecture, Parameters, Precision, TargetPolicy};
+use rand::{Rng, SeedableRng};
+use rand_chacha::ChaCha8Rng;
+use std::hint::black_box;
+
+const EPISODES: usize = 10;
+const CANDIDATES: usize = 10;
+/// Steps from the episodes' beginning, few enough that none falls over.
+const STEPS: usize = 4;
+const PAPER: Architecture =
+    Architecture { observation_dim: 11, action_dim: 3, hidden: 256, critics: 10, diffusion_steps: 5 };
+
+fn policy(precision: Precision) -> TargetPolicy {
+    TargetPolicy::new(Parameters::initialise(&PAPER, &mut ChaCha8Rng::seed_from_u64(0)), precision)
+}
+
+/// Four steps of ten episodes; a policy call and a control period each.
+fn steps(criterion: &mut Criterion) {
+    let spec = find("hopper").expect("a known environment");
+    let seeds: Vec<u64> = (0..EPISODES as u64).collect();
+    let mut group = criterion.benchmark_group("rollout");
+    for (name, precision) in [("f32", Precision::F32), ("bf16", Precision::Bf16)] {
+        let policy = policy(precision);
+        group.bench_function(format!("{STEPS} steps, {name}"), |bencher| {
+            bencher.iter_batched_ref(
+                || Rollout::new(spec, &seeds, ActionNoise::new).expect("MuJoCo compiles the embedded model"),
+                |rollout| {
+                    rayon::scope(|_| {
+                        for _ in 0..STEPS {
+                            rollout.step(|observations, noise, actions| {
+                                policy.select(observations, CANDIDATES, noise, actions);
+                            });
+                        }
+                    });
+                    assert_eq!(rollout.environment_steps(), (EPISODES * STEPS) as u64, "an episode has ended");
+                },
+                BatchSize::PerIteration,
+            );
+        });
+    }
+    group.finish();
+}
+
+/// The policy alone, for ten states.
+fn select(criterion: &mut Criterion) {
+    let mut random = ChaCha8Rng::seed_from_u64(1);
+    let observations: Vec<f32> =
+        (0..EPISODES * PAPER.observation_dim).map(|_| random.random_range(-1.0..1.0)).collect();
+    let mut noise: Vec<ActionNoise> = (0..EPISODES as u64).map(ActionNoise::new).collect();
+    let mut actions = vec![0.0; EPISODES * PAPER.action_dim];
+    let mut group = criterion.benchmark_group("select");
+    for (name, precision) in [("f32", Precision::F32), ("bf16", Precision::Bf16)] {
+        let policy = policy(precision);
+        group.bench_function(name, |bencher| {
+            bencher.iter(|| rayon::scope(|_| policy.select(&observations, CANDIDATES, &mut noise, &mut actions)));
+            black_box(&actions);
+        });
+    }
+    group.finish();
+}
+
+/// Control periods of one Hopper on one thread, actions uniform at random.
+fn hopper(criterion: &mut Criterion) {
+    let mut environment =
+        make(find("hopper").expect("a known environment")).expect("MuJoCo compiles the embedded model");
+    let mut random = ChaCha8Rng::seed_from_u64(0);
+    let mut seed = 0;
+    environment.reset(seed);
+    criterion.bench_function("environment/hopper", |bencher| {
+        bencher.iter(|| {
+            let step = environment.step(&random.random::<[f32; 3]>().map(|unit| 2.0 * unit - 1.0));
+            if step.terminated || step.truncated {
+                seed += 1;
+                environment.reset(seed);
+            }
+        });
+    });
+}
+
+criterion_group!(benches, steps, select, hopper);
+criterion_main!(benches);
