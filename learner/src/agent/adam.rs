@@ -27,7 +27,8 @@ impl Moments {
 
 /// One optimiser step's numbers.
 #[derive(Clone, Copy, Debug)]
-pub(super) struct AdamStep {
+pub struct AdamStep {
+    /// Step size, before the moments' bias corrections.
     pub learning_rate: f32,
     /// Global norm above which the gradient is scaled down to it.
     pub clip: f32,
@@ -83,7 +84,7 @@ fn ema_chunk(target: &mut [f32], online: &[f32], rate: f32) {
 }
 
 /// Sums the gradient's copies (one per tile) into the first, and returns its global norm.
-pub(super) fn reduce(gradient: &mut [f32], len: usize) -> f32 {
+pub fn reduce(gradient: &mut [f32], len: usize) -> f32 {
     let (sum, others) = gradient.split_at_mut(len);
     let others = &*others;
     let squares: Vec<f32> = sum
@@ -100,7 +101,7 @@ pub(super) fn reduce(gradient: &mut [f32], len: usize) -> f32 {
 }
 
 /// Clips the gradient, whose norm is known, and takes Adam's step.
-pub(super) fn adam(step: AdamStep, norm: f32, parameters: &mut [f32], moments: &mut Moments, gradient: &[f32]) {
+pub fn adam(step: AdamStep, norm: f32, parameters: &mut [f32], moments: &mut Moments, gradient: &[f32]) {
     let count = step.count as f64;
     let update = Update {
         scale: (step.clip / norm).min(1.0),
@@ -116,7 +117,7 @@ pub(super) fn adam(step: AdamStep, norm: f32, parameters: &mut [f32], moments: &
 }
 
 /// `target = (1 - rate)·target + rate·online`.
-pub(super) fn ema(target: &mut [f32], online: &[f32], rate: f32) {
+pub fn ema(target: &mut [f32], online: &[f32], rate: f32) {
     target
         .par_chunks_mut(CHUNK)
         .zip(online.par_chunks(CHUNK))
@@ -124,7 +125,7 @@ pub(super) fn ema(target: &mut [f32], online: &[f32], rate: f32) {
 }
 
 /// Cosine decay from 1 at step 0 to 0 at `total`.
-pub(super) fn cosine_decay(step: u64, total: u64) -> f32 {
+pub fn cosine_decay(step: u64, total: u64) -> f32 {
     let progress = (step as f64 / total.max(1) as f64).min(1.0);
     (0.5 * (1.0 + (std::f64::consts::PI * progress).cos())) as f32
 }

@@ -4,7 +4,7 @@
 //! [`reference`] is the same update in candle's tensors with autograd: slower and plainer. Both are held against numbers
 //! from an independent implementation (docs/golden.md) and against each other.
 
-mod adam;
+pub mod adam;
 mod config;
 mod guidance;
 mod noise;
