@@ -114,6 +114,8 @@ impl Conductor {
                 trained = &mut self.threads.trained, if training => {
                     training = false;
                     match trained {
+                        // Told to stop during the last step: there was nothing left to stop, but the scores are not waited for.
+                        Ok(Ok(Outcome::Completed)) if interrupted => return Ending::Interrupted,
                         Ok(Ok(Outcome::Completed)) => {}
                         Ok(Ok(Outcome::Stopped { .. })) => return Ending::Interrupted,
                         Ok(Err(error)) => return Ending::Failed(error),

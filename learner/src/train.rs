@@ -8,6 +8,7 @@ use std::time::Instant;
 
 use quad_dataset::{Batch, BatchSampler, Transitions};
 use serde::Serialize;
+use tracing::debug;
 
 use crate::agent::{Agent, AgentError, StepMetrics};
 use crate::metrics::TrainingMetrics;
@@ -128,6 +129,7 @@ pub fn train(
         }
         let due = plan.eval_interval > 0 && (last || step % plan.eval_interval == 0);
         if due || last || stopped {
+            debug!(step, "snapshot");
             let tensors = agent.target_safetensors().map_err(|source| TrainError::Update { step, source })?;
             (outlets.snapshot)(Snapshot { step, tensors, evaluate: due });
         }

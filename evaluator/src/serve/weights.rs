@@ -7,7 +7,7 @@ use quad_policy::{Architecture, PolicyError, Precision, TargetPolicy};
 use quad_protocol::{Job, Name, Schema, Snapshot, decode, keys};
 use tokio::sync::Notify;
 use tokio::task::JoinSet;
-use tracing::warn;
+use tracing::{debug, warn};
 use zenoh::Session;
 use zenoh::handlers::RingChannel;
 
@@ -128,6 +128,7 @@ impl NewestWeights {
                 match decoded.await {
                     Ok(Ok(snapshot)) => {
                         metrics.snapshots_received.inc();
+                        debug!(%run, step = snapshot.step, "weights arrived");
                         *cache.lock().unwrap_or_else(PoisonError::into_inner) = Some(Arc::new(snapshot));
                         arrived.notify_one();
                     }
