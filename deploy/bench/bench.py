@@ -1,0 +1,194 @@
+"""Runs the benchmarks of learner and evaluator and of their peers in JAX in turns, and prints what docs/performance.md
+shows. To be started by deploy/bench.sh.
+
+    bench.py ROUNDS
+
+Figures are medians over the rounds; a ratio is the median of the rounds' ratios.
+"""
+
+import json
+import os
+import platform
+import statistics
+import subprocess
+import sys
+from pathlib import Path
+
+# Shapes, as in learner/benches/update.rs and evaluator/benches/rollout.rs.
+OBSERVATION, ACTION, TIME, STEPS, BATCH = 11, 3, 32, 5, 256
+CONFIGURATIONS = {
+    "paper, 10 samples": {"hidden": 256, "critics": 10, "samples": 10, "predictions": 2},
+    "paper, 1 sample": {"hidden": 256, "critics": 10, "samples": 1, "predictions": 2},
+    "demo": {"hidden": 128, "critics": 5, "samples": 1, "predictions": 1},
+}
+EPISODES = CANDIDATES = 10
+ROLLOUT_STEPS = 4
+PEAK_CALLS, PEAK_ROWS, PEAK_WIDTH = 1000, 128, 256
+PYTHON = ".deps/venv/bin/python"
+
+
+class Work:
+    """Arithmetic: floating-point operations of products, and activations without and with their slope."""
+
+    def __init__(self, flop=0.0, mish=0.0, slope=0.0):
+        self.flop, self.mish, self.slope = flop, mish, slope
+
+    def __add__(self, other):
+        return Work(self.flop + other.flop, self.mish + other.mish, self.slope + other.slope)
+
+    def bound(self, peak):
+        """Seconds at the machine's peaks."""
+        return self.flop / peak["flop"] + self.mish / peak["mish"] + self.slope / peak["slope"]
+
+
+def forward(rows, inputs, hidden, outputs):
+    return Work(rows * 2 * (inputs * hidden + 2 * hidden**2 + hidden * outputs), rows * 3 * hidden)
+
+
+def back(rows, hidden, outputs):
+    """From the output's gradient to those before each activation, whose slopes the way forward had to find."""
+    return Work(rows * 2 * (2 * hidden**2 + hidden * outputs), -rows * 3 * hidden, rows * 3 * hidden)
+
+
+def parts(hidden, critics, samples, predictions):
+    """What a gradient step consists of: {benchmark: its arithmetic}; nothing counts as shared between rows."""
+    actor = lambda rows: forward(rows, OBSERVATION + ACTION + TIME, hidden, ACTION)
+    critic = lambda rows: forward(rows, OBSERVATION + ACTION, hidden, 1)
+    rows = critics * BATCH
+    return {
+        "sampled next actions": actor(STEPS * BATCH * samples),
+        "target critics": critic(rows * samples),
+        "critic step": critic(rows) + back(rows, hidden, 1) + Work(critic(rows).flop),
+        "critic optimiser": Work(),
+        "critic EMA": Work(),
+        "Q-gradients' scale": critic(rows),
+        "Q-gradients": critic(rows) + back(rows, hidden, 1) + Work(rows * 2 * hidden * ACTION),
+        "actor step": actor(BATCH * (1 + predictions)) + back(BATCH, hidden, ACTION) + Work(actor(BATCH).flop),
+        "actor optimiser and EMA": Work(),
+    }
+
+
+def criterion(package, bench):
+    """Runs a bench; {name: median seconds}."""
+    command = ["cargo", "bench", "--locked", "--workspace", "--quiet", "--bench", bench, "--", "--noplot", "--quiet"]
+    subprocess.run(command, check=True, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+    return {
+        json.loads((path / "benchmark.json").read_text())["full_id"]: json.loads((path / "estimates.json").read_text())["median"]["point_estimate"] / 1e9
+        for path in Path("target/criterion").rglob("new")
+    }
+
+
+def peer(*command):
+    result = subprocess.run([PYTHON, "-W", "ignore", *command], check=True, capture_output=True, text=True)
+    return json.loads(result.stdout)
+
+
+def one_round():
+    jax = {
+        "plain": peer("learner/benches/jax_step.py"),
+        "tuned": peer("learner/benches/jax_step.py", "--tuned"),
+        "rollout": peer("evaluator/benches/jax_rollout.py"),
+    }
+    seconds = criterion("quad-learner", "update") | criterion("quad-evaluator", "rollout")
+    threads = len(os.sched_getaffinity(0))
+    elements = threads * PEAK_CALLS * PEAK_ROWS * PEAK_WIDTH
+    peak = {
+        "flop": elements * 2 * PEAK_WIDTH / seconds["peak/product"],
+        "mish": elements / seconds["peak/mish"],
+        "slope": elements / seconds["peak/mish and slope"],
+    }
+    return {"jax": jax, "seconds": seconds, "peak": peak, "threads": threads}
+
+
+def median(rounds, of):
+    return statistics.median(of(x) for x in rounds)
+
+
+def table(*rows):
+    head, *rest = rows
+    for row in head, ["---", *["---:"] * (len(head) - 1)], *rest:
+        print("| " + " | ".join(row) + " |")
+    print()
+
+
+def machine(rounds):
+    info = Path("/proc/cpuinfo").read_text() if Path("/proc/cpuinfo").exists() else ""
+    model = next((line.split(": ")[1] for line in info.splitlines() if line.startswith("model name")), platform.processor())
+    extra = [x for x in ("avx512f", "avx512_bf16", "amx_bf16") if x in info]
+    peak = {name: median(rounds, lambda x: x["peak"][name]) / 1e9 for name in ("flop", "mish", "slope")}
+    print(f"{model} ({', '.join(extra) or 'no AVX-512'}), {rounds[0]['threads']} threads; `gemm` {peak['flop']:.0f} GFLOP/s,")
+    print(f"Mish {peak['mish']:.1f} and with its slope {peak['slope']:.1f} G elements/s. Medians of {len(rounds)} rounds.\n")
+
+
+def updates(rounds):
+    rows = [["gradient step", "bound", "f32", "of the bound", "JAX, plain", "ratio", "JAX, tuned", "ratio", "bf16", "over best JAX"]]
+    for name, shapes in CONFIGURATIONS.items():
+        work = sum(parts(**shapes).values(), Work())
+        ours = lambda x: x["seconds"][f"update/{name}"]
+        bf16 = lambda x: x["seconds"][f"update, bf16/{name}"]
+        plain, tuned = (lambda x, kind=kind: min(x["jax"][kind][name].values()) for kind in ("plain", "tuned"))
+        best = lambda x: min(plain(x), tuned(x))
+        ms = lambda of: f"{1e3 * median(rounds, of):.1f} ms"
+        ratio = lambda over, under: f"{median(rounds, lambda x: over(x) / under(x)):.2f} ×"
+        share = median(rounds, lambda x: work.bound(x["peak"]) / ours(x))
+        rows.append(
+            [name, ms(lambda x: work.bound(x["peak"])), ms(ours), f"{100 * share:.0f} %", ms(plain), ratio(plain, ours)]
+            + [ms(tuned), ratio(tuned, ours), ms(bf16), ratio(best, bf16)]
+        )
+    table(*rows)
+
+
+def step_parts(rounds):
+    for name, shapes in CONFIGURATIONS.items():
+        rows = [[name, "GFLOP", "M Mish", "bound", "takes", "of the bound"]]
+        total, spent = Work(), 0.0
+        for part, work in parts(**shapes).items():
+            seconds = median(rounds, lambda x: x["seconds"][f"{name}/{part}"])
+            total, spent = total + work, spent + seconds
+            bound = median(rounds, lambda x: work.bound(x["peak"]))
+            figures = [f"{work.flop / 1e9:.2f}", f"{(work.mish + work.slope) / 1e6:.1f}", f"{1e3 * bound:.2f} ms"]
+            figures = figures if work.flop else ["", "", ""]
+            rows.append([part, *figures, f"{1e3 * seconds:.2f} ms", f"{100 * bound / seconds:.0f} %" if work.flop else ""])
+        whole = median(rounds, lambda x: x["seconds"][f"update/{name}"])
+        bound = median(rounds, lambda x: total.bound(x["peak"]))
+        rows.append(["noise, targets, weights λ, waiting", "", "", "", f"{1e3 * (whole - spent):.2f} ms", ""])
+        figures = [f"{total.flop / 1e9:.2f}", f"{(total.mish + total.slope) / 1e6:.1f}", f"{1e3 * bound:.2f} ms"]
+        rows.append(["the step", *figures, f"{1e3 * whole:.2f} ms", f"{100 * bound / whole:.0f} %"])
+        table(*rows)
+
+
+def rollouts(rounds):
+    decisions = EPISODES * CANDIDATES
+    work = forward(STEPS * decisions, OBSERVATION + ACTION + TIME, 256, ACTION)
+    work += forward(10 * decisions, OBSERVATION + ACTION, 256, 1)
+    physics = lambda x: EPISODES * x["seconds"]["environment/hopper"] / x["threads"]
+    jax = lambda x: x["jax"]["rollout"]["seconds"]
+    rows = [["ten Hopper episodes", "environment steps/s", "over JAX", "step of all ten", "its policy", "network and physics at their best", "over that"]]
+    rows.append(["JAX, one at a time", f"{median(rounds, lambda x: 1 / jax(x)):.0f}", "", "", "", "", ""])
+    for name in "f32", "bf16":
+        step = lambda x, name=name: x["seconds"][f"rollout/{ROLLOUT_STEPS} steps, {name}"] / ROLLOUT_STEPS
+        select = median(rounds, lambda x: x["seconds"][f"select/{name}"])
+        bound = lambda x: work.bound(x["peak"]) + physics(x)
+        rows.append(
+            [f"evaluator, {name}", f"{median(rounds, lambda x: EPISODES / step(x)):.0f}"]
+            + [f"{median(rounds, lambda x: jax(x) * EPISODES / step(x)):.1f} ×", f"{1e3 * median(rounds, step):.2f} ms"]
+            + [f"{1e3 * select:.2f} ms", f"{1e3 * median(rounds, bound):.2f} ms (f32)"]
+            + [f"{median(rounds, lambda x: step(x) / bound(x)):.2f} ×"]
+        )
+    table(*rows)
+
+
+def main():
+    rounds = []
+    for i in range(int(sys.argv[1])):
+        print(f"bench: round {i + 1} of {sys.argv[1]}", file=sys.stderr)
+        rounds.append(one_round())
+    Path("target/bench.json").write_text(json.dumps(rounds, indent=1))
+    machine(rounds)
+    updates(rounds)
+    step_parts(rounds)
+    rollouts(rounds)
+
+
+if __name__ == "__main__":
+    main()
