@@ -75,21 +75,27 @@ macro_rules! panel {
             c: *mut f32,
             c_row: usize,
         ) {
-            let mut i = 0;
-            // SAFETY: rows i.. are inside as long as as many are left as a block has.
-            unsafe {
-                let from = |i: usize| Strided { first: a.first.add(i * a.row), ..a };
-                while m - i >= ROWS {
-                    block::<ROWS>(k, from(i), b, b_row, c.add(i * c_row), c_row);
-                    i += ROWS;
-                }
-                while m - i >= 4 {
-                    block::<4>(k, from(i), b, b_row, c.add(i * c_row), c_row);
-                    i += 4;
-                }
-                while i < m {
-                    block::<1>(k, from(i), b, b_row, c.add(i * c_row), c_row);
-                    i += 1;
+            // Blocks of nearly equal height: in a low one the sums would wait for one another.
+            let blocks = m.div_ceil(ROWS);
+            for i in 0..blocks {
+                let (from, to) = (i * m / blocks, (i + 1) * m / blocks);
+                // SAFETY: rows from..to are inside, and at most `ROWS`.
+                unsafe {
+                    let (a, c) = (Strided { first: a.first.add(from * a.row), ..a }, c.add(from * c_row));
+                    match to - from {
+                        1 => block::<1>(k, a, b, b_row, c, c_row),
+                        2 => block::<2>(k, a, b, b_row, c, c_row),
+                        3 => block::<3>(k, a, b, b_row, c, c_row),
+                        4 => block::<4>(k, a, b, b_row, c, c_row),
+                        5 => block::<5>(k, a, b, b_row, c, c_row),
+                        6 => block::<6>(k, a, b, b_row, c, c_row),
+                        7 => block::<7>(k, a, b, b_row, c, c_row),
+                        8 => block::<8>(k, a, b, b_row, c, c_row),
+                        9 => block::<9>(k, a, b, b_row, c, c_row),
+                        10 => block::<10>(k, a, b, b_row, c, c_row),
+                        11 => block::<11>(k, a, b, b_row, c, c_row),
+                        _ => block::<ROWS>(k, a, b, b_row, c, c_row),
+                    }
                 }
             }
         }
