@@ -1,5 +1,7 @@
 //! Where the tests of the tensors' update run: on candle's CPU, and on a GPU with the feature `cuda`.
 
+#![allow(clippy::print_stderr)] // what is skipped is said
+
 use candle_core::Device;
 
 /// The devices to test on. Without a GPU the feature's share is skipped, unless QUAD_REQUIRE_PEERS asks for one.
