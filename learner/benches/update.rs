@@ -8,7 +8,8 @@ use criterion::{BenchmarkGroup, Criterion, criterion_group, criterion_main};
 use gemm::{Parallelism, gemm};
 use quad_dataset::Batch;
 use quad_learner::agent::adam::{AdamStep, adam, ema, reduce};
-use quad_learner::agent::{Agent, AgentConfig, EtaConfig, Guidance, Moments, TargetReduce};
+use quad_learner::agent::{AgentConfig, EtaConfig, Guidance, Moments, TargetReduce};
+use quad_learner::device::Device;
 use quad_policy::{
     CriticEnsemble, NoisePredictor, NoisyActions, Parameters, Precision, StateActions, mish_in_place, mish_slope,
 };
@@ -71,12 +72,19 @@ fn batch(size: usize) -> Batch {
 }
 
 fn updates(criterion: &mut Criterion) {
-    for (group, precision) in [("update", Precision::F32), ("update, bf16", Precision::Bf16)] {
+    let (cpu, f32) = (Device::Cpu, Precision::F32);
+    let mut groups = vec![("update", cpu, f32), ("update, bf16", cpu, Precision::Bf16)];
+    // An update ends with its numbers on the host, so that nothing of it is left for the GPU to do.
+    if cfg!(feature = "cuda") {
+        groups.push(("update on cuda", Device::Cuda, f32));
+    }
+    for (group, device, precision) in groups {
         let mut group = criterion.benchmark_group(group);
         group.sample_size(20);
         for (name, config) in configurations(precision) {
+            let architecture = config.architecture(DIMS.0, DIMS.1);
             let mut agent =
-                Agent::new(config.architecture(DIMS.0, DIMS.1), &config, 1_000_000, 0).expect("a usable configuration");
+                device.agent(architecture, &config, 1_000_000, 0).expect("a usable configuration and device");
             let batch = batch(config.batch_size);
             group.bench_function(name, |bencher| bencher.iter(|| agent.update(&batch).expect("a step")));
         }

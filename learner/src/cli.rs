@@ -9,6 +9,7 @@ use quad_policy::Precision;
 
 use crate::agent::Guidance;
 use crate::config::{self, Overrides};
+use crate::device::Device;
 
 const TRAIN_EXAMPLES: &str = "\
 Examples:
@@ -62,6 +63,9 @@ pub struct TrainArgs {
     /// Serve /metrics and /healthz here; port 0 takes a free one (see DIR/endpoints.json)
     #[arg(long, value_name = "ADDR:PORT", default_value = "127.0.0.1:0")]
     pub metrics: SocketAddr,
+    /// Train on the CPU, or on the first Nvidia GPU, with a learner that was built by deploy/cuda.sh
+    #[arg(long, value_name = "cpu|cuda", value_enum, hide_possible_values = true, default_value_t)]
+    pub device: Device,
     #[command(flatten)]
     overrides: OverrideArgs,
 }
@@ -169,13 +173,14 @@ mod tests {
 
     #[test]
     fn wrong_command_lines_exit_with_2() {
-        let wrong: [&[&str]; 7] = [
+        let wrong: [&[&str]; 8] = [
             &["--steps", "0"],
             &["--candidates", "0"],
             &["--guidance", "sac"],
             &["--listen", "127.0.0.1:7447"],
             &["--listen", "tcp/127.0.0.1:1", "--connect", "tcp/127.0.0.1:2"],
             &["--metrics", "9090"],
+            &["--device", "tpu"],
             &["--nonsense"],
         ];
         for flags in wrong {

@@ -7,6 +7,7 @@ use quad_policy::Precision;
 use serde::{Deserialize, Serialize};
 
 use crate::agent::{self, AgentConfig, Guidance};
+use crate::device::Device;
 
 /// The presets that the binary carries: name and TOML.
 pub const PRESETS: [(&str, &str); 2] = [
@@ -92,6 +93,9 @@ pub struct RunInfo {
     pub preset: String,
     /// Version of the learner.
     pub version: String,
+    /// Where it trains; runs from before there was a choice do not say.
+    #[serde(default)]
+    pub device: Device,
 }
 
 /// What the run learns from.

@@ -5,8 +5,8 @@
 //!
 //! - [`cli`] is what can be typed, [`config`] what it resolves to: a preset with flags on top, validated once.
 //! - [`run`] goes from the command line to the exit; [`conduct`] is the main loop in between.
-//! - [`threads`] starts the threads that do the work: [`train`] (nothing but gradient steps, with [`agent`]),
-//!   [`weights`] (keeps and publishes snapshots) and [`hub`] (hands out jobs, takes scores in).
+//! - [`threads`] starts the threads that do the work: [`train`] (nothing but gradient steps, with an [`agent`] on a
+//!   [`device`]), [`weights`] (keeps and publishes snapshots) and [`hub`] (hands out jobs, takes scores in).
 //! - [`scoreboard`] is the hub's state without any I/O; [`seeds`] says which episodes an evaluation has.
 //! - [`wire`] declares everything on Zenoh; its callbacks fill an [`inbox`]; [`notice`] is what threads tell the loop.
 //! - [`run_dir`] is the folder of a run, [`metrics`] what Prometheus asks, [`display`] what a person sees meanwhile.
@@ -16,6 +16,7 @@ pub mod agent;
 pub mod cli;
 pub mod conduct;
 pub mod config;
+pub mod device;
 pub mod display;
 pub mod hub;
 pub mod inbox;

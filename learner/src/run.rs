@@ -61,6 +61,8 @@ fn train(args: &TrainArgs) -> anyhow::Result<()> {
     let name = run_name(&path)?;
     RunDir::check_free(&path).hint("choose another --run-dir, or remove the folder if you do not need it")?;
 
+    args.device.check(experiment.agent.precision)?;
+
     let environment = quad_dataset::environment::find(&experiment.environment)?;
     let options = ReadOptions { environment, reward: experiment.reward };
     let transitions = Transitions::read(&args.dataset, &options)
@@ -175,6 +177,7 @@ fn run_config(
             epoch: SystemTime::now().duration_since(UNIX_EPOCH)?.as_millis() as u64,
             preset: config::preset_label(&args.preset),
             version: env!("CARGO_PKG_VERSION").to_owned(),
+            device: args.device,
         },
         dataset: DatasetInfo {
             path: args.dataset.clone(),

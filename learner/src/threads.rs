@@ -13,8 +13,8 @@ use tokio::sync::mpsc::UnboundedSender;
 use tokio::sync::oneshot;
 use tracing::warn;
 
-use crate::agent::Agent;
 use crate::config::{Experiment, RunConfig};
+use crate::device::Device;
 use crate::hub::{self, EvaluationPlan, Hub};
 use crate::inbox::{Inbox, inbox};
 use crate::metrics::{Metrics, TrainingMetrics};
@@ -88,6 +88,7 @@ impl Threads {
         let (tell, trained) = oneshot::channel();
         let trainer = Trainer {
             experiment: experiment.clone(),
+            device: config.run.device,
             environment,
             transitions,
             metrics: metrics.training.clone(),
@@ -129,6 +130,7 @@ fn finish(name: &str, thread: JoinHandle<()>) -> anyhow::Result<()> {
 
 struct Trainer {
     experiment: Experiment,
+    device: Device,
     environment: &'static EnvironmentSpec,
     transitions: Transitions,
     metrics: TrainingMetrics,
@@ -141,7 +143,7 @@ impl Trainer {
     fn run(self) -> TrainingResult {
         let Experiment { steps, eval_interval, seed, agent: config, .. } = &self.experiment;
         let architecture = config.architecture(self.environment.observation_dim, self.environment.action_dim);
-        let mut agent = Agent::new(architecture, config, *steps, *seed)?;
+        let mut agent = self.device.agent(architecture, config, *steps, *seed)?;
         let mut sampler = BatchSampler::new(self.transitions.len(), config.batch_size, *seed);
         let outlets = Outlets {
             metrics: self.metrics,
@@ -150,7 +152,7 @@ impl Trainer {
             stop: &self.stop,
         };
         let plan = Plan { steps: *steps, eval_interval: *eval_interval };
-        let outcome = train(&mut agent, &self.transitions, &mut sampler, plan, &outlets)?;
+        let outcome = train(&mut *agent, &self.transitions, &mut sampler, plan, &outlets)?;
         if outcome == Outcome::Completed {
             self.weights.send(weights::Event::TrainingCompleted);
         }

@@ -10,7 +10,7 @@ use quad_dataset::{Batch, BatchSampler, Transitions};
 use serde::Serialize;
 use tracing::debug;
 
-use crate::agent::{Agent, AgentError, StepMetrics};
+use crate::agent::{AgentError, StepMetrics, Trainee};
 use crate::metrics::TrainingMetrics;
 
 /// Gradient steps that a line of `metrics.jsonl` averages over.
@@ -104,7 +104,7 @@ pub enum TrainError {
 
 /// Trains until all steps are done or somebody asks to stop; at the end the last snapshot is handed over in any case.
 pub fn train(
-    agent: &mut Agent,
+    agent: &mut dyn Trainee,
     transitions: &Transitions,
     sampler: &mut BatchSampler,
     plan: Plan,

@@ -4,12 +4,14 @@
 
 #![allow(clippy::unwrap_used)] // what cannot be had ends the run
 
+mod devices;
+
+use candle_core::Device;
+use devices::devices;
 use quad_dataset::Batch;
 use quad_learner::agent::reference::{Reference, ReferenceState};
 use quad_learner::agent::{Agent, AgentConfig, AgentState, Guidance, Moments, StepMetrics, StepNoise};
-use quad_policy::{
-    Architecture, NoisePredictor, NoisyActions, Parameters, Precision, Schedule, TargetPolicy, reference,
-};
+use quad_policy::{Architecture, NoisePredictor, NoisyActions, Parameters, Precision, Schedule, TargetPolicy};
 use safetensors::{Dtype, SafeTensors};
 use std::path::{Path, PathBuf};
 
@@ -64,32 +66,6 @@ impl Golden {
             eta: numbers(&self.state, "eta")[0],
             nu_squared: (nu_squared >= 0.0).then_some(nu_squared),
             step: self.config.step,
-        }
-    }
-
-    fn reference_state(&self) -> ReferenceState {
-        let state = self.agent_state();
-        let mut all = reference::load(&self.state, &candle_core::Device::Cpu).unwrap();
-        let mut take = |prefix: &str| {
-            let names: Vec<_> = all.keys().filter(|name| name.starts_with(prefix)).cloned().collect();
-            let strip = |name: &str| {
-                name.trim_start_matches("target_")
-                    .trim_start_matches("adam_m.")
-                    .trim_start_matches("adam_v.")
-                    .to_string()
-            };
-            names.into_iter().map(|name| (strip(&name), all.remove(&name).unwrap())).collect()
-        };
-        ReferenceState {
-            actor: take("actor."),
-            critics: take("critic."),
-            target_actor: take("target_actor."),
-            target_critics: take("target_critic."),
-            first: take("adam_m."),
-            second: take("adam_v."),
-            eta: state.eta,
-            nu_squared: state.nu_squared,
-            step: state.step,
         }
     }
 
@@ -266,13 +242,21 @@ fn golden_update() {
 
 #[test]
 fn golden_reference_update() {
+    for device in devices() {
+        golden_reference_update_on(&device);
+    }
+}
+
+/// Any device must meet the same tolerance: candle multiplies in full f32 on a GPU, too, unless it is told to use TF32,
+/// so that only the order of sums differs.
+fn golden_reference_update_on(device: &Device) {
     for golden in goldens() {
-        let mut state = golden.reference_state();
+        let mut state = ReferenceState::new(&golden.agent_state(), device).unwrap();
         let update = Reference {
             config: &golden.config.agent,
             architecture: golden.architecture,
             total_steps: golden.config.total_steps,
-            device: candle_core::Device::Cpu,
+            device: device.clone(),
         };
         let metrics = update.step(&mut state, &golden.batch(), &golden.noise()).unwrap();
         golden.check_metrics(&metrics);

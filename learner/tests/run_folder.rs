@@ -4,6 +4,7 @@
 use std::path::Path;
 
 use quad_learner::config::{DatasetInfo, Overrides, RunConfig, RunInfo, resolve};
+use quad_learner::device::Device;
 use quad_learner::plot::learning_curves;
 use quad_learner::report::{Report, RunReport};
 use quad_learner::run_dir::{RunDir, RunDirError, ScoreLine};
@@ -11,7 +12,13 @@ use quad_learner::run_dir::{RunDir, RunDirError, ScoreLine};
 fn config(name: &str, seed: u64) -> RunConfig {
     let overrides = Overrides { seed: Some(seed), episodes: Some(2), ..Overrides::default() };
     RunConfig {
-        run: RunInfo { name: name.into(), epoch: 1, preset: "hopper-demo".into(), version: "0.1.0".into() },
+        run: RunInfo {
+            name: name.into(),
+            epoch: 1,
+            preset: "hopper-demo".into(),
+            version: "0.1.0".into(),
+            device: Device::Cpu,
+        },
         dataset: DatasetInfo {
             path: "data.hdf5".into(),
             transitions: 100,

@@ -2,16 +2,21 @@
 
 #![allow(clippy::unwrap_used)] // what cannot be had ends the run
 
+mod devices;
+
+use devices::devices;
 use quad_dataset::Batch;
 use quad_learner::agent::reference::{Reference, ReferenceState};
-use quad_learner::agent::{Agent, AgentConfig, AgentState, EtaConfig, Guidance, StepNoise, TargetReduce};
-use quad_policy::reference::{Tensors, load};
+use quad_learner::agent::{
+    Agent, AgentConfig, AgentState, EtaConfig, Guidance, StepMetrics, StepNoise, TargetReduce, TensorAgent,
+};
 use quad_policy::{Architecture, Parameters, Precision};
 use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 use rand_distr::{Distribution, StandardNormal};
 
 const DIMS: (usize, usize) = (11, 3);
+const GUIDANCE: [Guidance; 3] = [Guidance::Quad, Guidance::Dac, Guidance::None];
 
 fn config(guidance: Guidance) -> AgentConfig {
     AgentConfig {
@@ -62,60 +67,65 @@ fn noise(config: &AgentConfig, generator: &mut ChaCha8Rng) -> StepNoise {
     }
 }
 
-fn tensors(parameters: &Parameters) -> (Tensors, Tensors) {
-    let all = load(&parameters.to_safetensors().unwrap(), &candle_core::Device::Cpu).unwrap();
-    all.into_iter().partition(|(name, _)| name.starts_with("actor"))
-}
-
-fn reference_state(state: &AgentState) -> ReferenceState {
-    let ((actor, critics), (target_actor, target_critics)) = (tensors(&state.online), tensors(&state.target));
-    let zeros: Tensors =
-        actor.iter().chain(&critics).map(|(name, x)| (name.clone(), x.zeros_like().unwrap())).collect();
-    ReferenceState {
-        actor,
-        critics,
-        target_actor,
-        target_critics,
-        first: zeros.clone(),
-        second: zeros,
-        eta: state.eta,
-        nu_squared: state.nu_squared,
-        step: state.step,
-    }
-}
-
 fn fresh(config: &AgentConfig) -> (Architecture, AgentState) {
     let architecture = config.architecture(DIMS.0, DIMS.1);
     (architecture, AgentState::new(&architecture, config, 3))
 }
 
+/// That two updates reported the same, up to rounding in f32.
+fn close(what: &str, a: &StepMetrics, b: &StepMetrics) {
+    for (name, a, b) in [
+        ("critic_loss", a.critic_loss, b.critic_loss),
+        ("bc_loss", a.bc_loss, b.bc_loss),
+        ("actor_loss", a.actor_loss, b.actor_loss),
+        ("eta", a.eta, b.eta),
+        ("lambda_mean", a.lambda_mean, b.lambda_mean),
+        ("q_mean", a.q_mean, b.q_mean),
+        ("nu_squared", a.nu_squared, b.nu_squared),
+        ("critic_gradient_norm", a.critic_gradient_norm, b.critic_gradient_norm),
+        ("actor_gradient_norm", a.actor_gradient_norm, b.actor_gradient_norm),
+        ("learning_rate", a.learning_rate, b.learning_rate),
+    ] {
+        assert!((a - b).abs() <= 2e-4 * b.abs() + 1e-6, "{what}: {name} is {a}, not {b}");
+    }
+}
+
 #[test]
 fn fast_update_and_reference_agree_over_several_steps() {
-    for guidance in [Guidance::Quad, Guidance::Dac, Guidance::None] {
+    for (device, guidance) in devices().iter().flat_map(|device| GUIDANCE.map(|guidance| (device, guidance))) {
         let config = config(guidance);
         let (architecture, state) = fresh(&config);
-        let mut slow = reference_state(&state);
+        let mut slow = ReferenceState::new(&state, device).unwrap();
         let mut fast = Agent::from_state(state, &config, 50, 0);
-        let reference = Reference { config: &config, architecture, total_steps: 50, device: candle_core::Device::Cpu };
+        let reference = Reference { config: &config, architecture, total_steps: 50, device: device.clone() };
         let mut generator = ChaCha8Rng::seed_from_u64(9);
         for step in 0..5 {
             let (batch, noise) = (batch(&config, &mut generator), noise(&config, &mut generator));
             let a = fast.step(&batch, &noise).unwrap();
             let b = reference.step(&mut slow, &batch, &noise).unwrap();
-            for (name, a, b) in [
-                ("critic_loss", a.critic_loss, b.critic_loss),
-                ("bc_loss", a.bc_loss, b.bc_loss),
-                ("actor_loss", a.actor_loss, b.actor_loss),
-                ("eta", a.eta, b.eta),
-                ("lambda_mean", a.lambda_mean, b.lambda_mean),
-                ("q_mean", a.q_mean, b.q_mean),
-                ("nu_squared", a.nu_squared, b.nu_squared),
-                ("critic_gradient_norm", a.critic_gradient_norm, b.critic_gradient_norm),
-                ("actor_gradient_norm", a.actor_gradient_norm, b.actor_gradient_norm),
-                ("learning_rate", a.learning_rate, b.learning_rate),
-            ] {
-                assert!((a - b).abs() <= 2e-4 * b.abs() + 1e-6, "{guidance:?}, step {step}: {name} is {a}, not {b}");
-            }
+            close(&format!("{device:?}, {guidance:?}, step {step}"), &a, &b);
+        }
+    }
+}
+
+#[test]
+fn both_agents_start_with_the_same_weights_and_draw_the_same_noise() {
+    let config = config(Guidance::Quad);
+    let architecture = config.architecture(DIMS.0, DIMS.1);
+    for device in devices() {
+        let mut fast = Agent::new(architecture, &config, 50, 8).unwrap();
+        let mut tensors = TensorAgent::new(architecture, &config, 50, 8, device.clone()).unwrap();
+        assert_eq!(tensors.target_safetensors().unwrap(), fast.target_safetensors().unwrap(), "{device:?}");
+        let mut generator = ChaCha8Rng::seed_from_u64(9);
+        for step in 0..5 {
+            let batch = batch(&config, &mut generator);
+            close(&format!("{device:?}, step {step}"), &fast.update(&batch).unwrap(), &tensors.update(&batch).unwrap());
+        }
+        let bytes = tensors.target_safetensors().unwrap();
+        let target = Parameters::from_safetensors(&architecture, &bytes).unwrap();
+        for (a, b) in [(&target.actor, &fast.state().target.actor), (&target.critics, &fast.state().target.critics)] {
+            let difference = a.iter().zip(b).map(|(a, b)| (a - b).abs()).fold(0.0, f32::max);
+            assert!(difference < 1e-4, "{device:?}: a target's weight differs by {difference}");
         }
     }
 }

@@ -8,7 +8,8 @@ use std::collections::BTreeMap;
 /// x·tanh(softplus(x)) as x·n/(n + 2) with n = e^x (e^x + 2). From 20 on it is x, to the last bit of f32; the bound keeps
 /// value and derivative finite everywhere (the derivative of candle's own Mish is NaN from 89 on).
 pub fn mish(x: &Tensor) -> Result<Tensor> {
-    let e = x.minimum(20f32)?.exp()?;
+    // As a tensor, not a number: that would be sent to the device each time.
+    let e = x.minimum(&Tensor::full(20f32, x.shape(), x.device())?)?.exp()?;
     let n = (&e * (&e + 2.0)?)?;
     x * (&n / (&n + 2.0)?)?
 }
@@ -49,9 +50,11 @@ pub fn noise(weights: &Tensors, observations: &Tensor, actions: &Tensor, t: &Ten
     mlp(weights, "actor.trunk", 4, &Tensor::cat(&[observations, actions, &time], 1)?)
 }
 
-/// Q_k(s, a): `observations [B, o]`, `actions [B, a]` → `[K, B]`.
+/// Q_k(s, a): `observations [B, o]`; `actions [B, a]`, or `[K, B, a]` with actions for each critic → `[K, B]`.
 pub fn values(weights: &Tensors, observations: &Tensor, actions: &Tensor) -> Result<Tensor> {
-    let input = Tensor::cat(&[observations, actions], 1)?.unsqueeze(0)?;
+    let actions = if actions.rank() == 2 { actions.unsqueeze(0)? } else { actions.clone() };
+    let observations = observations.broadcast_left(actions.dim(0)?)?;
+    let input = Tensor::cat(&[observations, actions], 2)?;
     mlp(weights, "critic", 4, &input)?.squeeze(2)
 }
 

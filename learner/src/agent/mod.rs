@@ -1,8 +1,9 @@
 //! The QUAD update, Algorithm 1 of the paper.
 //!
 //! [`Agent::step`] reads like the algorithm; `target` (Eq. 20), `guidance` (Eq. 21–24) and `adam` are its parts.
-//! [`reference`] is the same update in candle's tensors with autograd: slower and plainer. Both are held against numbers
-//! from an independent implementation (docs/golden.md) and against each other.
+//! [`reference`] is the same update in candle's tensors with autograd: plainer, slower on a CPU, and what a GPU runs, by
+//! [`TensorAgent`]. Both are held against numbers from an independent implementation (docs/golden.md) and against each
+//! other.
 
 pub mod adam;
 mod config;
@@ -10,11 +11,15 @@ mod guidance;
 mod noise;
 pub mod reference;
 mod target;
+mod tensor;
+mod trainee;
 
 pub use adam::Moments;
 pub use config::{AgentConfig, ConfigError, EtaConfig, Guidance, TargetReduce};
 pub use guidance::Uncertainty;
 pub use noise::StepNoise;
+pub use tensor::TensorAgent;
+pub use trainee::Trainee;
 
 use adam::{AdamStep, adam, cosine_decay, ema, reduce};
 use noise::NoiseSource;
@@ -111,6 +116,9 @@ pub enum AgentError {
     /// Weights cannot be written or read.
     #[error("the weights cannot be written")]
     Weights(#[from] PolicyError),
+    /// A tensor cannot be computed or moved.
+    #[error("candle failed")]
+    Tensor(#[from] candle_core::Error),
 }
 
 /// Trains an actor and its critics.
@@ -194,7 +202,7 @@ impl Agent {
 
     /// One pass through Algorithm 1's loop with the noise given.
     pub fn step(&mut self, batch: &Batch, noise: &StepNoise) -> Result<StepMetrics, AgentError> {
-        self.check(batch)?;
+        check_batch(self.state.online.architecture(), &self.config, batch)?;
         // As a whole on a thread of the pool: else each of its parallel parts would wake one up and wait for it.
         Ok(rayon::scope(|_| self.step_checked(batch, noise)))
     }
@@ -215,23 +223,6 @@ impl Agent {
             q_mean: targets.iter().sum::<f32>() / targets.len() as f32,
             ..actor
         }
-    }
-
-    fn check(&self, batch: &Batch) -> Result<(), AgentError> {
-        let Architecture { observation_dim, action_dim, .. } = *self.state.online.architecture();
-        let size = self.config.batch_size;
-        for (array, found, expected) in [
-            ("observations", batch.observations.len(), size * observation_dim),
-            ("actions", batch.actions.len(), size * action_dim),
-            ("rewards", batch.rewards.len(), size),
-            ("next observations", batch.next_observations.len(), size * observation_dim),
-            ("masks", batch.masks.len(), size),
-        ] {
-            if found != expected {
-                return Err(AgentError::Batch { array, found, expected });
-            }
-        }
-        Ok(())
     }
 
     /// Algorithm 1, lines 4–7: regress every critic to the lower confidence bound at actions of the target actor.
@@ -360,6 +351,23 @@ impl Agent {
         seen.lambda.clear();
         seen.lambda.extend(seen.uncertainty.variance.iter().map(weight));
     }
+}
+
+fn check_batch(architecture: &Architecture, config: &AgentConfig, batch: &Batch) -> Result<(), AgentError> {
+    let Architecture { observation_dim, action_dim, .. } = *architecture;
+    let size = config.batch_size;
+    for (array, found, expected) in [
+        ("observations", batch.observations.len(), size * observation_dim),
+        ("actions", batch.actions.len(), size * action_dim),
+        ("rewards", batch.rewards.len(), size),
+        ("next observations", batch.next_observations.len(), size * observation_dim),
+        ("masks", batch.masks.len(), size),
+    ] {
+        if found != expected {
+            return Err(AgentError::Batch { array, found, expected });
+        }
+    }
+    Ok(())
 }
 
 /// Mean over all numbers of (x - y)².

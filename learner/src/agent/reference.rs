@@ -1,13 +1,13 @@
 //! The update in candle's tensors, differentiated by candle's autograd: the version to read, and to hold the fast one
-//! against. Runs on any of candle's devices.
+//! against. Runs on any of candle's devices; a step reads back from there once, at its end.
 
-use super::{AgentConfig, Guidance, StepMetrics, StepNoise, TargetReduce, cosine_decay};
+use super::{AgentConfig, AgentError, AgentState, Guidance, StepMetrics, StepNoise, TargetReduce, cosine_decay};
 use candle_core::backprop::GradStore;
 use candle_core::{D, Device, Result, Tensor, Var};
 use quad_dataset::Batch;
 use quad_policy::{
-    Architecture, Schedule,
-    reference::{Tensors, noise, sample, values},
+    Architecture, Parameters, Schedule,
+    reference::{Tensors, load, noise, sample, values},
 };
 
 /// Everything that an update changes; the names are those of [`quad_policy::Parameters`].
@@ -25,12 +25,41 @@ pub struct ReferenceState {
     pub first: Tensors,
     /// Adam's second moments.
     pub second: Tensors,
-    /// Behaviour-cloning strength η.
-    pub eta: f32,
-    /// ν̂², none before the first update.
-    pub nu_squared: Option<f32>,
+    /// Behaviour-cloning strength η, `[]`.
+    pub eta: Tensor,
+    /// ν̂², `[]`; none before the first update.
+    pub nu_squared: Option<Tensor>,
     /// Updates done.
     pub step: u64,
+}
+
+impl ReferenceState {
+    /// An agent's state, copied to a device.
+    pub fn new(state: &AgentState, device: &Device) -> std::result::Result<Self, AgentError> {
+        let tensors = |parameters: &Parameters| -> std::result::Result<Tensors, AgentError> {
+            Ok(load(&parameters.to_safetensors()?, device)?)
+        };
+        let moments = |actor: &Vec<f32>, critics: &Vec<f32>| {
+            let mut parameters = state.online.clone();
+            parameters.actor.clone_from(actor);
+            parameters.critics.clone_from(critics);
+            tensors(&parameters)
+        };
+        let split = |all: Tensors| all.into_iter().partition(|(name, _)| name.starts_with("actor"));
+        let (actor, critics) = split(tensors(&state.online)?);
+        let (target_actor, target_critics) = split(tensors(&state.target)?);
+        Ok(Self {
+            actor,
+            critics,
+            target_actor,
+            target_critics,
+            first: moments(&state.actor_moments.first, &state.critic_moments.first)?,
+            second: moments(&state.actor_moments.second, &state.critic_moments.second)?,
+            eta: Tensor::new(state.eta, device)?,
+            nu_squared: state.nu_squared.map(|x| Tensor::new(x, device)).transpose()?,
+            step: state.step,
+        })
+    }
 }
 
 /// Trainable copies of weights: gradients are taken of these.
@@ -52,8 +81,15 @@ fn mean_and_variance(x: &Tensor) -> Result<(Tensor, Tensor)> {
     Ok((mean.squeeze(0)?, variance))
 }
 
-fn number(x: &Tensor) -> Result<f32> {
-    x.to_scalar::<f32>()
+/// Mean over all numbers of (x - y)², `[]`.
+fn mean_square_error(x: &Tensor, y: &Tensor) -> Result<Tensor> {
+    (x - y)?.sqr()?.mean_all()
+}
+
+/// Tensors `[]` as numbers, in one copy: the device works on its own until somebody reads from it.
+fn numbers<const N: usize>(x: [&Tensor; N]) -> Result<[f32; N]> {
+    let x = Tensor::stack(&x, 0)?.to_vec1::<f32>()?;
+    x.try_into().map_err(|_| candle_core::Error::Msg("a tensor is not one number".into()))
 }
 
 /// One update.
@@ -125,12 +161,13 @@ impl Reference<'_> {
             (inputs.actions.broadcast_mul(&inputs.signal)? + inputs.epsilon.broadcast_mul(&inputs.deviation)?)?;
         let (actor_variables, actor) = variables(&state.actor)?;
         let predicted = self::noise(&actor, &inputs.observations, &noisy, &inputs.t)?;
-        let bc_loss = (&inputs.epsilon - &predicted)?.sqr()?.mean_all()?;
-        let mut actor_loss = (&bc_loss * f64::from(state.eta))?;
-        let mut lambda_mean = 0.0;
+        let bc_loss = mean_square_error(&inputs.epsilon, &predicted)?;
+        let mut actor_loss = (&bc_loss * &state.eta)?;
+        let zero = bc_loss.zeros_like()?;
+        let mut lambda_mean = zero.clone();
         if self.config.guidance != Guidance::None {
             let (gradient, lambda) = self.guidance(state, &inputs, &noisy, &predicted.detach())?;
-            lambda_mean = number(&lambda.mean_all()?)?;
+            lambda_mean = lambda.mean_all()?;
             let weight = lambda.unsqueeze(1)?.mul(&inputs.deviation)?;
             actor_loss = (actor_loss + (&predicted * gradient.broadcast_mul(&weight)?)?.mean_all()?)?;
         }
@@ -141,22 +178,46 @@ impl Reference<'_> {
         // Line 12: dual ascent on η.
         if let Some(threshold) = self.config.eta.threshold {
             let predicted = self::noise(&state.actor, &inputs.observations, &noisy, &inputs.t)?;
-            let error = number(&(&inputs.epsilon - &predicted)?.sqr()?.mean_all()?)? - threshold;
+            let error = (mean_square_error(&inputs.epsilon, &predicted)? - f64::from(threshold))?;
             let eta = &self.config.eta;
-            state.eta = (state.eta + eta.rate * error.clamp(-1.0, 1.0)).clamp(eta.minimum, eta.maximum);
+            let raised = (&state.eta + (error.clamp(-1f32, 1f32)? * f64::from(eta.rate))?)?;
+            state.eta = raised.clamp(eta.minimum, eta.maximum)?;
         }
         state.step += 1;
         if state.step.is_multiple_of(self.config.actor_ema_every) && state.step > self.config.actor_ema_start {
             ema(&mut state.target_actor, &state.actor, self.config.ema_rate)?;
         }
-        Ok(StepMetrics {
-            critic_loss: number(&critic_loss)?,
-            bc_loss: number(&bc_loss)?,
-            actor_loss: number(&actor_loss)?,
-            eta: state.eta,
+        let nu_squared = state.nu_squared.as_ref().unwrap_or(&zero);
+        let q_mean = targets.mean_all()?;
+        let [
+            critic_loss,
+            bc_loss,
+            actor_loss,
+            eta,
             lambda_mean,
-            q_mean: number(&targets.mean_all()?)?,
-            nu_squared: state.nu_squared.unwrap_or(0.0),
+            q_mean,
+            nu_squared,
+            critic_gradient_norm,
+            actor_gradient_norm,
+        ] = numbers([
+            &critic_loss,
+            &bc_loss,
+            &actor_loss,
+            &state.eta,
+            &lambda_mean,
+            &q_mean,
+            nu_squared,
+            &critic_gradient_norm,
+            &actor_gradient_norm,
+        ])?;
+        Ok(StepMetrics {
+            critic_loss,
+            bc_loss,
+            actor_loss,
+            eta,
+            lambda_mean,
+            q_mean,
+            nu_squared,
             critic_gradient_norm,
             actor_gradient_norm,
             learning_rate,
@@ -187,50 +248,48 @@ impl Reference<'_> {
         predicted: &Tensor,
     ) -> Result<(Tensor, Tensor)> {
         let data = values(&state.target_critics, &inputs.observations, &inputs.actions)?;
-        let q_scale = f64::from(number(&data.mean(0)?.abs()?.mean_all()?)?) + 1e-6;
+        let q_scale = (data.mean(0)?.abs()?.mean_all()? + 1e-6)?;
 
-        let each: Vec<Tensor> = (0..self.architecture.critics)
-            .map(|k| {
-                let critic = state.target_critics.iter().map(|(name, x)| Ok((name.clone(), x.narrow(0, k, 1)?)));
-                let actions = Var::from_tensor(noisy)?;
-                let q = values(&critic.collect::<Result<_>>()?, &inputs.observations, actions.as_tensor())?;
-                let gradients = q.sum_all()?.backward()?;
-                gradient_of(&gradients, "actions", &actions)? / q_scale
-            })
-            .collect::<Result<_>>()?;
-        let gradients = Tensor::stack(&each, 0)?;
+        // Actions for each critic, so that one pass gives the gradients of all: none has a part in another's.
+        let actions = Var::from_tensor(&noisy.broadcast_left(self.architecture.critics)?)?;
+        let q = values(&state.target_critics, &inputs.observations, &actions)?;
+        let gradients = gradient_of(&q.sum_all()?.backward()?, "actions", &actions)?.broadcast_div(&q_scale)?;
 
         let norm = (predicted.sqr()?.sum_keepdim(1)?.sqrt()? + 1e-8)?;
         let direction = predicted.broadcast_div(&norm)?.unsqueeze(0)?;
         let alignment = gradients.broadcast_mul(&direction)?.sum(2)?;
         let (mean, variance) = mean_and_variance(&alignment)?;
-        let batch_variance = number(&mean.broadcast_sub(&mean.mean_all()?)?.sqr()?.mean_all()?)?;
-        let rate = self.config.nu_ema_rate;
-        let nu_squared =
-            state.nu_squared.map_or(batch_variance, |before| (1.0 - rate) * before + rate * batch_variance);
-        state.nu_squared = Some(nu_squared);
+        let batch_variance = mean.broadcast_sub(&mean.mean_all()?)?.sqr()?.mean_all()?;
+        let rate = f64::from(self.config.nu_ema_rate);
+        let nu_squared = match &state.nu_squared {
+            Some(before) => ((before * (1.0 - rate))? + (batch_variance * rate)?)?,
+            None => batch_variance,
+        };
         let lambda = match self.config.guidance {
             Guidance::Quad => {
-                let denominator =
-                    ((variance / f64::from(self.config.tau))? + f64::from(nu_squared + self.config.delta))?;
-                (denominator.recip()? * f64::from(nu_squared))?
+                let denominator = ((variance / f64::from(self.config.tau))? + f64::from(self.config.delta))?;
+                denominator.broadcast_add(&nu_squared)?.recip()?.broadcast_mul(&nu_squared)?
             }
             Guidance::Dac | Guidance::None => variance.ones_like()?,
         };
+        state.nu_squared = Some(nu_squared);
         Ok((gradients.mean(0)?, lambda))
     }
 
     /// Adam (0.9, 0.999, 1e-8) on the gradient clipped by its global norm, which is returned.
-    fn adam(&self, state: &mut ReferenceState, variables: &[(String, Var)], all: &GradStore, rate: f32) -> Result<f32> {
-        let mut squares = 0.0;
-        for (name, variable) in variables {
-            squares += number(&gradient_of(all, name, variable)?.sqr()?.sum_all()?)?;
-        }
-        let norm = squares.sqrt();
-        let scale = f64::from((self.config.gradient_clip / norm).min(1.0));
+    fn adam(
+        &self,
+        state: &mut ReferenceState,
+        variables: &[(String, Var)],
+        all: &GradStore,
+        rate: f32,
+    ) -> Result<Tensor> {
+        let squares = variables.iter().map(|(name, variable)| gradient_of(all, name, variable)?.sqr()?.sum_all());
+        let norm = Tensor::stack(&squares.collect::<Result<Vec<_>>>()?, 0)?.sum_all()?.sqrt()?;
+        let scale = (norm.recip()? * f64::from(self.config.gradient_clip))?.minimum(1f32)?;
         let count = (state.step + 1) as f64;
         for (name, variable) in variables {
-            let gradient = (gradient_of(all, name, variable)? * scale)?;
+            let gradient = gradient_of(all, name, variable)?.broadcast_mul(&scale)?;
             let first = ((moment(&mut state.first, name)? * 0.9)? + (&gradient * 0.1)?)?;
             let second = ((moment(&mut state.second, name)? * 0.999)? + (gradient.sqr()? * 0.001)?)?;
             let unbiased = (&first / (1.0 - 0.9_f64.powf(count)))?;

@@ -1,0 +1,68 @@
+//! Where training runs.
+
+use anyhow::{Context, anyhow};
+use quad_policy::{Architecture, Precision};
+use quad_service::Hint;
+use serde::{Deserialize, Serialize};
+
+use crate::agent::{Agent, AgentConfig, TensorAgent, Trainee};
+
+/// Where training runs, as it is called on the command line and in files.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize, clap::ValueEnum)]
+#[serde(rename_all = "lowercase")]
+pub enum Device {
+    /// On the processor.
+    #[default]
+    Cpu,
+    /// On the first Nvidia GPU.
+    Cuda,
+}
+
+impl Device {
+    /// Whether it is there, and computes as asked.
+    pub fn check(self, precision: Precision) -> anyhow::Result<()> {
+        match (self, precision) {
+            (Self::Cpu, _) => Ok(()),
+            (Self::Cuda, Precision::F32) => gpu().map(drop),
+            (Self::Cuda, _) => Err(anyhow!("on a GPU the update computes in f32 only")).hint("use --precision f32"),
+        }
+    }
+
+    /// A new agent there, to be used by the thread that asks for it; its learning rates reach 0 at `steps`.
+    pub fn agent(
+        self,
+        architecture: Architecture,
+        config: &AgentConfig,
+        steps: u64,
+        seed: u64,
+    ) -> anyhow::Result<Box<dyn Trainee>> {
+        Ok(match self {
+            Self::Cpu => Box::new(Agent::new(architecture, config, steps, seed)?),
+            Self::Cuda => Box::new(TensorAgent::new(architecture, config, steps, seed, gpu()?)?),
+        })
+    }
+}
+
+fn gpu() -> anyhow::Result<candle_core::Device> {
+    let hint = match cfg!(feature = "cuda") {
+        true => "does `nvidia-smi` show a GPU on this machine, and a driver for CUDA 13? --device cpu needs neither",
+        false => "build a learner that can by deploy/cuda.sh, or train with --device cpu",
+    };
+    candle_core::Device::new_cuda(0).context("this learner cannot train on a GPU here").hint(hint)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_gpu_that_cannot_be_used_is_an_error() {
+        if !cfg!(feature = "cuda") {
+            let error = Device::Cuda.check(Precision::F32).unwrap_err();
+            assert!(error.to_string().contains("cannot train on a GPU"), "{error}");
+        }
+        let error = Device::Cuda.check(Precision::Bf16).unwrap_err();
+        assert!(error.to_string().contains("f32"), "{error}");
+        assert!(Device::Cpu.check(Precision::Bf16).is_ok());
+    }
+}
