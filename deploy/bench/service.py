@@ -39,7 +39,7 @@ def process(command, log, cores):
             yield child
         finally:
             child.terminate()
-            child.wait()
+            child.wait(timeout=30)
 
 
 def resident(pid):
