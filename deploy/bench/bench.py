@@ -68,14 +68,16 @@ def parts(hidden, critics, samples, predictions):
     }
 
 
-def criterion(package, bench):
-    """Runs a bench; {name: median seconds}."""
+def criterion(bench):
+    """Runs a bench; {name: median seconds}, also of what ran before."""
     command = ["cargo", "bench", "--locked", "--workspace", "--quiet", "--bench", bench, "--", "--noplot", "--quiet"]
-    subprocess.run(command, check=True, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
-    return {
-        json.loads((path / "benchmark.json").read_text())["full_id"]: json.loads((path / "estimates.json").read_text())["median"]["point_estimate"] / 1e9
-        for path in Path("target/criterion").rglob("new")
-    }
+    subprocess.run(command, check=True, capture_output=True)
+    medians = {}
+    for folder in Path("target/criterion").rglob("new"):
+        name = json.loads((folder / "benchmark.json").read_text())["full_id"]
+        estimates = json.loads((folder / "estimates.json").read_text())
+        medians[name] = estimates["median"]["point_estimate"] / 1e9
+    return medians
 
 
 def peer(*command):
@@ -89,7 +91,7 @@ def one_round():
         "tuned": peer("learner/benches/jax_step.py", "--tuned"),
         "rollout": peer("evaluator/benches/jax_rollout.py"),
     }
-    seconds = criterion("quad-learner", "update") | criterion("quad-evaluator", "rollout")
+    seconds = criterion("update") | criterion("rollout")
     threads = len(os.sched_getaffinity(0))
     elements = threads * PEAK_CALLS * PEAK_ROWS * PEAK_WIDTH
     peak = {
@@ -112,16 +114,22 @@ def table(*rows):
 
 
 def machine(rounds):
-    info = Path("/proc/cpuinfo").read_text() if Path("/proc/cpuinfo").exists() else ""
-    model = next((line.split(": ")[1] for line in info.splitlines() if line.startswith("model name")), platform.processor())
-    extra = [x for x in ("avx512f", "avx512_bf16", "amx_bf16") if x in info]
-    peak = {name: median(rounds, lambda x: x["peak"][name]) / 1e9 for name in ("flop", "mish", "slope")}
-    print(f"{model} ({', '.join(extra) or 'no AVX-512'}), {rounds[0]['threads']} threads; `gemm` {peak['flop']:.0f} GFLOP/s,")
-    print(f"Mish {peak['mish']:.1f} and with its slope {peak['slope']:.1f} G elements/s. Medians of {len(rounds)} rounds.\n")
+    info = Path("/proc/cpuinfo")
+    lines = info.read_text().splitlines() if info.exists() else []
+    model = next((line.split(": ")[1] for line in lines if line.startswith("model name")), platform.machine())
+    flags = next((line.split() for line in lines if line.startswith("flags")), [])
+    can = ", ".join(flag for flag in ("avx512f", "avx512_bf16", "amx_bf16") if flag in flags) or "no AVX-512"
+    product, mish, slope = (median(rounds, lambda x: x["peak"][name]) / 1e9 for name in ("flop", "mish", "slope"))
+    print(f"{model} ({can}), {rounds[0]['threads']} threads; the `gemm` crate does {product:.0f} GFLOP/s, a Mish loop")
+    print(f"{mish:.1f} G elements/s, with the slope {slope:.1f}. Medians of {len(rounds)} rounds.\n")
 
 
 def updates(rounds):
-    rows = [["gradient step", "bound", "f32", "of the bound", "JAX, plain", "ratio", "JAX, tuned", "ratio", "bf16", "over best JAX"]]
+    rows = [
+        "gradient step | bound | f32 | of the bound | JAX, plain | ratio | JAX, tuned | ratio | bf16 | over best JAX".split(
+            " | "
+        )
+    ]
     for name, shapes in CONFIGURATIONS.items():
         work = sum(parts(**shapes).values(), Work())
         ours = lambda x: x["seconds"][f"update/{name}"]
@@ -148,7 +156,9 @@ def step_parts(rounds):
             bound = median(rounds, lambda x: work.bound(x["peak"]))
             figures = [f"{work.flop / 1e9:.2f}", f"{(work.mish + work.slope) / 1e6:.1f}", f"{1e3 * bound:.2f} ms"]
             figures = figures if work.flop else ["", "", ""]
-            rows.append([part, *figures, f"{1e3 * seconds:.2f} ms", f"{100 * bound / seconds:.0f} %" if work.flop else ""])
+            rows.append(
+                [part, *figures, f"{1e3 * seconds:.2f} ms", f"{100 * bound / seconds:.0f} %" if work.flop else ""]
+            )
         whole = median(rounds, lambda x: x["seconds"][f"update/{name}"])
         bound = median(rounds, lambda x: total.bound(x["peak"]))
         rows.append(["noise, targets, weights λ, waiting", "", "", "", f"{1e3 * (whole - spent):.2f} ms", ""])
@@ -163,18 +173,21 @@ def rollouts(rounds):
     work += forward(10 * decisions, OBSERVATION + ACTION, 256, 1)
     physics = lambda x: EPISODES * x["seconds"]["environment/hopper"] / x["threads"]
     jax = lambda x: x["jax"]["rollout"]["seconds"]
-    rows = [["ten Hopper episodes", "environment steps/s", "over JAX", "step of all ten", "its policy", "network and physics at their best", "over that"]]
+    rows = [
+        "ten Hopper episodes | environment steps/s | over JAX | step of all ten | its policy | network and physics at their best | over that".split(
+            " | "
+        )
+    ]
     rows.append(["JAX, one at a time", f"{median(rounds, lambda x: 1 / jax(x)):.0f}", "", "", "", "", ""])
     for name in "f32", "bf16":
-        step = lambda x, name=name: x["seconds"][f"rollout/{ROLLOUT_STEPS} steps, {name}"] / ROLLOUT_STEPS
-        select = median(rounds, lambda x: x["seconds"][f"select/{name}"])
+        step = lambda x: x["seconds"][f"rollout/{ROLLOUT_STEPS} steps, {name}"] / ROLLOUT_STEPS
         bound = lambda x: work.bound(x["peak"]) + physics(x)
-        rows.append(
-            [f"evaluator, {name}", f"{median(rounds, lambda x: EPISODES / step(x)):.0f}"]
-            + [f"{median(rounds, lambda x: jax(x) * EPISODES / step(x)):.1f} ×", f"{1e3 * median(rounds, step):.2f} ms"]
-            + [f"{1e3 * select:.2f} ms", f"{1e3 * median(rounds, bound):.2f} ms (f32)"]
-            + [f"{median(rounds, lambda x: step(x) / bound(x)):.2f} ×"]
-        )
+        row = [f"evaluator, {name}", f"{median(rounds, lambda x: EPISODES / step(x)):.0f}"]
+        row += [f"{median(rounds, lambda x: jax(x) * EPISODES / step(x)):.1f} ×"]
+        row += [f"{1e3 * median(rounds, of):.2f} ms" for of in (step, lambda x: x["seconds"][f"select/{name}"])]
+        # The peak was measured in f32.
+        row += [f"{1e3 * median(rounds, bound):.2f} ms", f"{median(rounds, lambda x: step(x) / bound(x)):.2f} ×"]
+        rows.append(row if name == "f32" else [*row[:-2], "", ""])
     table(*rows)
 
 

@@ -94,7 +94,12 @@ def train(folder, dataset, steps, evaluators):
                 seen["pages"].append((time.time(), done, metric(page, "quad_learner_step_duration_seconds_sum")))
         # The evaluations that are still open are of no interest.
     taken = stamps(f"{run}.learner.log", "snapshot")
-    seen["delays"] = [arrived[step] - taken[step] for arrived in (stamps(log, "weights arrived") for log in logs) for step in arrived if step in taken]
+    seen["delays"] = [
+        arrived[step] - taken[step]
+        for arrived in (stamps(log, "weights arrived") for log in logs)
+        for step in arrived
+        if step in taken
+    ]
     seen["begin"] = []
     for log in logs:
         arrived, begun = stamps(log, "weights arrived"), stamps(log, "evaluating")
@@ -139,11 +144,23 @@ def main():
     tenth = max(1, len(memory) // 10)
     rows = [
         ("learner, start to end of a process that makes one step", f"{start:.2f} s"),
-        ("gradient step alone / with four evaluators", f"{1e3 * a:.2f} / {1e3 * b:.2f} ms ({100 * (b / a - 1):+.1f} %)"),
+        (
+            "gradient step alone / with four evaluators",
+            f"{1e3 * a:.2f} / {1e3 * b:.2f} ms ({100 * (b / a - 1):+.1f} %)",
+        ),
         ("training thread's time outside the steps, with four evaluators", f"{100 * outside:.2f} %"),
-        (f"snapshot taken → at an evaluator, {len(delays)} arrivals", f"median {1e3 * statistics.median(delays):.0f} ms, most {1e3 * delays[-1]:.0f} ms"),
-        (f"weights at an evaluator → its episodes begin, {len(begin)} times", f"median {1e3 * statistics.median(begin):.0f} ms, most {1e3 * begin[-1]:.0f} ms"),
-        (f"learner's memory, after a tenth / at the end of {arguments.steps} steps", f"{memory[tenth]:.0f} / {memory[-1]:.0f} MB"),
+        (
+            f"snapshot taken → at an evaluator, {len(delays)} arrivals",
+            f"median {1e3 * statistics.median(delays):.0f} ms, most {1e3 * delays[-1]:.0f} ms",
+        ),
+        (
+            f"weights at an evaluator → its episodes begin, {len(begin)} times",
+            f"median {1e3 * statistics.median(begin):.0f} ms, most {1e3 * begin[-1]:.0f} ms",
+        ),
+        (
+            f"learner's memory, after a tenth / at the end of {arguments.steps} steps",
+            f"{memory[tenth]:.0f} / {memory[-1]:.0f} MB",
+        ),
         ("largest evaluator's memory", f"{max(seen['evaluator_memory'] for seen in together):.0f} MB"),
     ]
     print("| processes | |\n|---|---|")

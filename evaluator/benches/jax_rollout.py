@@ -33,7 +33,9 @@ def main():
     config = make.make_config("quad", "hopper")
     steps, candidates, a = config["agent"]["diffusion_steps"], config["candidates"], config["action_dim"]
     state = make.random_state(config, np.random.default_rng(0))
-    actor, critics = jax.tree.map(lambda x: jnp.asarray(x, jnp.float32), (state["target_actor"], state["target_critic"]))
+    actor, critics = jax.tree.map(
+        lambda x: jnp.asarray(x, jnp.float32), (state["target_actor"], state["target_critic"])
+    )
 
     @jax.jit
     def act(actor, critics, observation, key):
