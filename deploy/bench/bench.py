@@ -125,11 +125,8 @@ def machine(rounds):
 
 
 def updates(rounds):
-    rows = [
-        "gradient step | bound | f32 | of the bound | JAX, plain | ratio | JAX, tuned | ratio | bf16 | over best JAX".split(
-            " | "
-        )
-    ]
+    head = "gradient step | bound | f32 | of the bound | JAX, plain | ratio | JAX, tuned | ratio | bf16 | over best JAX"
+    rows = [head.split(" | ")]
     for name, shapes in CONFIGURATIONS.items():
         work = sum(parts(**shapes).values(), Work())
         ours = lambda x: x["seconds"][f"update/{name}"]
@@ -173,11 +170,8 @@ def rollouts(rounds):
     work += forward(10 * decisions, OBSERVATION + ACTION, 256, 1)
     physics = lambda x: EPISODES * x["seconds"]["environment/hopper"] / x["threads"]
     jax = lambda x: x["jax"]["rollout"]["seconds"]
-    rows = [
-        "ten Hopper episodes | environment steps/s | over JAX | step of all ten | its policy | network and physics at their best | over that".split(
-            " | "
-        )
-    ]
+    head = "ten Hopper episodes | environment steps/s | over JAX | step of all ten | its policy"
+    rows = [head.split(" | ") + ["network and physics at their best", "over that"]]
     rows.append(["JAX, one at a time", f"{median(rounds, lambda x: 1 / jax(x)):.0f}", "", "", "", "", ""])
     for name in "f32", "bf16":
         step = lambda x: x["seconds"][f"rollout/{ROLLOUT_STEPS} steps, {name}"] / ROLLOUT_STEPS
