@@ -8,6 +8,7 @@ use std::arch::x86_64::{
     _mm512_setzero_ps, _mm512_shuffle_f32x4, _mm512_storeu_ps, _mm512_unpackhi_pd, _mm512_unpackhi_ps,
     _mm512_unpacklo_pd, _mm512_unpacklo_ps,
 };
+use std::cell::RefCell;
 
 /// Lanes of a register.
 const LANES: usize = 16;
@@ -27,6 +28,11 @@ pub(crate) struct Strided<T> {
     pub first: *const T,
     pub row: usize,
     pub column: usize,
+}
+
+thread_local! {
+    /// Where [`multiply_transposed`] transposes to.
+    static BLOCK: RefCell<Vec<f32>> = RefCell::default();
 }
 
 /// Defines `panel`, `c = a·b` for all `m` rows and one block of columns, for elements of 32 bits: `$add(sum, x, b)` adds
@@ -102,6 +108,8 @@ macro_rules! panel {
     };
 }
 
+pub(crate) mod bf16;
+
 panel!("avx512f", f32, _mm512_set1_ps, _mm512_loadu_ps, |sum, x, b| _mm512_fmadd_ps(x, b, sum));
 
 /// `c[m × n] = a[m × k] · b[k × n]`, `b` and `c` row-major.
@@ -153,18 +161,13 @@ unsafe fn transpose(from: *const f32, from_row: usize, to: *mut f32, to_row: usi
     }
 }
 
-/// `c[m × k] = a[m × n] · b[k × n]ᵀ`, all row-major; `block_of_b` is room to work in.
+/// `c[m × k] = a[m × n] · b[k × n]ᵀ`, all row-major.
 ///
 /// # Safety
 /// [`serves`] must hold for `k` and `n`, and the three matrices must span that many elements.
 #[target_feature(enable = "avx512f")]
-pub(crate) unsafe fn multiply_transposed(
-    (m, k, n): (usize, usize, usize),
-    a: *const f32,
-    b: *const f32,
-    c: *mut f32,
-    block_of_b: &mut Vec<f32>,
-) {
+pub(crate) unsafe fn multiply_transposed(m: usize, k: usize, n: usize, a: *const f32, b: *const f32, c: *mut f32) {
+    let mut block_of_b = BLOCK.take();
     block_of_b.resize(n * COLUMNS, 0.0);
     let a = Strided { first: a, row: n, column: 1 };
     for j in (0..k).step_by(COLUMNS) {
@@ -178,99 +181,5 @@ pub(crate) unsafe fn multiply_transposed(
             panel(m, n, a, block_of_b.as_ptr(), COLUMNS, c.add(j), k);
         }
     }
-}
-
-/// The product with its operands rounded to bfloat16 and its sums in f32: twice as fast where the CPU has AVX512-BF16.
-pub(crate) mod bf16 {
-    use super::*;
-    use std::arch::x86_64::{
-        __m512bh, __m512i, _mm512_cvtne2ps_pbh, _mm512_dpbf16_ps, _mm512_loadu_si512, _mm512_permutexvar_epi16,
-        _mm512_set1_epi32, _mm512_storeu_si512,
-    };
-
-    /// Two neighbours of a sum's terms in one element.
-    type Pair = i32;
-
-    /// Whether this CPU can, and a product of these shapes is made of whole registers.
-    pub(crate) fn serves(k: usize, columns: usize) -> bool {
-        super::serves(columns) && k.is_multiple_of(COLUMNS) && available()
-    }
-
-    /// Whether this CPU can.
-    pub(crate) fn available() -> bool {
-        is_x86_feature_detected!("avx512f")
-            && is_x86_feature_detected!("avx512bw")
-            && is_x86_feature_detected!("avx512bf16")
-    }
-
-    #[inline]
-    fn pairs(x: __m512i) -> __m512bh {
-        // SAFETY: both are 64 bytes of any content.
-        unsafe { std::mem::transmute(x) }
-    }
-
-    #[inline]
-    fn bits(x: __m512bh) -> __m512i {
-        // SAFETY: both are 64 bytes of any content.
-        unsafe { std::mem::transmute(x) }
-    }
-
-    panel!(
-        "avx512f,avx512bw,avx512bf16",
-        Pair,
-        _mm512_set1_epi32,
-        |b: *const Pair| _mm512_loadu_si512(b.cast()),
-        |sum, x, b| _mm512_dpbf16_ps(sum, pairs(x), pairs(b))
-    );
-
-    /// Rounds two registers of numbers, the first in the low half of the result.
-    #[inline]
-    #[target_feature(enable = "avx512f,avx512bw,avx512bf16")]
-    unsafe fn round(low: *const f32, high: *const f32) -> __m512i {
-        // SAFETY: the caller vouches for 16 numbers at each.
-        unsafe { bits(_mm512_cvtne2ps_pbh(_mm512_loadu_ps(high), _mm512_loadu_ps(low))) }
-    }
-
-    /// Rounded operands: all of `a`, and a block of columns of `b`.
-    #[derive(Default)]
-    pub(crate) struct Rounded {
-        a: Vec<Pair>,
-        b: Vec<Pair>,
-    }
-
-    /// `c[m × n] = a[m × k] · b[k × n]`, all row-major.
-    ///
-    /// # Safety
-    /// [`serves`] must hold for `k` and `n`, and the three matrices must span that many elements.
-    #[target_feature(enable = "avx512f,avx512bw,avx512bf16")]
-    pub(crate) unsafe fn multiply(
-        (m, n, k): (usize, usize, usize),
-        a: *const f32,
-        b: *const f32,
-        c: *mut f32,
-        rounded: &mut Rounded,
-    ) {
-        let pairs = k / 2;
-        rounded.a.resize(m * pairs, 0);
-        rounded.b.resize(pairs * COLUMNS, 0);
-        // Lane i of the lower half beside lane i of the upper one.
-        let interleave: [u16; 2 * LANES] = std::array::from_fn(|i| (i / 2 + i % 2 * LANES) as u16);
-        // SAFETY: m × k is a multiple of two registers, a block of `b` is k rows of two.
-        unsafe {
-            let interleave = _mm512_loadu_si512(interleave.as_ptr().cast());
-            for (i, to) in rounded.a.chunks_exact_mut(LANES).enumerate() {
-                let from = a.add(i * COLUMNS);
-                _mm512_storeu_si512(to.as_mut_ptr().cast(), round(from, from.add(LANES)));
-            }
-            let a = Strided { first: rounded.a.as_ptr(), row: pairs, column: 1 };
-            for j in (0..n).step_by(COLUMNS) {
-                for (i, to) in rounded.b.chunks_exact_mut(LANES).enumerate() {
-                    let from = b.add(i / 2 * 2 * n + j + i % 2 * LANES);
-                    let row = _mm512_permutexvar_epi16(interleave, round(from, from.add(n)));
-                    _mm512_storeu_si512(to.as_mut_ptr().cast(), row);
-                }
-                panel(m, pairs, a, rounded.b.as_ptr(), COLUMNS, c.add(j), n);
-            }
-        }
-    }
+    BLOCK.set(block_of_b);
 }

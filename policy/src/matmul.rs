@@ -3,17 +3,9 @@
 //! The callers split work into tiles that run in parallel, so a single product never does.
 
 use gemm::{Parallelism, gemm};
-use std::cell::RefCell;
 
 #[cfg(target_arch = "x86_64")]
 use crate::avx512;
-
-thread_local! {
-    /// Where [`avx512::multiply_transposed`] transposes to.
-    static BLOCK: RefCell<Vec<f32>> = RefCell::default();
-    /// Where [`avx512::bf16::multiply`] rounds to.
-    static ROUNDED: RefCell<avx512::bf16::Rounded> = RefCell::default();
-}
 
 /// A row-major matrix or its transpose, as `gemm` wants it: first element, column stride, row stride.
 type Operand = (*const f32, isize, isize);
@@ -73,9 +65,7 @@ pub(crate) fn product_bf16(x: &[f32], w: &[f32], out: &mut [f32], k: usize, n: u
         let m = x.len() / k;
         assert!(x.len() == m * k && w.len() == k * n && out.len() == m * n, "the product's shape");
         // SAFETY: as in `multiply`.
-        return ROUNDED.with_borrow_mut(|rounded| unsafe {
-            avx512::bf16::multiply((m, n, k), x.as_ptr(), w.as_ptr(), out.as_mut_ptr(), rounded);
-        });
+        return unsafe { avx512::bf16::multiply(m, n, k, x.as_ptr(), w.as_ptr(), out.as_mut_ptr()) };
     }
     product(x, w, out, k, n);
 }
@@ -88,9 +78,7 @@ pub(crate) fn product_transposed(g: &[f32], w: &[f32], out: &mut [f32], k: usize
     if avx512::serves(n) && avx512::serves(k) {
         assert_eq!(out.len(), m * k, "the product's shape");
         // SAFETY: as in `multiply`.
-        return BLOCK.with_borrow_mut(|block| unsafe {
-            avx512::multiply_transposed((m, k, n), g.as_ptr(), w.as_ptr(), out.as_mut_ptr(), block);
-        });
+        return unsafe { avx512::multiply_transposed(m, k, n, g.as_ptr(), w.as_ptr(), out.as_mut_ptr()) };
     }
     multiply(m, k, n, out, (g.as_ptr(), 1, n as isize), (w.as_ptr(), n as isize, 1));
 }
