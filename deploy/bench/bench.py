@@ -17,9 +17,9 @@ from pathlib import Path
 # Shapes, as in learner/benches/update.rs and evaluator/benches/rollout.rs.
 OBSERVATION, ACTION, TIME, STEPS, BATCH = 11, 3, 32, 5, 256
 CONFIGURATIONS = {
-    "paper, 10 samples": {"hidden": 256, "critics": 10, "samples": 10, "predictions": 2},
-    "paper, 1 sample": {"hidden": 256, "critics": 10, "samples": 1, "predictions": 2},
-    "demo": {"hidden": 128, "critics": 5, "samples": 1, "predictions": 1},
+    "paper, 10 samples": {"hidden": 256, "critics": 10, "samples": 10, "predictions": 1},
+    "paper, 1 sample": {"hidden": 256, "critics": 10, "samples": 1, "predictions": 1},
+    "demo": {"hidden": 128, "critics": 5, "samples": 1, "predictions": 0},
 }
 EPISODES = CANDIDATES = 10
 ROLLOUT_STEPS = 4

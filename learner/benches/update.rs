@@ -183,11 +183,13 @@ fn parts_of(group: &mut BenchmarkGroup<'_, WallTime>, config: &AgentConfig) {
     let noisy = NoisyActions { observations: &observations, actions: &actions, t: &t };
     let (mut predicted, mut gradient) = (vec![0.0; b * a], vec![0.0; weights.actor.len()]);
     let mut moments = Moments::zeros(weights.actor.len());
-    // Before the guidance, and for η after the step.
-    let predictions = if config.eta.threshold.is_some() { 2 } else { 1 };
     bench(group, "actor step", || {
-        (0..predictions).for_each(|_| actor.predict(&weights.actor, noisy, &mut predicted));
-        actor.differentiate(&weights.actor, noisy, |_, x, out| out.copy_from_slice(x), &mut gradient);
+        let recording = actor.record(&weights.actor, noisy, &mut predicted);
+        actor.differentiate(&weights.actor, noisy, recording, &actions, &mut gradient);
+        // Again for η, with the new weights.
+        if config.eta.threshold.is_some() {
+            actor.predict(&weights.actor, noisy, &mut predicted);
+        }
     });
     bench(group, "actor optimiser and EMA", || {
         let norm = reduce(&mut gradient, weights.actor.len());

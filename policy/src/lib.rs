@@ -35,7 +35,7 @@ pub use architecture::Architecture;
 pub use elementwise::{mish_in_place, mish_slope};
 pub use ensemble::{CriticEnsemble, StateActions};
 pub use error::PolicyError;
-pub use noise_predictor::{NoisePredictor, NoisyActions};
+pub use noise_predictor::{NoisePredictor, NoisyActions, Recording};
 pub use parameters::Parameters;
 pub use precision::Precision;
 pub use schedule::Schedule;

@@ -19,13 +19,20 @@ pub struct NoisePredictor {
 }
 
 /// The time embedding for all t: everything but the state and the action in the trunk's first pre-activation.
-pub struct TimeEmbedding {
+struct TimeEmbedding {
     /// `T × 32`, before the activation between the two layers, after it, its slope; and the embedding.
     hidden: Vec<f32>,
     slope: Vec<f32>,
     embedding: Vec<f32>,
     /// `T × hidden`: embedding · kernel_t + bias.
     shift: Vec<f32>,
+}
+
+/// What [`NoisePredictor::record`] keeps for the way back.
+pub struct Recording {
+    embedding: TimeEmbedding,
+    /// Activations and slopes, tile by tile.
+    tiles: Vec<Workspace>,
 }
 
 /// cos(t·f_k), then sin(t·f_k), with f_k = exp(-k·ln(10000)/7) for k = 0..7.
@@ -177,46 +184,48 @@ impl NoisePredictor {
         });
     }
 
-    /// The gradient of a loss through ε_θ: `output_gradient(rows, ε, ∂L/∂ε)` fills the third from the second for the
-    /// rows of a tile, and `gradient` receives the parameters' gradient.
+    /// [`Self::predict`] that can be gone back through.
+    pub fn record(&self, parameters: &[f32], input: NoisyActions<'_>, out: &mut [f32]) -> Recording {
+        let (_, trunk) = self.split(parameters);
+        let embedding = self.embed(parameters);
+        let forward = |(i, out)| {
+            let mut work = Workspace::default();
+            self.tile(trunk, &embedding, self.tile_of(input, i), &mut work, |tile, work| {
+                self.trunk.forward_recorded(trunk, tile, work, out);
+            });
+            work
+        };
+        let tiles = out.par_chunks_mut(TILE * self.trunk.action_dim).enumerate().map(forward).collect();
+        Recording { embedding, tiles }
+    }
+
+    /// The gradient of a loss through ε_θ: from ∂L/∂ε, `batch × action_dim`, to that of the parameters. `recording` is
+    /// of the same parameters and input.
     pub fn differentiate(
         &self,
         parameters: &[f32],
         input: NoisyActions<'_>,
-        output_gradient: impl Fn(std::ops::Range<usize>, &[f32], &mut [f32]) + Sync,
+        recording: Recording,
+        output_gradient: &[f32],
         gradient: &mut [f32],
     ) {
         let (_, trunk) = self.split(parameters);
-        let embedding = self.embed(parameters);
+        let Recording { embedding, tiles } = recording;
         let (h, a, steps) = (self.trunk.hidden, self.trunk.action_dim, self.schedule.steps());
-        let tiles = input.t.len().div_ceil(TILE);
         // Per tile: the trunk's gradient, and δ of the first layer summed by t.
-        let results: Vec<(Vec<f32>, Vec<f32>)> = (0..tiles)
-            .into_par_iter()
-            .map(|i| {
-                let tile_input = self.tile_of(input, i);
-                let rows = tile_input.t.len();
-                let (mut trunk_gradient, mut by_step) = (vec![0.0; self.trunk.mlp.len()], vec![0.0; steps * h]);
-                with_workspace(|work| {
-                    let (mut epsilon, mut inputs) = (std::mem::take(&mut work.out), std::mem::take(&mut work.input));
-                    let predicted = sized(&mut epsilon, rows * a);
-                    self.tile(trunk, &embedding, tile_input, work, |tile, work| {
-                        self.trunk.forward_recorded(trunk, tile, work, predicted);
-                    });
-                    let mut out = vec![0.0; rows * a];
-                    output_gradient(i * TILE..i * TILE + rows, predicted, &mut out);
-                    self.trunk.backward(trunk, &out, work);
-                    let dims = (self.trunk.observation_dim, a);
-                    concatenate(tile_input.observations, tile_input.actions, dims, &mut inputs);
-                    self.trunk.parameter_gradient(&inputs, &out, work, &mut trunk_gradient);
-                    for (t, delta) in tile_input.t.iter().zip(work.slope[0].chunks_exact(h)) {
-                        by_step[(t - 1) * h..][..h].iter_mut().zip(delta).for_each(|(sum, d)| *sum += d);
-                    }
-                    (work.out, work.input) = (epsilon, inputs);
-                });
-                (trunk_gradient, by_step)
-            })
-            .collect();
+        let backward = |(i, mut work): (usize, Workspace)| {
+            let (input, out) = (self.tile_of(input, i), part(output_gradient, i * TILE, TILE, a));
+            let (mut trunk_gradient, mut by_step) = (vec![0.0; self.trunk.mlp.len()], vec![0.0; steps * h]);
+            self.trunk.backward(trunk, out, &mut work);
+            let mut inputs = Vec::new();
+            concatenate(input.observations, input.actions, (self.trunk.observation_dim, a), &mut inputs);
+            self.trunk.parameter_gradient(&inputs, out, &mut work, &mut trunk_gradient);
+            for (t, delta) in input.t.iter().zip(work.slope[0].chunks_exact(h)) {
+                by_step[(t - 1) * h..][..h].iter_mut().zip(delta).for_each(|(sum, d)| *sum += d);
+            }
+            (trunk_gradient, by_step)
+        };
+        let results: Vec<(Vec<f32>, Vec<f32>)> = tiles.into_par_iter().enumerate().map(backward).collect();
         let mut by_step = vec![0.0; steps * h];
         let (time_gradient, trunk_gradient) = gradient.split_at_mut(self.time.len());
         trunk_gradient.fill(0.0);

@@ -264,7 +264,7 @@ impl Agent {
         self.add_noise(batch, noise);
         let noisy = NoisyActions { observations: &batch.observations, actions: &self.seen.noisy_actions, t: &noise.t };
         self.seen.predicted_noise.resize(noise.epsilon.len(), 0.0);
-        self.actor.predict(&self.state.online.actor, noisy, &mut self.seen.predicted_noise);
+        let recording = self.actor.record(&self.state.online.actor, noisy, &mut self.seen.predicted_noise);
         let bc_loss = mean_square_error(&noise.epsilon, &self.seen.predicted_noise);
         if self.config.guidance != Guidance::None {
             self.weigh_gradients(batch);
@@ -281,12 +281,10 @@ impl Agent {
         let guidance_loss = (0..seen.predicted_noise.len()).map(|n| guidance(n / a, n % a) * seen.predicted_noise[n]);
         let guidance_loss = guidance_loss.sum::<f32>() / count;
         seen.actor_gradient.resize(state.online.actor.len(), 0.0);
-        let gradient = |rows: std::ops::Range<usize>, predicted: &[f32], out: &mut [f32]| {
-            for (n, (out, predicted)) in (rows.start * a..).zip(out.iter_mut().zip(predicted)) {
-                *out = (2.0 * state.eta * (predicted - noise.epsilon[n]) + guidance(n / a, n % a)) / count;
-            }
-        };
-        self.actor.differentiate(&state.online.actor, noisy, gradient, &mut seen.actor_gradient);
+        let errors = seen.predicted_noise.iter().zip(&noise.epsilon).map(|(predicted, epsilon)| predicted - epsilon);
+        let gradient = errors.enumerate().map(|(n, error)| (2.0 * state.eta * error + guidance(n / a, n % a)) / count);
+        let gradient: Vec<f32> = gradient.collect();
+        self.actor.differentiate(&state.online.actor, noisy, recording, &gradient, &mut seen.actor_gradient);
         let norm = reduce(&mut seen.actor_gradient, state.online.actor.len());
         let learning_rate = config.actor_learning_rate * decay;
         let step = AdamStep { learning_rate, clip: config.gradient_clip, count: state.step + 1 };
