@@ -136,23 +136,27 @@ unsafe fn transpose(from: *const f32, from_row: usize, to: *mut f32, to_row: usi
     // Quarter q of `quads[4·g + c]` is column 4·q + c of the rows 4·g..4·g + 4.
     let mut quads = rows;
     for g in (0..LANES).step_by(4) {
-        let low = [0, 2].map(|i| _mm512_castps_pd(_mm512_unpacklo_ps(rows[g + i], rows[g + i + 1])));
-        let high = [0, 2].map(|i| _mm512_castps_pd(_mm512_unpackhi_ps(rows[g + i], rows[g + i + 1])));
-        quads[g] = _mm512_castpd_ps(_mm512_unpacklo_pd(low[0], low[1]));
-        quads[g + 1] = _mm512_castpd_ps(_mm512_unpackhi_pd(low[0], low[1]));
-        quads[g + 2] = _mm512_castpd_ps(_mm512_unpacklo_pd(high[0], high[1]));
-        quads[g + 3] = _mm512_castpd_ps(_mm512_unpackhi_pd(high[0], high[1]));
+        let low = _mm512_castps_pd(_mm512_unpacklo_ps(rows[g], rows[g + 1]));
+        let high = _mm512_castps_pd(_mm512_unpackhi_ps(rows[g], rows[g + 1]));
+        let next_low = _mm512_castps_pd(_mm512_unpacklo_ps(rows[g + 2], rows[g + 3]));
+        let next_high = _mm512_castps_pd(_mm512_unpackhi_ps(rows[g + 2], rows[g + 3]));
+        quads[g] = _mm512_castpd_ps(_mm512_unpacklo_pd(low, next_low));
+        quads[g + 1] = _mm512_castpd_ps(_mm512_unpackhi_pd(low, next_low));
+        quads[g + 2] = _mm512_castpd_ps(_mm512_unpacklo_pd(high, next_high));
+        quads[g + 3] = _mm512_castpd_ps(_mm512_unpackhi_pd(high, next_high));
     }
     const EVEN: i32 = 0b10_00_10_00;
     const ODD: i32 = 0b11_01_11_01;
     for c in 0..4 {
-        let even = [0, 8].map(|g| _mm512_shuffle_f32x4::<EVEN>(quads[g + c], quads[g + 4 + c]));
-        let odd = [0, 8].map(|g| _mm512_shuffle_f32x4::<ODD>(quads[g + c], quads[g + 4 + c]));
+        let even = _mm512_shuffle_f32x4::<EVEN>(quads[c], quads[c + 4]);
+        let odd = _mm512_shuffle_f32x4::<ODD>(quads[c], quads[c + 4]);
+        let next_even = _mm512_shuffle_f32x4::<EVEN>(quads[c + 8], quads[c + 12]);
+        let next_odd = _mm512_shuffle_f32x4::<ODD>(quads[c + 8], quads[c + 12]);
         let columns = [
-            _mm512_shuffle_f32x4::<EVEN>(even[0], even[1]),
-            _mm512_shuffle_f32x4::<EVEN>(odd[0], odd[1]),
-            _mm512_shuffle_f32x4::<ODD>(even[0], even[1]),
-            _mm512_shuffle_f32x4::<ODD>(odd[0], odd[1]),
+            _mm512_shuffle_f32x4::<EVEN>(even, next_even),
+            _mm512_shuffle_f32x4::<EVEN>(odd, next_odd),
+            _mm512_shuffle_f32x4::<ODD>(even, next_even),
+            _mm512_shuffle_f32x4::<ODD>(odd, next_odd),
         ];
         for (q, column) in columns.into_iter().enumerate() {
             // SAFETY: and for as many to write to.
