@@ -2,9 +2,9 @@
 
     service.py [--steps N] [--dataset FILE]     about five minutes with the default of 600 steps
 
-Wants release builds of both, and two processor cores or more: the learner is bound to the first core and the evaluators
-to the others, so that they do not compete for cores, and what is left is what they cost one another through messages.
-The networks are of the paper's sizes, with one next action per state. Prints a table.
+Wants release builds of both, and two processor cores or more. The learner trains on one thread, and the evaluators are
+bound to all cores but the first, so that this thread always finds a core of its own: what is left is what they cost it
+through messages. The networks are of the paper's sizes, with one next action per state. Prints a table.
 """
 
 import argparse
@@ -22,8 +22,8 @@ from urllib.request import urlopen
 
 BIN = Path("target/release")
 EVALUATORS = 4
-# Far more often than any preset evaluates, so that a short run shows many snapshots.
-EVAL_INTERVAL = 50
+# A hundred times as often as the preset evaluates, so that a short run shows some snapshots.
+EVAL_INTERVAL = 200
 PRESET = ["--preset", "hopper-medium-replay-v2", "--samples", "1"]
 CORES = sorted(os.sched_getaffinity(0))
 
@@ -72,7 +72,7 @@ def train(folder, dataset, steps, evaluators):
     logs = [f"{run}.evaluator{i}.log" for i in range(evaluators)]
     seen = {"memory": [], "evaluator_memory": 0.0, "pages": []}
     with contextlib.ExitStack() as stack:
-        learner = stack.enter_context(process(command, f"{run}.learner.log", CORES[:1]))
+        learner = stack.enter_context(process(command, f"{run}.learner.log", CORES))
         while not (run / "endpoints.json").exists():
             if learner.poll() is not None:
                 raise SystemExit(Path(f"{run}.learner.log").read_text())
