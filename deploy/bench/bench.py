@@ -121,7 +121,7 @@ def machine(rounds):
     can = ", ".join(flag for flag in ("avx512f", "avx512_bf16", "amx_bf16") if flag in flags) or "no AVX-512"
     product, mish, slope = (median(rounds, lambda x: x["peak"][name]) / 1e9 for name in ("flop", "mish", "slope"))
     print(f"{model} ({can}), {rounds[0]['threads']} threads; the `gemm` crate does {product:.0f} GFLOP/s, a Mish loop")
-    print(f"{mish:.1f} G elements/s, with the slope {slope:.1f}. Medians of {len(rounds)} rounds.\n")
+    print(f"{mish:.1f} G elements/s, with the slope {slope:.1f}. Rounds: {len(rounds)}, of which medians are shown.\n")
 
 
 def updates(rounds):
