@@ -1,7 +1,7 @@
 #!/usr/bin/env bash
 # How fast this machine trains and evaluates, beside its own peaks and beside JAX: prints the tables of docs/performance.md.
 #
-#   deploy/bench.sh [ROUNDS]     three rounds if not said otherwise, of about five minutes each; on an idle machine
+#   deploy/bench.sh [ROUNDS]     three rounds if not said otherwise, of about six minutes each; on an idle machine
 #
 # Criterion's own reports are in target/criterion afterwards, every figure in target/bench.json.
 set -euo pipefail

@@ -52,7 +52,6 @@ def stamps(log, text):
     """{step: time} of the log lines that contain `text`."""
     found = {}
     for line in Path(log).read_text().splitlines():
-        line = re.sub(r"\x1b\[[0-9;]*m", "", line)
         if text in line and (step := re.search(r"\bstep=(\d+)", line)):
             found.setdefault(int(step[1]), datetime.datetime.fromisoformat(line.split()[0]).timestamp())
     return found
@@ -63,7 +62,7 @@ def metric(page, name):
 
 
 def train(folder, dataset, steps, evaluators):
-    """One run on one core; what was seen of it."""
+    """One run on one thread; what was seen of it. Evaluations that are open when the last step is done are dropped."""
     run = Path(folder) / f"run-{time.time_ns()}"
     run.mkdir()
     command = [BIN / "learner", "train", *PRESET, "--dataset", dataset, "--run-dir", run]
@@ -92,17 +91,11 @@ def train(folder, dataset, steps, evaluators):
                 page = urlopen(f"http://{metrics}/metrics", timeout=5).read().decode()
                 done = metric(page, "quad_learner_gradient_steps_total")
                 seen["pages"].append((time.time(), done, metric(page, "quad_learner_step_duration_seconds_sum")))
-        # The evaluations that are still open are of no interest.
     taken = stamps(f"{run}.learner.log", "snapshot")
-    seen["delays"] = [
-        arrived[step] - taken[step]
-        for arrived in (stamps(log, "weights arrived") for log in logs)
-        for step in arrived
-        if step in taken
-    ]
-    seen["begin"] = []
+    seen["delays"], seen["begin"] = [], []
     for log in logs:
         arrived, begun = stamps(log, "weights arrived"), stamps(log, "evaluating")
+        seen["delays"] += [arrived[step] - taken[step] for step in arrived if step in taken]
         seen["begin"] += [begun[step] - arrived[step] for step in begun if step in arrived]
     return seen
 

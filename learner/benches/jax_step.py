@@ -52,7 +52,7 @@ def single(tree):
 
 
 def prepare(sizes):
-    """The compiled step `(state, batch, key) -> state`, and what it starts from."""
+    """The step `(state, batch, key) -> state`, and what it starts from."""
     config = make.make_config("quad", "hopper")
     config["agent"] |= sizes
     agent, o, a = config["agent"], config["observation_dim"], config["action_dim"]

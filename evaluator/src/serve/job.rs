@@ -79,7 +79,8 @@ impl Running {
         let thread = tokio::task::spawn_blocking({
             let (shared, metrics, seeds, candidates) =
                 (shared.clone(), metrics.clone(), job.seeds.clone(), job.candidates as usize);
-            move || roll_out(spec, &seeds, candidates, &policy, &shared, &metrics)
+            // On a thread of the pool: else each parallel part of each step would wake one up and wait for it.
+            move || rayon::scope(|_| roll_out(spec, &seeds, candidates, &policy, &shared, &metrics))
         });
         Running { shared, metrics, started: Instant::now(), thread: Some(thread) }
     }
@@ -117,18 +118,6 @@ impl Drop for Running {
 
 /// Runs all episodes to their end, or gives `None` when cancelled.
 fn roll_out(
-    spec: &'static EnvironmentSpec,
-    seeds: &[u64],
-    candidates: usize,
-    policy: &TargetPolicy,
-    shared: &Shared,
-    metrics: &Metrics,
-) -> Result<Option<Vec<EpisodeOutcome>>, EnvironmentError> {
-    // On a thread of the pool: else each parallel part of each step would wake one up and wait for it.
-    rayon::scope(|_| roll_out_here(spec, seeds, candidates, policy, shared, metrics))
-}
-
-fn roll_out_here(
     spec: &'static EnvironmentSpec,
     seeds: &[u64],
     candidates: usize,

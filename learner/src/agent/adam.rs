@@ -125,7 +125,7 @@ pub fn ema(target: &mut [f32], online: &[f32], rate: f32) {
 }
 
 /// Cosine decay from 1 at step 0 to 0 at `total`.
-pub fn cosine_decay(step: u64, total: u64) -> f32 {
+pub(super) fn cosine_decay(step: u64, total: u64) -> f32 {
     let progress = (step as f64 / total.max(1) as f64).min(1.0);
     (0.5 * (1.0 + (std::f64::consts::PI * progress).cos())) as f32
 }
