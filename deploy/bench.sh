@@ -1,7 +1,7 @@
 #!/usr/bin/env bash
 # How fast this machine trains and evaluates, beside its own peaks and beside JAX: prints the tables of docs/performance.md.
 #
-#   deploy/bench.sh [ROUNDS]     three rounds if not said otherwise, of about six minutes each; on an idle machine
+#   deploy/bench.sh [ROUNDS]     five rounds if not said otherwise, of about a minute and a half each; on an idle machine
 #
 # Criterion's own reports are in target/criterion afterwards, every figure in target/bench.json.
 set -euo pipefail
@@ -11,5 +11,5 @@ deploy/setup.sh --tests
 cargo bench --locked --workspace --no-run
 cargo build --release --locked --workspace
 [ -e data/hopper-demo.hdf5 ] || target/release/evaluator collect --env hopper --out data/hopper-demo.hdf5
-python3 deploy/bench/bench.py "${1:-3}"
+python3 deploy/bench/bench.py "${1:-5}"
 python3 deploy/bench/service.py

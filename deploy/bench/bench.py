@@ -3,7 +3,9 @@ shows. To be started by deploy/bench.sh.
 
     bench.py ROUNDS
 
-Figures are medians over the rounds; a ratio is the median of the rounds' ratios.
+A round visits each configuration for some seconds, in which JAX, the learner and the machine's peaks are measured one
+after the other: machines may be shared, and change their speed. Figures are medians over the rounds; a ratio is the
+median of the rounds' ratios.
 """
 
 import json
@@ -68,10 +70,11 @@ def parts(hidden, critics, samples, predictions):
     }
 
 
-def criterion(bench):
-    """Runs a bench; {name: median seconds}, also of what ran before."""
+def criterion(bench, names):
+    """Runs those of a bench whose names match; {name: median seconds}, also of what ran before."""
     command = ["cargo", "bench", "--locked", "--workspace", "--quiet", "--bench", bench, "--", "--noplot", "--quiet"]
-    subprocess.run(command, check=True, capture_output=True)
+    quick = ["--warm-up-time", "0.3", "--measurement-time", "1", "--sample-size", "10", "--nresamples", "1000"]
+    subprocess.run([*command, *quick, names], check=True, capture_output=True)
     medians = {}
     for folder in Path("target/criterion").rglob("new"):
         name = json.loads((folder / "benchmark.json").read_text())["full_id"]
@@ -80,18 +83,26 @@ def criterion(bench):
     return medians
 
 
-def peer(*command):
-    result = subprocess.run([PYTHON, "-W", "ignore", *command], check=True, capture_output=True, text=True)
-    return json.loads(result.stdout)
+class Peer:
+    """A script in JAX that stays, and measures a moment whenever it is asked."""
+
+    def __init__(self, *command):
+        pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "text": True}
+        self.process = subprocess.Popen([PYTHON, "-W", "ignore", *command, "--serve", "--seconds", "1"], **pipes)
+
+    def measure(self, line=""):
+        self.process.stdin.write(line + "\n")
+        self.process.stdin.flush()
+        if not (answer := self.process.stdout.readline()):
+            raise SystemExit(f"bench: {self.process.args[3]} has ended, see above")
+        return json.loads(answer)
 
 
-def one_round():
-    jax = {
-        "plain": peer("learner/benches/jax_step.py"),
-        "tuned": peer("learner/benches/jax_step.py", "--tuned"),
-        "rollout": peer("evaluator/benches/jax_rollout.py"),
-    }
-    seconds = criterion("update") | criterion("rollout")
+def moment(bench, names):
+    """What a bench measures within some seconds, beside the machine's peaks within the same seconds."""
+    seconds = criterion("update", f"^(peak/{'' if bench == 'rollout' else '|' + names})")
+    if bench == "rollout":
+        seconds |= criterion(bench, names)
     threads = len(os.sched_getaffinity(0))
     elements = threads * PEAK_CALLS * PEAK_ROWS * PEAK_WIDTH
     peak = {
@@ -99,7 +110,22 @@ def one_round():
         "mish": elements / seconds["peak/mish"],
         "slope": elements / seconds["peak/mish and slope"],
     }
-    return {"jax": jax, "seconds": seconds, "peak": peak, "threads": threads}
+    return {"seconds": seconds, "peak": peak, "threads": threads}
+
+
+def measure(count):
+    """{configuration: its rounds}, and those of the evaluation as `rollout`."""
+    plain, tuned = Peer("learner/benches/jax_step.py"), Peer("learner/benches/jax_step.py", "--tuned")
+    rollout = Peer("evaluator/benches/jax_rollout.py")
+    rounds = {name: [] for name in [*CONFIGURATIONS, "rollout"]}
+    for i in range(count):
+        print(f"bench: round {i + 1} of {count}", file=sys.stderr)
+        for name in CONFIGURATIONS:
+            jax = {"plain": plain.measure(name), "tuned": tuned.measure(name)}
+            rounds[name].append(moment("update", f"update(, bf16)?/{name}$|{name}/") | {"jax": jax})
+        jax = rollout.measure()
+        rounds["rollout"].append(moment("rollout", "") | {"jax": jax})
+    return rounds
 
 
 def median(rounds, of):
@@ -121,17 +147,17 @@ def machine(rounds):
     can = ", ".join(flag for flag in ("avx512f", "avx512_bf16", "amx_bf16") if flag in flags) or "no AVX-512"
     product, mish, slope = (median(rounds, lambda x: x["peak"][name]) / 1e9 for name in ("flop", "mish", "slope"))
     print(f"{model} ({can}), {rounds[0]['threads']} threads; the `gemm` crate does {product:.0f} GFLOP/s, a Mish loop")
-    print(f"{mish:.1f} G elements/s, with the slope {slope:.1f}. Rounds: {len(rounds)}, of which medians are shown.\n")
+    print(f"{mish:.1f} G elements/s, with the slope {slope:.1f}. Medians of {len(rounds) // 4} rounds.\n")
 
 
-def updates(rounds):
+def updates(all_rounds):
     head = "gradient step | bound | f32 | of the bound | JAX, plain | ratio | JAX, tuned | ratio | bf16 | over best JAX"
     rows = [head.split(" | ")]
     for name, shapes in CONFIGURATIONS.items():
-        work = sum(parts(**shapes).values(), Work())
+        work, rounds = sum(parts(**shapes).values(), Work()), all_rounds[name]
         ours = lambda x: x["seconds"][f"update/{name}"]
         bf16 = lambda x: x["seconds"][f"update, bf16/{name}"]
-        plain, tuned = (lambda x, kind=kind: min(x["jax"][kind][name].values()) for kind in ("plain", "tuned"))
+        plain, tuned = (lambda x, kind=kind: min(x["jax"][kind].values()) for kind in ("plain", "tuned"))
         best = lambda x: min(plain(x), tuned(x))
         ms = lambda of: f"{1e3 * median(rounds, of):.1f} ms"
         ratio = lambda over, under: f"{median(rounds, lambda x: over(x) / under(x)):.2f} ×"
@@ -143,10 +169,10 @@ def updates(rounds):
     table(*rows)
 
 
-def step_parts(rounds):
+def step_parts(all_rounds):
     for name, shapes in CONFIGURATIONS.items():
         rows = [[name, "GFLOP", "M Mish", "bound", "takes", "of the bound"]]
-        total, spent = Work(), 0.0
+        total, spent, rounds = Work(), 0.0, all_rounds[name]
         for part, work in parts(**shapes).items():
             seconds = median(rounds, lambda x: x["seconds"][f"{name}/{part}"])
             total, spent = total + work, spent + seconds
@@ -169,7 +195,7 @@ def rollouts(rounds):
     work = forward(STEPS * decisions, OBSERVATION + ACTION + TIME, 256, ACTION)
     work += forward(10 * decisions, OBSERVATION + ACTION, 256, 1)
     physics = lambda x: EPISODES * x["seconds"]["environment/hopper"] / x["threads"]
-    jax = lambda x: x["jax"]["rollout"]["seconds"]
+    jax = lambda x: x["jax"]["seconds"]
     head = "ten Hopper episodes | environment steps/s | over JAX | step of all ten | its policy"
     rows = [head.split(" | ") + ["network and physics at their best", "over that"]]
     rows.append(["JAX, one at a time", f"{median(rounds, lambda x: 1 / jax(x)):.0f}", "", "", "", "", ""])
@@ -186,15 +212,12 @@ def rollouts(rounds):
 
 
 def main():
-    rounds = []
-    for i in range(int(sys.argv[1])):
-        print(f"bench: round {i + 1} of {sys.argv[1]}", file=sys.stderr)
-        rounds.append(one_round())
+    rounds = measure(int(sys.argv[1]))
     Path("target/bench.json").write_text(json.dumps(rounds, indent=1))
-    machine(rounds)
+    machine([moment for moments in rounds.values() for moment in moments])
     updates(rounds)
     step_parts(rounds)
-    rollouts(rounds)
+    rollouts(rounds["rollout"])
 
 
 if __name__ == "__main__":

@@ -1,10 +1,11 @@
 """The evaluation loop in JAX, timed: what `deploy/bench.sh` sets the evaluator's beside.
 
-    jax_rollout.py [--seconds S]
+    jax_rollout.py [--seconds S] [--serve]
 
 As is usual, and as DAC does it: one environment, and for each of its steps one call of a compiled function that draws
 ten candidates and returns the one that the critics like best. Networks of the paper's sizes from tests/golden/make.py,
-float32, weights random. Prints a JSON object: seconds per environment step, as a median.
+float32, weights random. Prints a line of JSON: seconds per environment step, as a median. With --serve it waits for
+lines on standard input, and prints one for each.
 """
 
 import argparse
@@ -28,7 +29,8 @@ jax.config.update("jax_enable_x64", False)
 def main():
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--seconds", type=float, default=10.0)
-    budget = parser.parse_args().seconds
+    parser.add_argument("--serve", action="store_true")
+    arguments = parser.parse_args()
 
     config = make.make_config("quad", "hopper")
     steps, candidates, a = config["agent"]["diffusion_steps"], config["candidates"], config["action_dim"]
@@ -45,20 +47,18 @@ def main():
 
     environment, key = gymnasium.make("Hopper-v4"), jax.random.key(0)
     observation, _ = environment.reset(seed=0)
-    times, deadline = [], None
-    while deadline is None or time.perf_counter() < deadline:
-        key, now = jax.random.split(key)
-        start = time.perf_counter()
-        action = np.asarray(act(actor, critics, observation.astype(np.float32), now))
-        observation, _, terminated, truncated, _ = environment.step(action)
-        end = time.perf_counter()
-        if deadline is None:  # that call compiled the function
-            deadline = end + budget
-            continue
-        times.append(end - start)
-        if terminated or truncated:
-            observation, _ = environment.reset()
-    print(json.dumps({"seconds": statistics.median(times)}))
+    jax.block_until_ready(act(actor, critics, observation.astype(np.float32), key))  # compiles it
+    for _ in sys.stdin if arguments.serve else range(1):
+        times, deadline = [], time.perf_counter() + arguments.seconds
+        while not times or time.perf_counter() < deadline:
+            key, now = jax.random.split(key)
+            start = time.perf_counter()
+            action = np.asarray(act(actor, critics, observation.astype(np.float32), now))
+            observation, _, terminated, truncated, _ = environment.step(action)
+            times.append(time.perf_counter() - start)
+            if terminated or truncated:
+                observation, _ = environment.reset()
+        print(json.dumps({"seconds": statistics.median(times)}), flush=True)
 
 
 if __name__ == "__main__":

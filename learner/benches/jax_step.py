@@ -1,10 +1,11 @@
 """The gradient step in JAX, timed: what `deploy/bench.sh` sets the learner's beside.
 
-    jax_step.py [--tuned] [--seconds S]
+    jax_step.py [--tuned] [--seconds S] [--serve]
 
 The step is the one of tests/golden/make.py in float32, compiled as a whole, its noise drawn inside; it is called from
 Python, and run by `lax.scan`. Tuned means: Mish with a single exponential instead of softplus and tanh, and an
-allocator that keeps its memory. Prints a JSON object: {configuration: {way: seconds per step}}, medians.
+allocator that keeps its memory. Prints a line of JSON for each configuration: {way: seconds per step}, medians. With
+--serve it waits for names of configurations on standard input, a line each, so that others can be timed in between.
 """
 
 import argparse
@@ -80,19 +81,8 @@ def prepare(sizes):
     return step, state, single(batch)
 
 
-def seconds_per_step(run, count, budget):
-    """Median over calls of `run`, which makes `count` steps."""
-    run()
-    times = []
-    deadline = time.perf_counter() + budget
-    while len(times) < 3 or time.perf_counter() < deadline:
-        start = time.perf_counter()
-        run()
-        times.append((time.perf_counter() - start) / count)
-    return statistics.median(times)
-
-
-def called(step, state, batch, budget):
+def called(step, state, batch):
+    """A function that makes five steps by five calls."""
     compiled, key = jax.jit(step, donate_argnums=0), jax.random.key(0)
     state = jax.tree.map(jnp.copy, state)
 
@@ -103,10 +93,12 @@ def called(step, state, batch, budget):
             state = compiled(state, batch, now)
         jax.block_until_ready(state)
 
-    return seconds_per_step(run, 5, budget)
+    return run
 
 
-def scanned(step, state, batch, budget):
+def scanned(step, state, batch):
+    """A function that makes five steps by one call."""
+
     @functools.partial(jax.jit, donate_argnums=0)
     def steps(state, batch, key):
         return jax.lax.scan(lambda state, key: (step(state, batch, key), None), state, jax.random.split(key, 5))[0]
@@ -117,21 +109,42 @@ def scanned(step, state, batch, budget):
         nonlocal state
         state = jax.block_until_ready(steps(state, batch, jax.random.key(0)))
 
-    return seconds_per_step(run, 5, budget)
+    return run
+
+
+def seconds_per_step(run, budget):
+    """Median over calls of `run`, which makes five steps."""
+    times = []
+    deadline = time.perf_counter() + budget
+    while len(times) < 3 or time.perf_counter() < deadline:
+        start = time.perf_counter()
+        run()
+        times.append((time.perf_counter() - start) / 5)
+    return statistics.median(times)
+
+
+@functools.cache
+def ways(name):
+    """{way: function that makes five steps}, compiled."""
+    prepared = prepare(CONFIGURATIONS[name])
+    runs = {way.__name__: way(*prepared) for way in (called, scanned)}
+    for run in runs.values():
+        run()
+    return runs
 
 
 def main():
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--tuned", action="store_true")
     parser.add_argument("--seconds", type=float, default=3.0, help="for each way of each configuration")
+    parser.add_argument("--serve", action="store_true")
     arguments = parser.parse_args()
     if arguments.tuned:
         make.mish = tuned_mish
-    results = {}
-    for name, sizes in CONFIGURATIONS.items():
-        prepared = prepare(sizes)
-        results[name] = {way.__name__: way(*prepared, arguments.seconds) for way in (called, scanned)}
-    print(json.dumps(results))
+    names = map(str.strip, sys.stdin) if arguments.serve else CONFIGURATIONS
+    for name in names:
+        runs = ways(name)
+        print(json.dumps({way: seconds_per_step(run, arguments.seconds) for way, run in runs.items()}), flush=True)
 
 
 if __name__ == "__main__":

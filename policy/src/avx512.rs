@@ -5,7 +5,7 @@
 
 use std::arch::x86_64::{
     _MM_HINT_T0, _mm_prefetch, _mm512_castpd_ps, _mm512_castps_pd, _mm512_fmadd_ps, _mm512_loadu_ps, _mm512_set1_ps,
-    _mm512_setzero_ps, _mm512_shuffle_f32x4, _mm512_storeu_ps, _mm512_unpackhi_pd, _mm512_unpackhi_ps,
+    _mm512_setzero_ps, _mm512_shuffle_f32x4, _mm512_store_ps, _mm512_storeu_ps, _mm512_unpackhi_pd, _mm512_unpackhi_ps,
     _mm512_unpacklo_pd, _mm512_unpacklo_ps,
 };
 use std::cell::RefCell;
@@ -22,6 +22,11 @@ pub(crate) fn serves(columns: usize) -> bool {
     columns.is_multiple_of(COLUMNS) && is_x86_feature_detected!("avx512f")
 }
 
+/// What a register holds, where one cache line holds it: other addresses take two for each register.
+#[derive(Clone, Copy)]
+#[repr(align(64))]
+struct Line<T>([T; LANES]);
+
 /// A matrix by its first element and the distances between rows and between columns.
 #[derive(Clone, Copy)]
 pub(crate) struct Strided<T> {
@@ -32,7 +37,7 @@ pub(crate) struct Strided<T> {
 
 thread_local! {
     /// Where [`multiply_transposed`] transposes to.
-    static BLOCK: RefCell<Vec<f32>> = RefCell::default();
+    static BLOCK: RefCell<Vec<Line<f32>>> = RefCell::default();
 }
 
 /// Defines `panel`, `c = a·b` for all `m` rows and one block of columns, for elements of 32 bits: `$add(sum, x, b)` adds
@@ -108,6 +113,7 @@ macro_rules! panel {
     };
 }
 
+mod amx;
 pub(crate) mod bf16;
 
 panel!("avx512f", f32, _mm512_set1_ps, _mm512_loadu_ps, |sum, x, b| _mm512_fmadd_ps(x, b, sum));
@@ -118,10 +124,21 @@ panel!("avx512f", f32, _mm512_set1_ps, _mm512_loadu_ps, |sum, x, b| _mm512_fmadd
 /// [`serves`] must hold for `n`, and the three matrices must span that many elements.
 #[target_feature(enable = "avx512f")]
 pub(crate) unsafe fn multiply(m: usize, n: usize, k: usize, a: Strided<f32>, b: *const f32, c: *mut f32) {
+    let mut block_of_b = BLOCK.take();
+    block_of_b.resize(k * COLUMNS / LANES, Line([0.0; LANES]));
+    let block = block_of_b.as_mut_ptr().cast::<f32>();
     for j in (0..n).step_by(COLUMNS) {
         // SAFETY: columns j.. of the matrices the caller vouches for.
-        unsafe { panel(m, k, a, b.add(j), n, c.add(j), n) };
+        unsafe {
+            for p in 0..k {
+                for half in [0, LANES] {
+                    _mm512_store_ps(block.add(p * COLUMNS + half), _mm512_loadu_ps(b.add(p * n + j + half)));
+                }
+            }
+            panel(m, k, a, block, COLUMNS, c.add(j), n);
+        }
     }
+    BLOCK.set(block_of_b);
 }
 
 /// `to = fromᵀ` for 16 × 16 numbers.
@@ -172,17 +189,18 @@ unsafe fn transpose(from: *const f32, from_row: usize, to: *mut f32, to_row: usi
 #[target_feature(enable = "avx512f")]
 pub(crate) unsafe fn multiply_transposed(m: usize, k: usize, n: usize, a: *const f32, b: *const f32, c: *mut f32) {
     let mut block_of_b = BLOCK.take();
-    block_of_b.resize(n * COLUMNS, 0.0);
+    block_of_b.resize(n * COLUMNS / LANES, Line([0.0; LANES]));
+    let block = block_of_b.as_mut_ptr().cast::<f32>();
     let a = Strided { first: a, row: n, column: 1 };
     for j in (0..k).step_by(COLUMNS) {
         // SAFETY: rows j..j + 32 of `b` become the columns of a block, n × 32.
         unsafe {
             for p in (0..n).step_by(LANES) {
                 for half in [0, LANES] {
-                    transpose(b.add((j + half) * n + p), n, block_of_b.as_mut_ptr().add(p * COLUMNS + half), COLUMNS);
+                    transpose(b.add((j + half) * n + p), n, block.add(p * COLUMNS + half), COLUMNS);
                 }
             }
-            panel(m, n, a, block_of_b.as_ptr(), COLUMNS, c.add(j), k);
+            panel(m, n, a, block, COLUMNS, c.add(j), k);
         }
     }
     BLOCK.set(block_of_b);

@@ -4,7 +4,7 @@
 //! neither do the results.
 
 use crate::mlp::Mlp;
-use crate::network::{Input, Network, TILE, concatenate, sized, with_workspace};
+use crate::network::{Input, Network, TILE, concatenate, with_workspace};
 use crate::{Architecture, Precision};
 use rayon::prelude::*;
 
@@ -61,16 +61,16 @@ impl CriticEnsemble {
         let tile = states * input.repeat;
         out.par_chunks_mut(rows).enumerate().for_each(|(k, out)| {
             let parameters = self.critic(parameters, k);
-            let shift = network.mlp.bias(parameters, 0);
+            let (shift, kernels) = (network.mlp.bias(parameters, 0), network.hidden_kernels(parameters, precision));
             out.par_chunks_mut(tile).enumerate().for_each(|(i, out)| {
                 let observations = part(input.observations, i * states, states, network.observation_dim);
                 let actions = part(input.actions, i * tile, tile, network.action_dim);
                 with_workspace(|work| {
                     let mut base = std::mem::take(&mut work.base);
                     let len = observations.len() / network.observation_dim * network.hidden;
-                    network.state_part(parameters, observations, sized(&mut base, len));
-                    let input = Input { base: &base[..len], repeat: input.repeat, shift, actions };
-                    network.forward(parameters, input, precision, work, out);
+                    network.state_part(parameters, observations, base.sized(len));
+                    let input = Input { base: base.first(len), repeat: input.repeat, shift, actions };
+                    network.forward(parameters, &kernels, input, work, out);
                     work.base = base;
                 });
             });
@@ -108,10 +108,10 @@ impl CriticEnsemble {
                         std::mem::take(&mut work.out),
                     );
                     let len = targets.len() * network.hidden;
-                    network.state_part(parameters, observations, sized(&mut base, len));
+                    network.state_part(parameters, observations, base.sized(len));
                     let shift = network.mlp.bias(parameters, 0);
-                    let tile = Input { base: &base[..len], repeat: 1, shift, actions };
-                    let values = sized(&mut out, targets.len());
+                    let tile = Input { base: base.first(len), repeat: 1, shift, actions };
+                    let values = out.sized(targets.len());
                     network.forward_recorded(parameters, tile, work, values);
                     let mut loss = 0.0;
                     for (q, y) in values.iter_mut().zip(targets) {
@@ -149,9 +149,9 @@ impl CriticEnsemble {
                 let actions = part(actions, i * TILE, TILE, a);
                 with_workspace(|work| {
                     let (mut base, mut out) = (std::mem::take(&mut work.base), std::mem::take(&mut work.out));
-                    network.state_part(parameters, observations, sized(&mut base, rows * network.hidden));
-                    let input = Input { base: &base, repeat: 1, shift, actions };
-                    let ones = sized(&mut out, rows);
+                    network.state_part(parameters, observations, base.sized(rows * network.hidden));
+                    let input = Input { base: base.first(rows * network.hidden), repeat: 1, shift, actions };
+                    let ones = out.sized(rows);
                     network.forward_recorded(parameters, input, work, ones);
                     ones.fill(1.0);
                     network.backward(parameters, ones, work);

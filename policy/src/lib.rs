@@ -18,6 +18,7 @@
 mod architecture;
 #[cfg(target_arch = "x86_64")]
 mod avx512;
+mod buffer;
 mod elementwise;
 mod ensemble;
 mod error;

@@ -2,6 +2,7 @@
 //!
 //! The callers split work into tiles that run in parallel, so a single product never does.
 
+use crate::Precision;
 use gemm::{Parallelism, gemm};
 
 #[cfg(target_arch = "x86_64")]
@@ -58,16 +59,35 @@ pub(crate) fn product(x: &[f32], w: &[f32], out: &mut [f32], k: usize, n: usize)
     multiply_row_major(m, n, k, out, (x.as_ptr(), 1, k as isize), w);
 }
 
-/// `product` with `x` and `w` rounded to bfloat16 where the CPU multiplies such numbers faster, else `product` itself.
-pub(crate) fn product_bf16(x: &[f32], w: &[f32], out: &mut [f32], k: usize, n: usize) {
+/// The right-hand side of many products.
+pub(crate) enum Kernel<'a> {
+    /// As it is.
+    F32(&'a [f32]),
+    /// Rounded to bfloat16, as is the left-hand side when they are multiplied.
     #[cfg(target_arch = "x86_64")]
-    if avx512::bf16::serves(k, n) {
-        let m = x.len() / k;
-        assert!(x.len() == m * k && w.len() == k * n && out.len() == m * n, "the product's shape");
-        // SAFETY: as in `multiply`.
-        return unsafe { avx512::bf16::multiply(m, n, k, x.as_ptr(), w.as_ptr(), out.as_mut_ptr()) };
+    Bf16(avx512::bf16::Kernel),
+}
+
+impl<'a> Kernel<'a> {
+    /// Prepares `w[k × n]`: rounded if that is asked for and the CPU multiplies such numbers faster.
+    pub fn new(w: &'a [f32], k: usize, n: usize, precision: Precision) -> Self {
+        #[cfg(target_arch = "x86_64")]
+        if precision == Precision::Bf16
+            && let Some(kernel) = avx512::bf16::Kernel::new(w, k, n)
+        {
+            return Kernel::Bf16(kernel);
+        }
+        Kernel::F32(w)
     }
-    product(x, w, out, k, n);
+
+    /// `out[m × n] = x[m × k] · self`.
+    pub fn product(&self, x: &[f32], out: &mut [f32], k: usize, n: usize) {
+        match self {
+            Kernel::F32(w) => product(x, w, out, k, n),
+            #[cfg(target_arch = "x86_64")]
+            Kernel::Bf16(kernel) => kernel.multiply(x, out),
+        }
+    }
 }
 
 /// `out[m × k] = g[m × n] · w[k × n]ᵀ`: a gradient's way back through `product`.
@@ -118,7 +138,7 @@ mod tests {
             let exact = |i: usize| sum(k, &|p| (x[i / n * k + p], w[p * n + i % n]));
             assert_close(&out, exact, &format!("{m} × {k} × {n}"));
             let mut out = vec![f32::NAN; m * n];
-            product_bf16(&x, &w, &mut out, k, n);
+            Kernel::new(&w, k, n, Precision::Bf16).product(&x, &mut out, k, n);
             // Each term is off by at most a part in 2^8: twice half a unit in the last of 8 bits.
             let terms = |i: usize| sum(k, &|p| (x[i / n * k + p].abs(), w[p * n + i % n].abs()));
             for (i, x) in out.iter().enumerate() {

@@ -5,16 +5,19 @@
 //! it, and the action's few columns are fused with the activation.
 
 use crate::Precision;
+use crate::buffer::Buffer;
 use crate::elementwise::{
     FirstLayer, bias_mish, bias_mish_slope, column_sums, dots, first_layer, first_layer_slope, multiply,
     scale_by_combination,
 };
-use crate::matmul::{outer, product, product_bf16, product_transposed};
+use crate::matmul::{Kernel, outer, product, product_transposed};
 use crate::mlp::Mlp;
 use std::cell::RefCell;
 
 /// Rows that one task works on: weights and activations of a tile stay in a core's own cache.
 pub(crate) const TILE: usize = 128;
+/// The same where products are rounded.
+const BLOCK: usize = 32;
 
 /// Shapes of one network.
 #[derive(Clone, Debug)]
@@ -41,18 +44,18 @@ pub(crate) struct Input<'a> {
 #[derive(Default)]
 pub(crate) struct Workspace {
     /// Activations of the hidden layers.
-    x: [Vec<f32>; 3],
+    x: [Buffer; 3],
     /// Their slopes; on the way back the gradients before the activations.
-    pub slope: [Vec<f32>; 3],
-    temporary: Vec<f32>,
+    pub slope: [Buffer; 3],
+    temporary: Buffer,
     /// The output layer's kernel, transposed.
-    output: Vec<f32>,
+    output: Buffer,
     /// State part of the first layer.
-    pub base: Vec<f32>,
+    pub base: Buffer,
     /// Network input, where a kernel's gradient needs it.
     pub input: Vec<f32>,
     /// Network output or its gradient.
-    pub out: Vec<f32>,
+    pub out: Buffer,
 }
 
 thread_local! {
@@ -62,14 +65,6 @@ thread_local! {
 /// Lends the thread's workspace. Not re-entrant: a task that holds it must not start others.
 pub(crate) fn with_workspace<R>(work: impl FnOnce(&mut Workspace) -> R) -> R {
     WORKSPACE.with_borrow_mut(work)
-}
-
-/// The first `len` elements, grown where needed; what they hold is left over from earlier use.
-pub(crate) fn sized(buffer: &mut Vec<f32>, len: usize) -> &mut [f32] {
-    if buffer.len() < len {
-        buffer.resize(len, 0.0);
-    }
-    &mut buffer[..len]
 }
 
 impl Network {
@@ -101,13 +96,13 @@ impl Network {
     }
 
     /// The output layer's kernel as `outputs × hidden`.
-    fn output_rows<'a>(&self, parameters: &'a [f32], transposed: &'a mut Vec<f32>) -> &'a [f32] {
+    fn output_rows<'a>(&self, parameters: &'a [f32], transposed: &'a mut Buffer) -> &'a [f32] {
         let kernel = self.mlp.kernel(parameters, 3);
         let (hidden, outputs) = self.mlp.shape(3);
         if outputs == 1 {
             return kernel;
         }
-        let rows = sized(transposed, kernel.len());
+        let rows = transposed.sized(kernel.len());
         for h in 0..hidden {
             for j in 0..outputs {
                 rows[j * hidden + h] = kernel[h * outputs + j];
@@ -116,35 +111,49 @@ impl Network {
         rows
     }
 
+    /// The kernels between the hidden layers, prepared for [`Self::forward`].
+    pub fn hidden_kernels<'a>(&self, parameters: &'a [f32], precision: Precision) -> [Kernel<'a>; 2] {
+        [1, 2].map(|layer| Kernel::new(self.mlp.kernel(parameters, layer), self.hidden, self.hidden, precision))
+    }
+
     /// `out[rows × outputs]` of a tile.
     pub fn forward(
         &self,
         parameters: &[f32],
+        kernels: &[Kernel<'_>; 2],
         input: Input<'_>,
-        precision: Precision,
         work: &mut Workspace,
         out: &mut [f32],
     ) {
-        let product = match precision {
-            Precision::F32 => product,
-            Precision::Bf16 => product_bf16,
-        };
-        let (h, len) = (self.hidden, input.actions.len() / self.action_dim * self.hidden);
+        let (h, a, outputs) = (self.hidden, self.action_dim, self.mlp.shape(3).1);
         let [x, y, _] = &mut work.x;
-        let (x, y) = (sized(x, len), sized(y, len));
-        first_layer(&self.first(parameters, input), x);
-        product(x, self.mlp.kernel(parameters, 1), y, h, h);
-        bias_mish(y, self.mlp.bias(parameters, 1));
-        product(y, self.mlp.kernel(parameters, 2), x, h, h);
-        bias_mish(x, self.mlp.bias(parameters, 2));
-        dots(x, self.output_rows(parameters, &mut work.output), self.mlp.bias(parameters, 3), out, h);
+        let output = self.output_rows(parameters, &mut work.output);
+        // Kernels that are multiplied as fast as activations are read need those in the nearest cache.
+        let rows = match &kernels[0] {
+            Kernel::F32(_) => TILE,
+            #[cfg(target_arch = "x86_64")]
+            Kernel::Bf16(_) => BLOCK,
+        };
+        let states = (rows / input.repeat).max(1);
+        let rows = states * input.repeat;
+        let blocks = input.base.chunks(states * h).zip(input.actions.chunks(rows * a));
+        for ((base, actions), out) in blocks.zip(out.chunks_mut(rows * outputs)) {
+            let len = actions.len() / a * h;
+            let (x, y) = (x.sized(len), y.sized(len));
+            first_layer(&self.first(parameters, Input { base, actions, ..input }), x);
+            kernels[0].product(x, y, h, h);
+            bias_mish(y, self.mlp.bias(parameters, 1));
+            kernels[1].product(y, x, h, h);
+            bias_mish(x, self.mlp.bias(parameters, 2));
+            dots(x, output, self.mlp.bias(parameters, 3), out, h);
+        }
     }
 
     /// `forward` that leaves activations and slopes in the workspace for `backward`.
     pub fn forward_recorded(&self, parameters: &[f32], input: Input<'_>, work: &mut Workspace, out: &mut [f32]) {
         let (h, len) = (self.hidden, input.actions.len() / self.action_dim * self.hidden);
-        let [x1, x2, x3] = work.x.each_mut().map(|x| sized(x, len));
-        let [s1, s2, s3] = work.slope.each_mut().map(|s| sized(s, len));
+        let [x1, x2, x3] = work.x.each_mut().map(|x| x.sized(len));
+        let [s1, s2, s3] = work.slope.each_mut().map(|s| s.sized(len));
         first_layer_slope(&self.first(parameters, input), x1, s1);
         product(x1, self.mlp.kernel(parameters, 1), x2, h, h);
         bias_mish_slope(x2, self.mlp.bias(parameters, 1), s2);
@@ -157,8 +166,8 @@ impl Network {
     pub fn backward(&self, parameters: &[f32], output_gradient: &[f32], work: &mut Workspace) {
         let h = self.hidden;
         let len = output_gradient.len() / self.mlp.shape(3).1 * h;
-        let [s1, s2, s3] = work.slope.each_mut().map(|s| sized(s, len));
-        let temporary = sized(&mut work.temporary, len);
+        let [s1, s2, s3] = work.slope.each_mut().map(|s| s.sized(len));
+        let temporary = work.temporary.sized(len);
         scale_by_combination(s3, output_gradient, self.output_rows(parameters, &mut work.output), h);
         product_transposed(s3, self.mlp.kernel(parameters, 2), temporary, h, h);
         multiply(s2, temporary);
@@ -171,8 +180,8 @@ impl Network {
     pub fn parameter_gradient(&self, input: &[f32], output_gradient: &[f32], work: &mut Workspace, out: &mut [f32]) {
         let (h, outputs) = self.mlp.shape(3);
         let len = output_gradient.len() / outputs * h;
-        let [d1, d2, d3] = work.slope.each_ref().map(|s| &s[..len]);
-        let [x1, x2, x3] = work.x.each_ref().map(|x| &x[..len]);
+        let [d1, d2, d3] = work.slope.each_ref().map(|s| s.first(len));
+        let [x1, x2, x3] = work.x.each_ref().map(|x| x.first(len));
         let inputs = self.observation_dim + self.action_dim;
         for (layer, (x, width, gradient)) in
             [(input, inputs, d1), (x1, h, d2), (x2, h, d3), (x3, h, output_gradient)].into_iter().enumerate()
@@ -188,7 +197,7 @@ impl Network {
     pub fn action_gradient(&self, parameters: &[f32], work: &Workspace, out: &mut [f32]) {
         let len = out.len() / self.action_dim * self.hidden;
         let zero = vec![0.0; self.action_dim];
-        dots(&work.slope[0][..len], self.action_kernel(parameters), &zero, out, self.hidden);
+        dots(work.slope[0].first(len), self.action_kernel(parameters), &zero, out, self.hidden);
     }
 }
 

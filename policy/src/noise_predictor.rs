@@ -4,7 +4,7 @@ use crate::elementwise::{column_sums, mish_slope, multiply};
 use crate::ensemble::part;
 use crate::matmul::{outer, product, product_transposed};
 use crate::mlp::Mlp;
-use crate::network::{Input, Network, TILE, Workspace, concatenate, sized, with_workspace};
+use crate::network::{Input, Network, TILE, Workspace, concatenate, with_workspace};
 use crate::{Architecture, Precision, Schedule};
 use rayon::prelude::*;
 
@@ -121,18 +121,19 @@ impl NoisePredictor {
         let share = (all / a).div_ceil(rayon::current_num_threads()).clamp(1, TILE);
         let states = (share / repeat).max(1);
         let tile = states * repeat * a;
+        let kernels = self.trunk.hidden_kernels(trunk, precision);
         actions.par_chunks_mut(tile).enumerate().for_each(|(i, actions)| {
             let observations = part(observations, i * states, states, self.trunk.observation_dim);
             with_workspace(|work| {
                 let (mut base, mut out) = (std::mem::take(&mut work.base), std::mem::take(&mut work.out));
                 let len = observations.len() / self.trunk.observation_dim * self.trunk.hidden;
-                self.trunk.state_part(trunk, observations, sized(&mut base, len));
+                self.trunk.state_part(trunk, observations, base.sized(len));
                 actions.copy_from_slice(&noise[i * tile..][..actions.len()]);
                 for t in (1..=steps).rev() {
                     let shift = &embedding.shift[(t - 1) * self.trunk.hidden..][..self.trunk.hidden];
-                    let input = Input { base: &base[..len], repeat, shift, actions };
-                    let epsilon = sized(&mut out, actions.len());
-                    self.trunk.forward(trunk, input, precision, work, epsilon);
+                    let input = Input { base: base.first(len), repeat, shift, actions };
+                    let epsilon = out.sized(actions.len());
+                    self.trunk.forward(trunk, &kernels, input, work, epsilon);
                     let z = if t > 1 { &noise[(steps - t + 1) * all + i * tile..][..actions.len()] } else { &[] };
                     self.schedule.reverse(t, actions, epsilon, z);
                 }
@@ -151,7 +152,7 @@ impl NoisePredictor {
         run: impl FnOnce(Input<'_>, &mut Workspace),
     ) {
         let (h, mut base) = (self.trunk.hidden, std::mem::take(&mut work.base));
-        let rows = sized(&mut base, input.t.len() * h);
+        let rows = base.sized(input.t.len() * h);
         self.trunk.state_part(trunk, input.observations, rows);
         for (row, t) in rows.chunks_exact_mut(h).zip(input.t) {
             let shift = &embedding.shift[(t - 1) * h..][..h];
@@ -174,11 +175,11 @@ impl NoisePredictor {
     /// `out[batch × action_dim] = ε_θ(a^t, s, t)`.
     pub fn predict(&self, parameters: &[f32], input: NoisyActions<'_>, out: &mut [f32]) {
         let (_, trunk) = self.split(parameters);
-        let embedding = self.embed(parameters);
+        let (embedding, kernels) = (self.embed(parameters), self.trunk.hidden_kernels(trunk, Precision::F32));
         out.par_chunks_mut(TILE * self.trunk.action_dim).enumerate().for_each(|(i, out)| {
             with_workspace(|work| {
                 self.tile(trunk, &embedding, self.tile_of(input, i), work, |tile, work| {
-                    self.trunk.forward(trunk, tile, Precision::F32, work, out);
+                    self.trunk.forward(trunk, &kernels, tile, work, out);
                 });
             });
         });
@@ -220,7 +221,7 @@ impl NoisePredictor {
             let mut inputs = Vec::new();
             concatenate(input.observations, input.actions, (self.trunk.observation_dim, a), &mut inputs);
             self.trunk.parameter_gradient(&inputs, out, &mut work, &mut trunk_gradient);
-            for (t, delta) in input.t.iter().zip(work.slope[0].chunks_exact(h)) {
+            for (t, delta) in input.t.iter().zip(work.slope[0].first(input.t.len() * h).chunks_exact(h)) {
                 by_step[(t - 1) * h..][..h].iter_mut().zip(delta).for_each(|(sum, d)| *sum += d);
             }
             (trunk_gradient, by_step)

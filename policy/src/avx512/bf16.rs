@@ -1,20 +1,15 @@
 //! The product with its operands rounded to bfloat16 and its sums in f32: twice as fast where the CPU has AVX512-BF16.
 
-use super::{COLUMNS, LANES, ROWS, Strided};
+use super::{COLUMNS, LANES, Line, ROWS, Strided, amx};
 use std::arch::x86_64::{
     __m512bh, __m512i, _MM_HINT_T0, _mm_prefetch, _mm512_cvtne2ps_pbh, _mm512_dpbf16_ps, _mm512_loadu_ps,
-    _mm512_loadu_si512, _mm512_permutexvar_epi16, _mm512_set1_epi32, _mm512_setzero_ps, _mm512_storeu_ps,
-    _mm512_storeu_si512,
+    _mm512_loadu_si512, _mm512_permutexvar_epi16, _mm512_set1_epi32, _mm512_setzero_ps, _mm512_store_si512,
+    _mm512_storeu_ps,
 };
 use std::cell::RefCell;
 
 /// Two neighbours of a sum's terms in one element.
-type Pair = i32;
-
-/// Whether this CPU can, and a product of these shapes is made of whole registers.
-pub(crate) fn serves(k: usize, columns: usize) -> bool {
-    super::serves(columns) && k.is_multiple_of(COLUMNS) && available()
-}
+pub(super) type Pair = i32;
 
 /// Whether this CPU can.
 pub(crate) fn available() -> bool {
@@ -52,38 +47,110 @@ unsafe fn round(low: *const f32, high: *const f32) -> __m512i {
 }
 
 thread_local! {
-    /// Rounded operands: all of `a`, and a block of columns of `b`.
-    static ROUNDED: RefCell<[Vec<Pair>; 2]> = RefCell::default();
+    /// Rounded rows.
+    static ROUNDED: RefCell<Vec<Line<Pair>>> = RefCell::default();
 }
 
-/// `c[m × n] = a[m × k] · b[k × n]`, all row-major.
-///
-/// # Safety
-/// [`serves`] must hold for `k` and `n`, and the three matrices must span that many elements.
-#[target_feature(enable = "avx512f,avx512bw,avx512bf16")]
-pub(crate) unsafe fn multiply(m: usize, n: usize, k: usize, a: *const f32, b: *const f32, c: *mut f32) {
-    let pairs = k / 2;
-    let [mut rounded_a, mut rounded_b] = ROUNDED.take();
-    rounded_a.resize(m * pairs, 0);
-    rounded_b.resize(pairs * COLUMNS, 0);
-    // Lane i of the lower half beside lane i of the upper one.
-    let interleave: [u16; 2 * LANES] = std::array::from_fn(|i| (i / 2 + i % 2 * LANES) as u16);
-    // SAFETY: m × k is a multiple of two registers, a block of `b` is k rows of two.
-    unsafe {
-        let interleave = _mm512_loadu_si512(interleave.as_ptr().cast());
-        for (i, to) in rounded_a.chunks_exact_mut(LANES).enumerate() {
-            let from = a.add(i * COLUMNS);
-            _mm512_storeu_si512(to.as_mut_ptr().cast(), round(from, from.add(LANES)));
-        }
-        let a = Strided { first: rounded_a.as_ptr(), row: pairs, column: 1 };
-        for j in (0..n).step_by(COLUMNS) {
-            for (i, to) in rounded_b.chunks_exact_mut(LANES).enumerate() {
-                let from = b.add(i / 2 * 2 * n + j + i % 2 * LANES);
-                let row = _mm512_permutexvar_epi16(interleave, round(from, from.add(n)));
-                _mm512_storeu_si512(to.as_mut_ptr().cast(), row);
+/// The right-hand side of products, `k × n`, rounded: block after block of columns, and in each the pairs of `k` as rows.
+pub(crate) struct Kernel {
+    blocks: Vec<Line<Pair>>,
+    k: usize,
+    n: usize,
+}
+
+impl Kernel {
+    /// Rounds a row-major matrix; `None` where this CPU cannot multiply with it, or it is not made of whole registers.
+    pub fn new(matrix: &[f32], k: usize, n: usize) -> Option<Self> {
+        assert_eq!(matrix.len(), k * n, "a kernel's shape");
+        let whole = k.is_multiple_of(COLUMNS) && n.is_multiple_of(COLUMNS);
+        // SAFETY: what it asks for holds.
+        (whole && available()).then(|| unsafe { Self::round(matrix, k, n) })
+    }
+
+    /// # Safety
+    /// This CPU must be able to; both sides must be multiples of [`COLUMNS`] and the matrix of that size.
+    #[target_feature(enable = "avx512f,avx512bw,avx512bf16")]
+    unsafe fn round(matrix: &[f32], k: usize, n: usize) -> Self {
+        // Lane i of the lower half beside lane i of the upper one.
+        let interleave: [u16; 2 * LANES] = std::array::from_fn(|i| (i / 2 + i % 2 * LANES) as u16);
+        let mut blocks = Vec::with_capacity(k / 2 * n / LANES);
+        for j in (0..n).step_by(LANES * 2) {
+            for i in 0..k {
+                // SAFETY: of the pairs' rows 2·(i/2) and the next, the left or right half of the block's columns.
+                blocks.push(unsafe {
+                    let from = matrix.as_ptr().add(i / 2 * 2 * n + j + i % 2 * LANES);
+                    let row = _mm512_permutexvar_epi16(
+                        _mm512_loadu_si512(interleave.as_ptr().cast()),
+                        round(from, from.add(n)),
+                    );
+                    std::mem::transmute::<__m512i, Line<Pair>>(row)
+                });
             }
-            panel(m, pairs, a, rounded_b.as_ptr(), COLUMNS, c.add(j), n);
+        }
+        Self { blocks, k, n }
+    }
+
+    /// `c[m × n] = a[m × k] · self`, row-major, by AMX where the CPU has it.
+    pub fn multiply(&self, a: &[f32], c: &mut [f32]) {
+        let m = a.len() / self.k;
+        assert!(a.len() == m * self.k && c.len() == m * self.n, "the product's shape");
+        // SAFETY: a kernel is only made where the CPU can; the shapes were checked here and there.
+        unsafe { self.multiply_by(amx::available(), m, a.as_ptr(), c.as_mut_ptr()) };
+    }
+
+    /// # Safety
+    /// `a` and `c` must have `m` rows; tiles must be available where they are asked for.
+    #[target_feature(enable = "avx512f,avx512bw,avx512bf16")]
+    unsafe fn multiply_by(&self, tiles: bool, m: usize, a: *const f32, c: *mut f32) {
+        let (pairs, n) = (self.k / 2, self.n);
+        let mut rounded = ROUNDED.take();
+        rounded.resize(m * pairs / LANES, Line([0; LANES]));
+        // SAFETY: m × k is a multiple of two registers, and whole blocks of pairs × 32 are behind each other.
+        unsafe {
+            for (i, to) in rounded.iter_mut().enumerate() {
+                let from = a.add(i * COLUMNS);
+                _mm512_store_si512(to.0.as_mut_ptr().cast(), round(from, from.add(LANES)));
+            }
+            let a = Strided { first: rounded.as_ptr().cast(), row: pairs, column: 1 };
+            let b: *const Pair = self.blocks.as_ptr().cast();
+            if tiles {
+                amx::multiply(m, n, pairs, a, b, c);
+            } else {
+                for j in (0..n).step_by(COLUMNS) {
+                    panel(m, pairs, a, b.add(j * pairs), COLUMNS, c.add(j), n);
+                }
+            }
+        }
+        ROUNDED.set(rounded);
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use rand::{Rng, SeedableRng};
+    use rand_chacha::ChaCha8Rng;
+
+    /// The dispatched product is tested beside the others in `matmul`; this is about the one that is not chosen there.
+    #[test]
+    fn tiles_add_up_what_registers_do() {
+        if !amx::available() {
+            return;
+        }
+        let mut generator = ChaCha8Rng::seed_from_u64(0);
+        let mut numbers = |len: usize| (0..len).map(|_| generator.random_range(-1.0..1.0)).collect::<Vec<f32>>();
+        for (m, k, n) in [(1, 32, 32), (2, 64, 96), (16, 32, 32), (17, 32, 64), (33, 96, 32), (100, 256, 64)] {
+            let (a, b) = (numbers(m * k), numbers(k * n));
+            let kernel = Kernel::new(&b, k, n).unwrap();
+            let by = |tiles| {
+                let mut c = vec![f32::NAN; m * n];
+                // SAFETY: AMX was found; a and c have m rows.
+                unsafe { kernel.multiply_by(tiles, m, a.as_ptr(), c.as_mut_ptr()) };
+                c
+            };
+            for (i, (x, y)) in by(true).into_iter().zip(by(false)).enumerate() {
+                assert!((x - y).abs() < 1e-5, "{m} × {k} × {n} at {i}: {x} for {y}");
+            }
         }
     }
-    ROUNDED.set([rounded_a, rounded_b]);
 }

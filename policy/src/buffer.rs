@@ -1,0 +1,26 @@
+//! Memory that is used again and again.
+
+/// Bytes of a cache line, and of the widest register.
+const LINE: usize = 64;
+
+/// Numbers from the beginning of a cache line on: a register of them elsewhere costs two accesses. Grows, never shrinks.
+#[derive(Default)]
+pub(crate) struct Buffer(Vec<f32>);
+
+impl Buffer {
+    /// `len` numbers; what they hold is left over from earlier use.
+    pub fn sized(&mut self, len: usize) -> &mut [f32] {
+        let needed = len + LINE / size_of::<f32>();
+        if self.0.len() < needed {
+            self.0 = vec![0.0; needed];
+        }
+        let start = self.0.as_ptr().align_offset(LINE);
+        &mut self.0[start..][..len]
+    }
+
+    /// The first `len` of the numbers that [`Self::sized`] gave last, which must have been as many.
+    pub fn first(&self, len: usize) -> &[f32] {
+        let start = self.0.as_ptr().align_offset(LINE);
+        &self.0[start..][..len]
+    }
+}
