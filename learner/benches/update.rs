@@ -150,14 +150,15 @@ fn parts_of(group: &mut BenchmarkGroup<'_, WallTime>, config: &AgentConfig) {
     let (actor, critics) = (NoisePredictor::new(&architecture), CriticEnsemble::new(&architecture));
     let (b, a, samples) = (config.batch_size, DIMS.1, config.samples);
     let Batch { observations, actions, rewards, next_observations, .. } = batch(b);
-    let f32 = Precision::F32;
+    // As they are.
+    let plain = (actor.round(&target.actor, Precision::F32), critics.round(&target.critics, Precision::F32));
 
     let (noise, mut sampled) = (numbers(config.diffusion_steps * b * samples * a), vec![0.0; b * samples * a]);
-    let sample = |out: &mut [f32]| actor.sample(&target.actor, &next_observations, samples, &noise, f32, out);
+    let sample = |out: &mut [f32]| actor.sample(&target.actor, &plain.0, &next_observations, samples, &noise, out);
     bench(group, "sampled next actions", || sample(&mut sampled));
     let mut values = vec![0.0; config.critics * b * samples];
     let next = StateActions { observations: &next_observations, actions: &sampled, repeat: samples };
-    bench(group, "target critics", || critics.values(&target.critics, next, f32, &mut values));
+    bench(group, "target critics", || critics.values(&target.critics, &plain.1, next, &mut values));
     let len = critics.parameters();
     let mut gradient = vec![0.0; critics.gradient_tiles(b) * len];
     bench(group, "critic step", || {
@@ -173,7 +174,7 @@ fn parts_of(group: &mut BenchmarkGroup<'_, WallTime>, config: &AgentConfig) {
 
     let data = StateActions { observations: &observations, actions: &actions, repeat: 1 };
     bench(group, "Q-gradients' scale", || {
-        critics.values(&target.critics, data, f32, &mut values[..config.critics * b])
+        critics.values(&target.critics, &plain.1, data, &mut values[..config.critics * b])
     });
     let mut gradients = vec![0.0; config.critics * b * a];
     bench(group, "Q-gradients", || {

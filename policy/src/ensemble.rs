@@ -3,6 +3,7 @@
 //! Work is cut into (critic, tile of rows) and runs in parallel; the cut does not depend on the number of threads, so
 //! neither do the results.
 
+use crate::matmul::Rounded;
 use crate::mlp::Mlp;
 use crate::network::{Input, Network, TILE, concatenate, with_workspace};
 use crate::{Architecture, Precision};
@@ -25,6 +26,9 @@ pub struct StateActions<'a> {
     /// Actions per state.
     pub repeat: usize,
 }
+
+/// An ensemble's hidden kernels as a [`Precision`] wants them, critic after critic; none in f32.
+pub struct RoundedCritics(Vec<[Rounded; 2]>);
 
 impl CriticEnsemble {
     /// The ensemble of an architecture.
@@ -53,15 +57,22 @@ impl CriticEnsemble {
         &parameters[k * len..][..len]
     }
 
-    /// `out[K × rows] = Q_k(s, a)`, a row for each action.
-    pub fn values(&self, parameters: &[f32], input: StateActions<'_>, precision: Precision, out: &mut [f32]) {
+    /// Prepares parameters for [`Self::values`].
+    pub fn round(&self, parameters: &[f32], precision: Precision) -> RoundedCritics {
+        let round = |k| self.network.round(self.critic(parameters, k));
+        let critics = if precision == Precision::Bf16 { self.critics } else { 0 };
+        RoundedCritics((0..critics).into_par_iter().filter_map(round).collect())
+    }
+
+    /// `out[K × rows] = Q_k(s, a)`, a row for each action. `rounded` is of the same parameters.
+    pub fn values(&self, parameters: &[f32], rounded: &RoundedCritics, input: StateActions<'_>, out: &mut [f32]) {
         let network = &self.network;
         let rows = input.actions.len() / network.action_dim;
         let states = (TILE / input.repeat).max(1);
         let tile = states * input.repeat;
         out.par_chunks_mut(rows).enumerate().for_each(|(k, out)| {
             let parameters = self.critic(parameters, k);
-            let (shift, kernels) = (network.mlp.bias(parameters, 0), network.hidden_kernels(parameters, precision));
+            let (shift, rounded) = (network.mlp.bias(parameters, 0), rounded.0.get(k));
             out.par_chunks_mut(tile).enumerate().for_each(|(i, out)| {
                 let observations = part(input.observations, i * states, states, network.observation_dim);
                 let actions = part(input.actions, i * tile, tile, network.action_dim);
@@ -70,7 +81,7 @@ impl CriticEnsemble {
                     let len = observations.len() / network.observation_dim * network.hidden;
                     network.state_part(parameters, observations, base.sized(len));
                     let input = Input { base: base.first(len), repeat: input.repeat, shift, actions };
-                    network.forward(parameters, &kernels, input, work, out);
+                    network.forward(parameters, rounded, input, work, out);
                     work.base = base;
                 });
             });

@@ -34,9 +34,9 @@ mod select;
 
 pub use architecture::Architecture;
 pub use elementwise::{mish_in_place, mish_slope};
-pub use ensemble::{CriticEnsemble, StateActions};
+pub use ensemble::{CriticEnsemble, RoundedCritics, StateActions};
 pub use error::PolicyError;
-pub use noise_predictor::{NoisePredictor, NoisyActions, Recording};
+pub use noise_predictor::{NoisePredictor, NoisyActions, Recording, RoundedActor};
 pub use parameters::Parameters;
 pub use precision::Precision;
 pub use schedule::Schedule;

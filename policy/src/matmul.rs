@@ -2,7 +2,6 @@
 //!
 //! The callers split work into tiles that run in parallel, so a single product never does.
 
-use crate::Precision;
 use gemm::{Parallelism, gemm};
 
 #[cfg(target_arch = "x86_64")]
@@ -59,34 +58,27 @@ pub(crate) fn product(x: &[f32], w: &[f32], out: &mut [f32], k: usize, n: usize)
     multiply_row_major(m, n, k, out, (x.as_ptr(), 1, k as isize), w);
 }
 
-/// The right-hand side of many products.
-pub(crate) enum Kernel<'a> {
-    /// As it is.
-    F32(&'a [f32]),
-    /// Rounded to bfloat16, as is the left-hand side when they are multiplied.
-    #[cfg(target_arch = "x86_64")]
-    Bf16(avx512::bf16::Kernel),
-}
+/// The right-hand side of a product rounded to bfloat16, for CPUs that multiply such numbers faster.
+pub(crate) struct Rounded(
+    #[cfg(target_arch = "x86_64")] avx512::bf16::Kernel,
+    #[cfg(not(target_arch = "x86_64"))] std::convert::Infallible,
+);
 
-impl<'a> Kernel<'a> {
-    /// Prepares `w[k × n]`: rounded if that is asked for and the CPU multiplies such numbers faster.
-    pub fn new(w: &'a [f32], k: usize, n: usize, precision: Precision) -> Self {
+impl Rounded {
+    /// Rounds `w[k × n]`; `None` where it is multiplied faster as it is.
+    pub fn new(w: &[f32], k: usize, n: usize) -> Option<Self> {
         #[cfg(target_arch = "x86_64")]
-        if precision == Precision::Bf16
-            && let Some(kernel) = avx512::bf16::Kernel::new(w, k, n)
-        {
-            return Kernel::Bf16(kernel);
-        }
-        Kernel::F32(w)
+        return avx512::bf16::Kernel::new(w, k, n).map(Self);
+        #[cfg(not(target_arch = "x86_64"))]
+        None
     }
 
-    /// `out[m × n] = x[m × k] · self`.
-    pub fn product(&self, x: &[f32], out: &mut [f32], k: usize, n: usize) {
-        match self {
-            Kernel::F32(w) => product(x, w, out, k, n),
-            #[cfg(target_arch = "x86_64")]
-            Kernel::Bf16(kernel) => kernel.multiply(x, out),
-        }
+    /// `out[m × n] = x[m × k] · self`, `x` rounded too.
+    pub fn product(&self, x: &[f32], out: &mut [f32]) {
+        #[cfg(target_arch = "x86_64")]
+        self.0.multiply(x, out);
+        #[cfg(not(target_arch = "x86_64"))]
+        match self.0 {}
     }
 }
 
@@ -138,7 +130,10 @@ mod tests {
             let exact = |i: usize| sum(k, &|p| (x[i / n * k + p], w[p * n + i % n]));
             assert_close(&out, exact, &format!("{m} × {k} × {n}"));
             let mut out = vec![f32::NAN; m * n];
-            Kernel::new(&w, k, n, Precision::Bf16).product(&x, &mut out, k, n);
+            match Rounded::new(&w, k, n) {
+                Some(rounded) => rounded.product(&x, &mut out),
+                None => product(&x, &w, &mut out, k, n),
+            }
             // Each term is off by at most a part in 2^8: twice half a unit in the last of 8 bits.
             let terms = |i: usize| sum(k, &|p| (x[i / n * k + p].abs(), w[p * n + i % n].abs()));
             for (i, x) in out.iter().enumerate() {

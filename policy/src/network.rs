@@ -4,19 +4,18 @@
 //! The first layer is taken apart: the state's part is computed once per state, whatever number of actions is tried in
 //! it, and the action's few columns are fused with the activation.
 
-use crate::Precision;
 use crate::buffer::Buffer;
 use crate::elementwise::{
     FirstLayer, bias_mish, bias_mish_slope, column_sums, dots, first_layer, first_layer_slope, multiply,
     scale_by_combination,
 };
-use crate::matmul::{Kernel, outer, product, product_transposed};
+use crate::matmul::{Rounded, outer, product, product_transposed};
 use crate::mlp::Mlp;
 use std::cell::RefCell;
 
 /// Rows that one task works on: weights and activations of a tile stay in a core's own cache.
 pub(crate) const TILE: usize = 128;
-/// The same where products are rounded.
+/// The same within a task whose products are rounded: these are so fast that activations must be in the nearest cache.
 const BLOCK: usize = 32;
 
 /// Shapes of one network.
@@ -111,16 +110,17 @@ impl Network {
         rows
     }
 
-    /// The kernels between the hidden layers, prepared for [`Self::forward`].
-    pub fn hidden_kernels<'a>(&self, parameters: &'a [f32], precision: Precision) -> [Kernel<'a>; 2] {
-        [1, 2].map(|layer| Kernel::new(self.mlp.kernel(parameters, layer), self.hidden, self.hidden, precision))
+    /// The two kernels between hidden layers, rounded; `None` where [`Self::forward`] is as fast without.
+    pub fn round(&self, parameters: &[f32]) -> Option<[Rounded; 2]> {
+        let round = |layer| Rounded::new(self.mlp.kernel(parameters, layer), self.hidden, self.hidden);
+        Some([round(1)?, round(2)?])
     }
 
-    /// `out[rows × outputs]` of a tile.
+    /// `out[rows × outputs]` of a tile, by the rounded kernels if there are any.
     pub fn forward(
         &self,
         parameters: &[f32],
-        kernels: &[Kernel<'_>; 2],
+        rounded: Option<&[Rounded; 2]>,
         input: Input<'_>,
         work: &mut Workspace,
         out: &mut [f32],
@@ -128,23 +128,22 @@ impl Network {
         let (h, a, outputs) = (self.hidden, self.action_dim, self.mlp.shape(3).1);
         let [x, y, _] = &mut work.x;
         let output = self.output_rows(parameters, &mut work.output);
-        // Kernels that are multiplied as fast as activations are read need those in the nearest cache.
-        let rows = match &kernels[0] {
-            Kernel::F32(_) => TILE,
-            #[cfg(target_arch = "x86_64")]
-            Kernel::Bf16(_) => BLOCK,
+        let hidden = |layer: usize, x: &[f32], out: &mut [f32]| {
+            match rounded {
+                Some(kernels) => kernels[layer - 1].product(x, out),
+                None => product(x, self.mlp.kernel(parameters, layer), out, h, h),
+            }
+            bias_mish(out, self.mlp.bias(parameters, layer));
         };
-        let states = (rows / input.repeat).max(1);
+        let states = (if rounded.is_some() { BLOCK } else { TILE } / input.repeat).max(1);
         let rows = states * input.repeat;
         let blocks = input.base.chunks(states * h).zip(input.actions.chunks(rows * a));
         for ((base, actions), out) in blocks.zip(out.chunks_mut(rows * outputs)) {
             let len = actions.len() / a * h;
             let (x, y) = (x.sized(len), y.sized(len));
             first_layer(&self.first(parameters, Input { base, actions, ..input }), x);
-            kernels[0].product(x, y, h, h);
-            bias_mish(y, self.mlp.bias(parameters, 1));
-            kernels[1].product(y, x, h, h);
-            bias_mish(x, self.mlp.bias(parameters, 2));
+            hidden(1, x, y);
+            hidden(2, y, x);
             dots(x, output, self.mlp.bias(parameters, 3), out, h);
         }
     }

@@ -2,7 +2,7 @@
 
 use crate::elementwise::{column_sums, mish_slope, multiply};
 use crate::ensemble::part;
-use crate::matmul::{outer, product, product_transposed};
+use crate::matmul::{Rounded, outer, product, product_transposed};
 use crate::mlp::Mlp;
 use crate::network::{Input, Network, TILE, Workspace, concatenate, with_workspace};
 use crate::{Architecture, Precision, Schedule};
@@ -17,6 +17,9 @@ pub struct NoisePredictor {
     features: Vec<f32>,
     schedule: Schedule,
 }
+
+/// A noise predictor's hidden kernels as a [`Precision`] wants them; none in f32.
+pub struct RoundedActor(Option<[Rounded; 2]>);
 
 /// The time embedding for all t: everything but the state and the action in the trunk's first pre-activation.
 struct TimeEmbedding {
@@ -101,17 +104,23 @@ impl NoisePredictor {
         TimeEmbedding { hidden, slope, embedding, shift }
     }
 
+    /// Prepares parameters for [`Self::sample`].
+    pub fn round(&self, parameters: &[f32], precision: Precision) -> RoundedActor {
+        let (_, trunk) = self.split(parameters);
+        RoundedActor(if precision == Precision::Bf16 { self.trunk.round(trunk) } else { None })
+    }
+
     /// Draws actions by the whole reverse process (DDPM), x_0 clipped to [-1, 1] at each step.
     ///
-    /// `noise` is `T × rows × action_dim`, standard normal, rows being states × `repeat`: first a^T, then the noise of
+    /// `rounded` is of the same parameters, `noise` is `T × rows × action_dim`, standard normal, rows being states × `repeat`: first a^T, then the noise of
     /// the reverse steps from t = T down to 2. `actions` is `rows × action_dim`.
     pub fn sample(
         &self,
         parameters: &[f32],
+        rounded: &RoundedActor,
         observations: &[f32],
         repeat: usize,
         noise: &[f32],
-        precision: Precision,
         actions: &mut [f32],
     ) {
         let a = self.trunk.action_dim;
@@ -121,7 +130,6 @@ impl NoisePredictor {
         let share = (all / a).div_ceil(rayon::current_num_threads()).clamp(1, TILE);
         let states = (share / repeat).max(1);
         let tile = states * repeat * a;
-        let kernels = self.trunk.hidden_kernels(trunk, precision);
         actions.par_chunks_mut(tile).enumerate().for_each(|(i, actions)| {
             let observations = part(observations, i * states, states, self.trunk.observation_dim);
             with_workspace(|work| {
@@ -133,7 +141,7 @@ impl NoisePredictor {
                     let shift = &embedding.shift[(t - 1) * self.trunk.hidden..][..self.trunk.hidden];
                     let input = Input { base: base.first(len), repeat, shift, actions };
                     let epsilon = out.sized(actions.len());
-                    self.trunk.forward(trunk, &kernels, input, work, epsilon);
+                    self.trunk.forward(trunk, rounded.0.as_ref(), input, work, epsilon);
                     let z = if t > 1 { &noise[(steps - t + 1) * all + i * tile..][..actions.len()] } else { &[] };
                     self.schedule.reverse(t, actions, epsilon, z);
                 }
@@ -175,11 +183,11 @@ impl NoisePredictor {
     /// `out[batch × action_dim] = ε_θ(a^t, s, t)`.
     pub fn predict(&self, parameters: &[f32], input: NoisyActions<'_>, out: &mut [f32]) {
         let (_, trunk) = self.split(parameters);
-        let (embedding, kernels) = (self.embed(parameters), self.trunk.hidden_kernels(trunk, Precision::F32));
+        let embedding = self.embed(parameters);
         out.par_chunks_mut(TILE * self.trunk.action_dim).enumerate().for_each(|(i, out)| {
             with_workspace(|work| {
                 self.tile(trunk, &embedding, self.tile_of(input, i), work, |tile, work| {
-                    self.trunk.forward(trunk, &kernels, tile, work, out);
+                    self.trunk.forward(trunk, None, tile, work, out);
                 });
             });
         });

@@ -1,6 +1,7 @@
 //! Acting: the best of N_a candidates (Eq. 25), drawn from the target actor and valued by the target critics.
 
-use crate::ensemble::StateActions;
+use crate::ensemble::{RoundedCritics, StateActions};
+use crate::noise_predictor::RoundedActor;
 use crate::{Architecture, CriticEnsemble, NoisePredictor, Parameters, PolicyError, Precision};
 use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;
@@ -31,7 +32,7 @@ pub struct TargetPolicy {
     actor: NoisePredictor,
     critics: CriticEnsemble,
     parameters: Parameters,
-    precision: Precision,
+    rounded: (RoundedActor, RoundedCritics),
 }
 
 /// Candidates of a batch of states and what the critics say of them.
@@ -49,7 +50,8 @@ impl TargetPolicy {
     pub fn new(parameters: Parameters, precision: Precision) -> Self {
         let architecture = *parameters.architecture();
         let (actor, critics) = (NoisePredictor::new(&architecture), CriticEnsemble::new(&architecture));
-        Self { actor, critics, parameters, precision }
+        let rounded = (actor.round(&parameters.actor, precision), critics.round(&parameters.critics, precision));
+        Self { actor, critics, parameters, rounded }
     }
 
     /// Reads a snapshot's tensors: exactly those of the architecture, all finite.
@@ -80,7 +82,7 @@ impl TargetPolicy {
             }
         }
         if candidates == 1 {
-            return self.actor.sample(&self.parameters.actor, observations, 1, &draws, self.precision, actions);
+            return self.actor.sample(&self.parameters.actor, &self.rounded.0, observations, 1, &draws, actions);
         }
         let selection = self.select_with(observations, candidates, &draws);
         for (i, (action, chosen)) in actions.chunks_exact_mut(a).zip(&selection.chosen).enumerate() {
@@ -92,11 +94,11 @@ impl TargetPolicy {
     pub fn select_with(&self, observations: &[f32], candidates: usize, noise: &[f32]) -> Selection {
         let rows = observations.len() / self.architecture().observation_dim * candidates;
         let mut actions = vec![0.0; rows * self.architecture().action_dim];
-        self.actor.sample(&self.parameters.actor, observations, candidates, noise, self.precision, &mut actions);
+        self.actor.sample(&self.parameters.actor, &self.rounded.0, observations, candidates, noise, &mut actions);
         let critics = self.architecture().critics;
         let mut each = vec![0.0; critics * rows];
         let input = StateActions { observations, actions: &actions, repeat: candidates };
-        self.critics.values(&self.parameters.critics, input, self.precision, &mut each);
+        self.critics.values(&self.parameters.critics, &self.rounded.1, input, &mut each);
         let mut values = vec![0.0; rows];
         for critic in each.chunks_exact(rows) {
             values.iter_mut().zip(critic).for_each(|(sum, q)| *sum += q / critics as f32);

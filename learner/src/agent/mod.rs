@@ -233,12 +233,14 @@ impl Agent {
 
         seen.next_actions.resize(rows * action_dim, 0.0);
         let (states, samples) = (&batch.next_observations, config.samples);
-        let precision = config.precision;
-        self.actor.sample(&state.target.actor, states, samples, &noise.next, precision, &mut seen.next_actions);
+        let actor = &state.target.actor;
+        let rounded = self.actor.round(actor, config.precision);
+        self.actor.sample(actor, &rounded, states, samples, &noise.next, &mut seen.next_actions);
 
         seen.values.resize(critics * rows, 0.0);
         let next = StateActions { observations: states, actions: &seen.next_actions, repeat: samples };
-        self.critics.values(&state.target.critics, next, precision, &mut seen.values);
+        let rounded = self.critics.round(&state.target.critics, config.precision);
+        self.critics.values(&state.target.critics, &rounded, next, &mut seen.values);
         let bound =
             LowerConfidenceBound { gamma: config.gamma, rho: config.rho, samples, reduce: config.target_reduce };
         bound.targets(&seen.values, &batch.rewards, &batch.masks, &mut seen.targets);
@@ -326,7 +328,8 @@ impl Agent {
         let (observations, rows) = (&batch.observations, batch.rewards.len());
         seen.values.resize(critics * rows, 0.0);
         let data = StateActions { observations, actions: &batch.actions, repeat: 1 };
-        self.critics.values(&state.target.critics, data, config.precision, &mut seen.values);
+        let rounded = self.critics.round(&state.target.critics, config.precision);
+        self.critics.values(&state.target.critics, &rounded, data, &mut seen.values);
         let mean_over_critics = |i: usize| seen.values.iter().skip(i).step_by(rows).sum::<f32>() / critics as f32;
         seen.q_scale = (0..rows).map(|i| mean_over_critics(i).abs()).sum::<f32>() / rows as f32 + 1e-6;
 
