@@ -98,8 +98,12 @@ impl Parameters {
             true => (&self.critics, CriticEnsemble::new(&self.architecture).parameters_per_critic()),
             false => (&self.actor, usize::MAX),
         };
-        let numbers = flat.chunks(stride).flat_map(|chunk| &chunk[place.offset..place.offset + place.len]);
-        numbers.flat_map(|x| x.to_le_bytes()).collect()
+        let chunks = flat.chunks(stride).map(|chunk| &chunk[place.offset..place.offset + place.len]);
+        let mut bytes = vec![0; chunks.len() * place.len * size_of::<f32>()];
+        for (bytes, chunk) in bytes.chunks_exact_mut(place.len * size_of::<f32>()).zip(chunks) {
+            bytes.chunks_exact_mut(size_of::<f32>()).zip(chunk).for_each(|(b, x)| b.copy_from_slice(&x.to_le_bytes()));
+        }
+        bytes
     }
 
     /// A safetensors file of all tensors, always the same bytes for the same numbers.
@@ -141,11 +145,15 @@ impl Parameters {
         let mut parameters = Self::zeros(architecture);
         for (place, name, tensor) in tensors {
             let mut numbers = tensor.data().chunks_exact(4).map(|b| f32::from_le_bytes([b[0], b[1], b[2], b[3]]));
-            if !numbers.clone().all(f32::is_finite) {
-                return Err(PolicyError::NotFinite(name));
+            let mut finite = true;
+            for chunk in parameters.chunks_mut(&place) {
+                for (x, number) in chunk.iter_mut().zip(&mut numbers) {
+                    *x = number;
+                    finite &= number.is_finite();
+                }
             }
-            for x in parameters.chunks_mut(&place).flatten() {
-                *x = numbers.next().unwrap_or_default();
+            if !finite {
+                return Err(PolicyError::NotFinite(name));
             }
         }
         Ok(parameters)

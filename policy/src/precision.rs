@@ -10,8 +10,8 @@ pub enum Precision {
     /// f32 throughout.
     #[default]
     F32,
-    /// Operands rounded to bfloat16 (8 bits of mantissa), sums in f32. Twice as fast where the CPU has AVX512-BF16; a CPU
-    /// without it computes in f32.
+    /// Operands rounded to bfloat16 (8 bits of mantissa), sums in f32. Faster where the CPU has AVX512-BF16, several times
+    /// where it has AMX; a CPU without them computes in f32.
     Bf16,
 }
 

@@ -8,6 +8,8 @@
 //! Bytes may come from anybody: whatever they are, [`decode`] gives a message that keeps all rules or a typed error.
 //! A frame of up to 1 MiB never makes it allocate more than 4 MiB at once, a larger one never more than 64 MiB.
 
+use std::io::Read;
+
 use bincode::config::{Configuration, Fixint, LittleEndian};
 use bincode::de::Decoder;
 use bincode::enc::Encoder;
@@ -164,33 +166,47 @@ pub fn encode<M: Message>(message: &M) -> Result<Vec<u8>, CodecError> {
 ///
 /// Any [`CodecError`], the first that is found.
 pub fn decode<M: Message>(frame: &[u8]) -> Result<M, CodecError> {
-    let Some((header, body)) = frame.split_first_chunk::<HEADER_LENGTH>() else {
-        let cut = &MAGIC[..frame.len().min(MAGIC.len())];
-        return Err(if frame.starts_with(cut) { CodecError::Truncated } else { CodecError::NotQuad });
-    };
+    decode_from(frame.len(), frame)
+}
+
+/// [`decode`] of a frame of `length` bytes that are read one after the other. It saves a copy of those that did not come
+/// in one piece.
+///
+/// # Errors
+///
+/// Any [`CodecError`], the first that is found.
+pub fn decode_from<M: Message>(length: usize, mut frame: impl Read) -> Result<M, CodecError> {
+    let mut header = [0; HEADER_LENGTH];
+    let read = &mut header[..length.min(HEADER_LENGTH)];
+    frame.read_exact(read).map_err(|_| CodecError::Truncated)?;
+    if read.len() < HEADER_LENGTH {
+        let begins = read.iter().zip(MAGIC).all(|(found, expected)| found == expected);
+        return Err(if begins { CodecError::Truncated } else { CodecError::NotQuad });
+    }
     let [magic @ .., version_low, version_high, kind] = header;
-    let version = u16::from_le_bytes([*version_low, *version_high]);
-    if magic != MAGIC {
+    let version = u16::from_le_bytes([version_low, version_high]);
+    if magic != *MAGIC {
         return Err(CodecError::NotQuad);
     }
     if version != PROTOCOL_VERSION {
         return Err(CodecError::Version { theirs: version, ours: PROTOCOL_VERSION });
     }
-    if *kind != M::KIND {
-        return Err(CodecError::Kind { found: *kind, expected: M::KIND });
+    if kind != M::KIND {
+        return Err(CodecError::Kind { found: kind, expected: M::KIND });
     }
-    if frame.len() > M::LIMIT {
-        return Err(CodecError::Oversized { length: frame.len(), limit: M::LIMIT });
+    if length > M::LIMIT {
+        return Err(CodecError::Oversized { length, limit: M::LIMIT });
     }
+    let mut body = frame.take((length - HEADER_LENGTH) as u64);
     // Bincode allocates what a length field claims before it reads; the limit bounds that.
-    let (message, length) = if frame.len() <= SMALL {
-        bincode::decode_from_slice::<M, _>(body, FIXED.with_limit::<{ SMALL * MEMORY_PER_WIRE_BYTE }>())
+    let message: M = if length <= SMALL {
+        bincode::decode_from_std_read(&mut body, FIXED.with_limit::<{ SMALL * MEMORY_PER_WIRE_BYTE }>())
     } else {
-        bincode::decode_from_slice::<M, _>(body, FIXED.with_limit::<LARGE>())
+        bincode::decode_from_std_read(&mut body, FIXED.with_limit::<LARGE>())
     }
     .map_err(body_error)?;
-    if length < body.len() {
-        return Err(CodecError::Trailing(body.len() - length));
+    if body.limit() > 0 {
+        return Err(CodecError::Trailing(body.limit() as usize));
     }
     message.verify()?;
     Ok(message)
@@ -199,7 +215,9 @@ pub fn decode<M: Message>(frame: &[u8]) -> Result<M, CodecError> {
 fn body_error(error: DecodeError) -> CodecError {
     match error {
         // The limits are never below what the frame's own bytes can hold, so more was claimed than there is.
-        DecodeError::UnexpectedEnd { .. } | DecodeError::LimitExceeded => CodecError::Truncated,
+        DecodeError::UnexpectedEnd { .. } | DecodeError::Io { .. } | DecodeError::LimitExceeded => {
+            CodecError::Truncated
+        }
         DecodeError::OtherString(text) => CodecError::Malformed(text),
         other => CodecError::Malformed(other.to_string()),
     }

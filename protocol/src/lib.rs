@@ -23,7 +23,7 @@ mod progress;
 mod score;
 mod snapshot;
 
-pub use codec::{CodecError, Message, PROTOCOL_VERSION, decode, encode};
+pub use codec::{CodecError, Message, PROTOCOL_VERSION, decode, decode_from, encode};
 pub use hash::{Hash, InvalidHash};
 pub use job::{Job, JobReply, JobRequest};
 pub use name::{InvalidName, Name};

@@ -58,9 +58,9 @@ pub struct ServeArgs {
     /// Name in scores and metrics, unique among the evaluators of a run [default: HOST-PID-RANDOM]
     #[arg(long, value_parser = |text: &str| Name::new(text))]
     name: Option<Name>,
-    /// Arithmetic of the networks, f32 or bf16: the latter is up to twice as fast on CPUs with AVX512-BF16, and rounds
-    #[arg(long, value_name = "NAME", default_value = "f32")]
-    precision: Precision,
+    /// Arithmetic of the networks, f32 or bf16 [default: bf16 on CPUs that are faster with it, by AMX or AVX512-BF16]
+    #[arg(long, value_name = "NAME")]
+    precision: Option<Precision>,
 }
 
 /// What a process waits for its last thread and its farewells to the network when told to stop.
@@ -85,9 +85,10 @@ async fn serve_until_stopped(args: ServeArgs) -> anyhow::Result<()> {
     let metrics = Metrics::new().context("cannot register the metrics")?;
     let name = args.name.map_or_else(unique_name, Ok)?;
     info!(evaluator = %name, "ready to serve");
-    if !args.precision.is_available() {
+    if args.precision.is_some_and(|wanted| !wanted.is_available()) {
         warn!("this CPU has no AVX512-BF16: it computes in f32");
     }
+    let precision = args.precision.unwrap_or(Precision::Bf16);
     // Serves for as long as it is held.
     let _server = match args.metrics {
         Some(address) => {
@@ -100,7 +101,7 @@ async fn serve_until_stopped(args: ServeArgs) -> anyhow::Result<()> {
         None => None,
     };
     let mut discovery = Discovery::start(args.connect);
-    let worker = Worker::new(name, args.precision, metrics.clone(), discovery.runs());
+    let worker = Worker::new(name, precision, metrics.clone(), discovery.runs());
     let result = tokio::select! {
         biased;
         () = stop => Ok(()),

@@ -2,7 +2,7 @@
 
 use std::time::Duration;
 
-use quad_protocol::{CodecError, Message, decode};
+use quad_protocol::{CodecError, Message, decode_from};
 use tracing::warn;
 use zenoh::Session;
 
@@ -51,7 +51,7 @@ pub async fn ask<A: Message>(
     // The channel closes when everybody has answered, at once where nobody does.
     while let Ok(reply) = replies.recv_async().await {
         match reply.result() {
-            Ok(sample) => match decode(&sample.payload().to_bytes()) {
+            Ok(sample) => match decode_from(sample.payload().len(), sample.payload().reader()) {
                 Ok(answer) => return Ok(answer),
                 Err(error) => {
                     metrics.rejected(error.label());

@@ -4,7 +4,7 @@ use std::sync::{Arc, Mutex, PoisonError};
 
 use quad_dataset::environment;
 use quad_policy::{Architecture, PolicyError, Precision, TargetPolicy};
-use quad_protocol::{Job, Name, Schema, Snapshot, decode, keys};
+use quad_protocol::{Job, Name, Schema, Snapshot, decode_from, keys};
 use tokio::sync::Notify;
 use tokio::task::JoinSet;
 use tracing::{debug, warn};
@@ -124,7 +124,10 @@ impl NewestWeights {
         listener.spawn(async move {
             while let Ok(sample) = subscriber.recv_async().await {
                 // Hashing megabytes is work for a thread of its own, not for the runtime's.
-                let decoded = tokio::task::spawn_blocking(move || decode::<Snapshot>(&sample.payload().to_bytes()));
+                let decoded = tokio::task::spawn_blocking(move || {
+                    let payload = sample.payload();
+                    decode_from::<Snapshot>(payload.len(), payload.reader())
+                });
                 match decoded.await {
                     Ok(Ok(snapshot)) => {
                         metrics.snapshots_received.inc();
