@@ -9,20 +9,9 @@
 # needs no GPU, but the kernels are for one kind of them: CUDA_COMPUTE_CAP, by default 90, Hopper (H100, H200).
 set -euo pipefail
 cd "$(dirname "$0")/.."
+. deploy/common.sh
 
-DEPS=$PWD/.deps
 TOOLKIT=$DEPS/cuda
-LOG=$DEPS/cuda.log
-
-say() { echo "cuda: $*" >&2; }
-die() { printf 'cuda: %s\n' "$@" >&2; exit 1; }
-
-# Runs a command silently; where it fails, shows what it said, then the given hint.
-try() {
-  local hint=$1
-  shift
-  "$@" >"$LOG" 2>&1 || { tail -n 15 "$LOG" >&2; die "this failed: $*" "$hint"; }
-}
 
 fetch_toolkit() {
   # The copy is made last: where it equals what is wanted, all of it is in place.

@@ -8,21 +8,10 @@
 # Packages need root or sudo; everything else goes into .deps, which git ignores.
 set -euo pipefail
 cd "$(dirname "$0")/.."
+. deploy/common.sh
 
 MUJOCO=libmujoco.so.3.17.0
-DEPS=$PWD/.deps
-LOG=$DEPS/setup.log
-
-say() { echo "setup: $*" >&2; }
-die() { printf 'setup: %s\n' "$@" >&2; exit 1; }
 have() { command -v "$1" >/dev/null; }
-
-# Runs a command silently; where it fails, shows what it said, then the given hint.
-try() {
-  local hint=$1
-  shift
-  "$@" >"$LOG" 2>&1 || { tail -n 15 "$LOG" >&2; die "this failed: $*" "$hint"; }
-}
 
 as_root() {
   if [ "$(id -u)" -eq 0 ]; then "$@"; else sudo "$@"; fi

@@ -1,10 +1,11 @@
 """Memory, stalls, delays and start-up of a learner and four evaluators, as real processes on this machine.
 
-    service.py [--steps N] [--dataset FILE]     about five minutes with the default of 600 steps
+    service.py [--seconds S] [--pairs N] [--dataset FILE]     about four minutes, unless told otherwise
 
 Wants release builds of both, and two processor cores or more. The learner trains on one thread, and the evaluators are
 bound to all cores but the first, so that this thread always finds a core of its own: what is left is what they cost it
-through messages. The networks are of the paper's sizes, with one next action per state. Prints a table.
+through messages. The four come and go while it trains, so that spells with and without them lie side by side. The
+networks are of the paper's sizes, with one next action per state. Prints a table.
 """
 
 import argparse
@@ -24,6 +25,8 @@ BIN = Path("target/release")
 EVALUATORS = 4
 # A hundred times as often as the preset evaluates, so that a short run shows some snapshots.
 EVAL_INTERVAL = 200
+# Of a spell, before it counts: evaluators start, or leave.
+SETTLE = 3
 PRESET = ["--preset", "hopper-medium-replay-v2", "--samples", "1"]
 CORES = sorted(os.sched_getaffinity(0))
 
@@ -61,49 +64,60 @@ def metric(page, name):
     return float(re.search(rf"^{name}(?:{{[^}}]*}})? (\S+)$", page, re.MULTILINE)[1])
 
 
-def train(folder, dataset, steps, evaluators):
-    """One run on one thread; what was seen of it. Evaluations that are open when the last step is done are dropped."""
-    run = Path(folder) / f"run-{time.time_ns()}"
-    run.mkdir()
+class Learner:
+    """What a learner's /metrics says, and what its processes take."""
+
+    def __init__(self, pid, address):
+        self.pid, self.address = pid, address
+        self.memory, self.evaluator_memory = [], 0.0
+
+    def look(self):
+        """Now, gradient steps so far, and seconds spent in them."""
+        page = urlopen(f"http://{self.address}/metrics", timeout=5).read().decode()
+        sums = ("quad_learner_gradient_steps_total", "quad_learner_step_duration_seconds_sum")
+        return (time.time(), *(metric(page, name) for name in sums))
+
+    def spell(self, seconds, evaluators):
+        """Seconds per gradient step for a while, and the share of it that was outside the steps."""
+        time.sleep(SETTLE)
+        start, first, before = self.look()
+        while time.time() < start + seconds:
+            time.sleep(0.5)
+            self.memory.append(resident(self.pid))
+            self.evaluator_memory = max([self.evaluator_memory, *(resident(x.pid) for x in evaluators)])
+        end, last, after = self.look()
+        return (end - start) / (last - first), 1 - (after - before) / (end - start)
+
+
+def train(folder, dataset, seconds, pairs):
+    """A learner on one thread, spells without and with evaluators in turns; what was seen of it."""
+    run = Path(folder) / "run"
     command = [BIN / "learner", "train", *PRESET, "--dataset", dataset, "--run-dir", run]
-    command += ["--steps", str(steps), "--listen", "tcp/127.0.0.1:0"]
-    command += ["--eval-interval", str(EVAL_INTERVAL if evaluators else 0)]
-    logs = [f"{run}.evaluator{i}.log" for i in range(evaluators)]
-    seen = {"memory": [], "evaluator_memory": 0.0, "pages": []}
-    with contextlib.ExitStack() as stack:
-        learner = stack.enter_context(process(command, f"{run}.learner.log", CORES))
+    command += ["--steps", "1000000", "--listen", "tcp/127.0.0.1:0", "--eval-interval", str(EVAL_INTERVAL)]
+    seen = {"alone": [], "together": [], "outside": [], "delays": [], "begin": []}
+    with process(command, f"{run}.learner.log", CORES) as child:
         while not (run / "endpoints.json").exists():
-            if learner.poll() is not None:
+            if child.poll() is not None:
                 raise SystemExit(Path(f"{run}.learner.log").read_text())
             time.sleep(0.05)
         endpoints = json.loads((run / "endpoints.json").read_text())
-        zenoh, metrics = endpoints["zenoh"][0], endpoints["metrics"]
-        others = [
-            stack.enter_context(process([BIN / "evaluator", "serve", "--connect", zenoh], log, CORES[1:]))
-            for log in logs
-        ]
-        done = 0
-        while learner.poll() is None and done < steps:
-            time.sleep(0.5)
-            with contextlib.suppress(OSError, TypeError):
-                seen["memory"].append(resident(learner.pid))
-                seen["evaluator_memory"] = max([seen["evaluator_memory"], *(resident(x.pid) for x in others)])
-                page = urlopen(f"http://{metrics}/metrics", timeout=5).read().decode()
-                done = metric(page, "quad_learner_gradient_steps_total")
-                seen["pages"].append((time.time(), done, metric(page, "quad_learner_step_duration_seconds_sum")))
-    taken = stamps(f"{run}.learner.log", "snapshot")
-    seen["delays"], seen["begin"] = [], []
-    for log in logs:
-        arrived, begun = stamps(log, "weights arrived"), stamps(log, "evaluating")
-        seen["delays"] += [arrived[step] - taken[step] for step in arrived if step in taken]
-        seen["begin"] += [begun[step] - arrived[step] for step in begun if step in arrived]
-    return seen
-
-
-def pace(seen):
-    """Seconds per gradient step, and the share of time outside the steps, from the second to the last look."""
-    (start, first, before), (end, last, after) = seen["pages"][1], seen["pages"][-2]
-    return (end - start) / (last - first), 1 - (after - before) / (end - start)
+        learner = Learner(child.pid, endpoints["metrics"])
+        serve = [BIN / "evaluator", "serve", "--connect", endpoints["zenoh"][0]]
+        for pair in range(pairs):
+            seen["alone"].append(learner.spell(seconds, [])[0])
+            logs = [f"{run}.evaluator{pair}.{i}.log" for i in range(EVALUATORS)]
+            with contextlib.ExitStack() as stack:
+                evaluators = [stack.enter_context(process(serve, log, CORES[1:])) for log in logs]
+                pace, outside = learner.spell(seconds, evaluators)
+            seen["together"].append(pace)
+            seen["outside"].append(outside)
+            taken = stamps(f"{run}.learner.log", "snapshot")
+            for log in logs:
+                arrived, begun = stamps(log, "weights arrived"), stamps(log, "evaluating")
+                seen["delays"] += [arrived[step] - taken[step] for step in arrived if step in taken]
+                seen["begin"] += [begun[step] - arrived[step] for step in begun if step in arrived]
+        seen["steps"] = int(learner.look()[1])
+    return seen | {"memory": learner.memory, "evaluator_memory": learner.evaluator_memory}
 
 
 def start_up(folder, dataset):
@@ -120,41 +134,32 @@ def start_up(folder, dataset):
 
 def main():
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--steps", type=int, default=600, help="of each of the four runs")
+    parser.add_argument("--seconds", type=float, default=15.0, help="of each spell")
+    parser.add_argument("--pairs", type=int, default=6, help="of spells without and with evaluators")
     parser.add_argument("--dataset", type=Path, default=Path("data/hopper-demo.hdf5"))
     arguments = parser.parse_args()
     with tempfile.TemporaryDirectory() as folder:
         start = statistics.median(start_up(folder, arguments.dataset) for _ in range(5))
-        alone, together = [], []
-        for _ in range(2):
-            alone.append(train(folder, arguments.dataset, arguments.steps, 0))
-            together.append(train(folder, arguments.dataset, arguments.steps, EVALUATORS))
-    a, b = (statistics.mean(pace(seen)[0] for seen in runs) for runs in (alone, together))
-    outside = max(pace(seen)[1] for seen in together)
-    delays = sorted(x for seen in together for x in seen["delays"])
-    begin = sorted(x for seen in together for x in seen["begin"])
-    memory = together[-1]["memory"]
-    tenth = max(1, len(memory) // 10)
+        seen = train(folder, arguments.dataset, arguments.seconds, arguments.pairs)
+    alone, together = (1e3 * statistics.median(seen[which]) for which in ("alone", "together"))
+    cost = 100 * statistics.median(b / a - 1 for a, b in zip(seen["alone"], seen["together"], strict=True))
+    delays, begin, memory = sorted(seen["delays"]), sorted(seen["begin"]), seen["memory"]
+    outside, pairs = 100 * max(seen["outside"]), arguments.pairs
+    ms = lambda times: f"median {1e3 * statistics.median(times):.0f} ms, most {1e3 * times[-1]:.0f} ms"
     rows = [
         ("learner, start to end of a process that makes one step", f"{start:.2f} s"),
         (
-            "gradient step alone / with four evaluators",
-            f"{1e3 * a:.2f} / {1e3 * b:.2f} ms ({100 * (b / a - 1):+.1f} %)",
+            f"gradient step alone / with four evaluators, medians of {pairs} spells of each, and of the pairs' ratios",
+            f"{alone:.2f} / {together:.2f} ms ({cost:+.1f} %)",
         ),
-        ("training thread's time outside the steps, with four evaluators", f"{100 * outside:.2f} %"),
+        ("training thread's time outside the steps, with four evaluators, most of a spell", f"{outside:.2f} %"),
+        (f"snapshot taken → at an evaluator, {len(delays)} arrivals", ms(delays)),
+        (f"weights at an evaluator → its episodes begin, {len(begin)} times", ms(begin)),
         (
-            f"snapshot taken → at an evaluator, {len(delays)} arrivals",
-            f"median {1e3 * statistics.median(delays):.0f} ms, most {1e3 * delays[-1]:.0f} ms",
+            f"learner's memory, after a tenth / at the end of {seen['steps']} steps",
+            f"{memory[len(memory) // 10]:.0f} / {memory[-1]:.0f} MB",
         ),
-        (
-            f"weights at an evaluator → its episodes begin, {len(begin)} times",
-            f"median {1e3 * statistics.median(begin):.0f} ms, most {1e3 * begin[-1]:.0f} ms",
-        ),
-        (
-            f"learner's memory, after a tenth / at the end of {arguments.steps} steps",
-            f"{memory[tenth]:.0f} / {memory[-1]:.0f} MB",
-        ),
-        ("largest evaluator's memory", f"{max(seen['evaluator_memory'] for seen in together):.0f} MB"),
+        ("largest evaluator's memory", f"{seen['evaluator_memory']:.0f} MB"),
     ]
     print("| processes | |\n|---|---|")
     for name, value in rows:

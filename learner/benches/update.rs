@@ -46,7 +46,7 @@ fn config(hidden: usize, critics: usize, samples: usize, threshold: Option<f32>,
     }
 }
 
-/// The configurations that are measured, all but the precision; deploy/bench_table.py knows their shapes.
+/// The configurations that are measured, all but the precision; deploy/bench/bench.py knows their shapes.
 fn configurations(precision: Precision) -> [(&'static str, AgentConfig); 3] {
     [
         ("paper, 10 samples", config(256, 10, 10, Some(1.0), precision)),

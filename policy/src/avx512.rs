@@ -40,8 +40,15 @@ thread_local! {
     static BLOCK: RefCell<Vec<Line<f32>>> = RefCell::default();
 }
 
-/// Defines `panel`, `c = a·b` for all `m` rows and one block of columns, for elements of 32 bits: `$add(sum, x, b)` adds
-/// the products of one element, in all lanes, with a register of others.
+/// What is read after a block, two cache lines of it for each of the block's `k` rows.
+#[derive(Clone, Copy)]
+struct Ahead<T> {
+    first: *const T,
+    row: usize,
+}
+
+/// Defines `panel`, `c = a·b` for all `m` rows and one block of columns, `b` being `k × 32` and `c` part of a matrix, for
+/// elements of 32 bits: `$add(sum, x, b)` adds the products of one element, in all lanes, with a register of others.
 macro_rules! panel {
     ($features:literal, $element:ty, $broadcast:expr, $load:expr, $add:expr) => {
         #[inline]
@@ -50,7 +57,7 @@ macro_rules! panel {
             k: usize,
             a: Strided<$element>,
             b: *const $element,
-            b_row: usize,
+            ahead: Ahead<$element>,
             c: *mut f32,
             c_row: usize,
         ) {
@@ -58,11 +65,12 @@ macro_rules! panel {
             unsafe {
                 let mut sums = [[_mm512_setzero_ps(); 2]; R];
                 for p in 0..k {
-                    let b = b.add(p * b_row);
+                    let b = b.add(p * COLUMNS);
                     let (left, right) = ($load(b), $load(b.add(LANES)));
-                    // What the next block of columns reads; behind the last one it is an address that nobody reads.
-                    _mm_prefetch::<_MM_HINT_T0>(b.wrapping_add(COLUMNS).cast());
-                    _mm_prefetch::<_MM_HINT_T0>(b.wrapping_add(COLUMNS + LANES).cast());
+                    // Behind the last block it is an address that nobody reads.
+                    let soon = ahead.first.wrapping_add(p * ahead.row);
+                    _mm_prefetch::<_MM_HINT_T0>(soon.cast());
+                    _mm_prefetch::<_MM_HINT_T0>(soon.wrapping_add(LANES).cast());
                     for (i, sum) in sums.iter_mut().enumerate() {
                         let x = $broadcast(*a.first.add(i * a.row + p * a.column));
                         sum[0] = $add(sum[0], x, left);
@@ -82,7 +90,7 @@ macro_rules! panel {
             k: usize,
             a: Strided<$element>,
             b: *const $element,
-            b_row: usize,
+            ahead: Ahead<$element>,
             c: *mut f32,
             c_row: usize,
         ) {
@@ -94,18 +102,18 @@ macro_rules! panel {
                 unsafe {
                     let (a, c) = (Strided { first: a.first.add(from * a.row), ..a }, c.add(from * c_row));
                     match to - from {
-                        1 => block::<1>(k, a, b, b_row, c, c_row),
-                        2 => block::<2>(k, a, b, b_row, c, c_row),
-                        3 => block::<3>(k, a, b, b_row, c, c_row),
-                        4 => block::<4>(k, a, b, b_row, c, c_row),
-                        5 => block::<5>(k, a, b, b_row, c, c_row),
-                        6 => block::<6>(k, a, b, b_row, c, c_row),
-                        7 => block::<7>(k, a, b, b_row, c, c_row),
-                        8 => block::<8>(k, a, b, b_row, c, c_row),
-                        9 => block::<9>(k, a, b, b_row, c, c_row),
-                        10 => block::<10>(k, a, b, b_row, c, c_row),
-                        11 => block::<11>(k, a, b, b_row, c, c_row),
-                        _ => block::<ROWS>(k, a, b, b_row, c, c_row),
+                        1 => block::<1>(k, a, b, ahead, c, c_row),
+                        2 => block::<2>(k, a, b, ahead, c, c_row),
+                        3 => block::<3>(k, a, b, ahead, c, c_row),
+                        4 => block::<4>(k, a, b, ahead, c, c_row),
+                        5 => block::<5>(k, a, b, ahead, c, c_row),
+                        6 => block::<6>(k, a, b, ahead, c, c_row),
+                        7 => block::<7>(k, a, b, ahead, c, c_row),
+                        8 => block::<8>(k, a, b, ahead, c, c_row),
+                        9 => block::<9>(k, a, b, ahead, c, c_row),
+                        10 => block::<10>(k, a, b, ahead, c, c_row),
+                        11 => block::<11>(k, a, b, ahead, c, c_row),
+                        _ => block::<ROWS>(k, a, b, ahead, c, c_row),
                     }
                 }
             }
@@ -135,7 +143,7 @@ pub(crate) unsafe fn multiply(m: usize, n: usize, k: usize, a: Strided<f32>, b: 
                     _mm512_store_ps(block.add(p * COLUMNS + half), _mm512_loadu_ps(b.add(p * n + j + half)));
                 }
             }
-            panel(m, k, a, block, COLUMNS, c.add(j), n);
+            panel(m, k, a, block, Ahead { first: b.wrapping_add(j + COLUMNS), row: n }, c.add(j), n);
         }
     }
     BLOCK.set(block_of_b);
@@ -200,7 +208,7 @@ pub(crate) unsafe fn multiply_transposed(m: usize, k: usize, n: usize, a: *const
                     transpose(b.add((j + half) * n + p), n, block.add(p * COLUMNS + half), COLUMNS);
                 }
             }
-            panel(m, n, a, block, COLUMNS, c.add(j), k);
+            panel(m, n, a, block, Ahead { first: b.wrapping_add((j + COLUMNS) * n), row: COLUMNS }, c.add(j), k);
         }
     }
     BLOCK.set(block_of_b);

@@ -1,6 +1,6 @@
 //! The product with its operands rounded to bfloat16 and its sums in f32: twice as fast where the CPU has AVX512-BF16.
 
-use super::{COLUMNS, LANES, Line, ROWS, Strided, amx};
+use super::{Ahead, COLUMNS, LANES, Line, ROWS, Strided, amx};
 use std::arch::x86_64::{
     __m512bh, __m512i, _MM_HINT_T0, _mm_prefetch, _mm512_cvtne2ps_pbh, _mm512_dpbf16_ps, _mm512_loadu_ps,
     _mm512_loadu_si512, _mm512_permutexvar_epi16, _mm512_set1_epi32, _mm512_setzero_ps, _mm512_store_si512,
@@ -117,7 +117,9 @@ impl Kernel {
                 amx::multiply(m, n, pairs, a, b, c);
             } else {
                 for j in (0..n).step_by(COLUMNS) {
-                    panel(m, pairs, a, b.add(j * pairs), COLUMNS, c.add(j), n);
+                    let block = b.add(j * pairs);
+                    let ahead = Ahead { first: block.wrapping_add(pairs * COLUMNS), row: COLUMNS };
+                    panel(m, pairs, a, block, ahead, c.add(j), n);
                 }
             }
         }
