@@ -96,7 +96,7 @@ struct OverrideArgs {
     /// Actions that an evaluated policy samples per state; the critics choose the best
     #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(1..))]
     candidates: Option<u32>,
-    /// Arithmetic of what no gradient is taken of, f32 or bf16: the latter is faster on CPUs with AMX or AVX512-BF16, and rounds
+    /// Arithmetic of what no gradient is taken of, f32 or bf16: the latter is faster on CPUs with AMX or AMD's AVX512-BF16, and rounds
     #[arg(long, value_name = "NAME")]
     precision: Option<Precision>,
 }

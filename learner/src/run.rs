@@ -6,6 +6,7 @@ use std::time::{SystemTime, UNIX_EPOCH};
 
 use anyhow::{Context, anyhow};
 use quad_dataset::{EnvironmentSpec, ReadOptions, Transitions};
+use quad_policy::Precision;
 use quad_protocol::Name;
 use quad_service::{Endpoints, Hint};
 use tokio::sync::mpsc;
@@ -73,7 +74,7 @@ fn train(args: &TrainArgs) -> anyhow::Result<()> {
     info!("{count} transitions of {episodes} episodes, mean score {mean_score:.2}");
     info!("{}", config.experiment.summary());
     if !config.experiment.agent.precision.is_available() {
-        warn!("this CPU has no AVX512-BF16: it computes in f32");
+        warn!("{}", Precision::UNAVAILABLE);
     }
     debug!("{config:?}");
 

@@ -10,12 +10,16 @@ pub enum Precision {
     /// f32 throughout.
     #[default]
     F32,
-    /// Operands rounded to bfloat16 (8 bits of mantissa), sums in f32. Faster where the CPU has AVX512-BF16, several times
-    /// where it has AMX; a CPU without them computes in f32.
+    /// Operands rounded to bfloat16 (8 bits of mantissa), sums in f32. Faster on AMD's CPUs with AVX512-BF16, several times
+    /// on those with AMX; others compute in f32.
     Bf16,
 }
 
 impl Precision {
+    /// What to tell people whose CPU does not compute with what they asked for.
+    pub const UNAVAILABLE: &str =
+        "this CPU is no faster in bf16, which takes AMX or AMD's AVX512-BF16: it computes in f32";
+
     /// Whether this CPU computes with it, rather than with f32 in its place.
     pub fn is_available(self) -> bool {
         match self {

@@ -58,7 +58,7 @@ pub struct ServeArgs {
     /// Name in scores and metrics, unique among the evaluators of a run [default: HOST-PID-RANDOM]
     #[arg(long, value_parser = |text: &str| Name::new(text))]
     name: Option<Name>,
-    /// Arithmetic of the networks, f32 or bf16 [default: bf16 on CPUs that are faster with it, by AMX or AVX512-BF16]
+    /// Arithmetic of the networks, f32 or bf16 [default: bf16 on CPUs that are faster with it, by AMX or AMD's AVX512-BF16]
     #[arg(long, value_name = "NAME")]
     precision: Option<Precision>,
 }
@@ -86,7 +86,7 @@ async fn serve_until_stopped(args: ServeArgs) -> anyhow::Result<()> {
     let name = args.name.map_or_else(unique_name, Ok)?;
     info!(evaluator = %name, "ready to serve");
     if args.precision.is_some_and(|wanted| !wanted.is_available()) {
-        warn!("this CPU has no AVX512-BF16: it computes in f32");
+        warn!("{}", Precision::UNAVAILABLE);
     }
     let precision = args.precision.unwrap_or(Precision::Bf16);
     // Serves for as long as it is held.

@@ -1,4 +1,4 @@
-//! The product of rounded operands by AMX: whole tiles of 16 × 16 sums at a time, many times as fast as AVX512-BF16.
+//! The product of rounded operands by AMX: whole tiles of 16 × 16 sums at a time.
 
 use super::bf16::Pair;
 use super::{COLUMNS, Strided};
@@ -15,7 +15,7 @@ const ROWS: usize = 2 * TILE;
 pub(super) fn available() -> bool {
     static AVAILABLE: LazyLock<bool> = LazyLock::new(|| {
         const TILES_AND_BF16: u32 = 1 << 24 | 1 << 22;
-        super::bf16::available() && __cpuid_count(7, 0).edx & TILES_AND_BF16 == TILES_AND_BF16 && may_use_tiles()
+        super::bf16::has_registers() && __cpuid_count(7, 0).edx & TILES_AND_BF16 == TILES_AND_BF16 && may_use_tiles()
     });
     *AVAILABLE
 }
