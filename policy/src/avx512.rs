@@ -1,7 +1,8 @@
-//! A dense product for CPUs with AVX-512 that reads its operands where they lie.
+//! A dense product for CPUs with AVX-512 that copies little.
 //!
-//! The matrices of these networks fit into a core's own cache, so the copies into blocks that a general library makes
-//! first cost more than they gain (docs/performance.md): only the way back through a layer needs one, a transposition.
+//! The matrices of these networks fit into a core's own cache, so the copies of both sides that a general library makes
+//! first cost more than they gain (docs/performance.md): the left side is read where it lies, and of the right one a block
+//! of columns is copied or transposed at a time, to stay in the nearest cache.
 
 use std::arch::x86_64::{
     _MM_HINT_T0, _mm_prefetch, _mm512_castpd_ps, _mm512_castps_pd, _mm512_fmadd_ps, _mm512_loadu_ps, _mm512_set1_ps,
@@ -36,7 +37,7 @@ pub(crate) struct Strided<T> {
 }
 
 thread_local! {
-    /// Where [`multiply_transposed`] transposes to.
+    /// A block of columns of the right side.
     static BLOCK: RefCell<Vec<Line<f32>>> = RefCell::default();
 }
 

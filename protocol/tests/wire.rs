@@ -2,6 +2,7 @@
 #![allow(clippy::unwrap_used, clippy::expect_used)]
 
 use std::fmt::Debug;
+use std::io::Read;
 use std::time::{Duration, Instant};
 
 use proptest::collection::vec;
@@ -105,6 +106,9 @@ fn progress() -> impl Strategy<Value = Progress> {
 fn withstands_the_wire<M: Message + PartialEq + Debug>(message: &M) -> Result<(), TestCaseError> {
     let frame = encode(message).unwrap();
     prop_assert_eq!(&decode::<M>(&frame).unwrap(), message);
+    let (begin, end) = frame.split_at(frame.len() / 2);
+    prop_assert_eq!(&decode_from::<M>(frame.len(), begin.chain(end)).unwrap(), message, "in two pieces");
+    prop_assert_eq!(decode_from::<M>(frame.len(), begin), Err(CodecError::Truncated), "without the second piece");
 
     for length in 0..frame.len() {
         prop_assert_eq!(decode::<M>(&frame[..length]), Err(CodecError::Truncated), "cut to {} bytes", length);
