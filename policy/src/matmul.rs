@@ -6,6 +6,8 @@ use gemm::{Parallelism, gemm};
 
 #[cfg(target_arch = "x86_64")]
 use crate::avx512;
+#[cfg(target_arch = "x86_64")]
+pub(crate) use crate::avx512::bf16::Rounded;
 
 /// A row-major matrix or its transpose, as `gemm` wants it: first element, column stride, row stride.
 type Operand = (*const f32, isize, isize);
@@ -58,27 +60,18 @@ pub(crate) fn product(x: &[f32], w: &[f32], out: &mut [f32], k: usize, n: usize)
     multiply_row_major(m, n, k, out, (x.as_ptr(), 1, k as isize), w);
 }
 
-/// The right-hand side of a product rounded to bfloat16, for CPUs that multiply such numbers faster.
-pub(crate) struct Rounded(
-    #[cfg(target_arch = "x86_64")] avx512::bf16::Kernel,
-    #[cfg(not(target_arch = "x86_64"))] std::convert::Infallible,
-);
+/// There are none where no such CPU is.
+#[cfg(not(target_arch = "x86_64"))]
+pub(crate) enum Rounded {}
 
+#[cfg(not(target_arch = "x86_64"))]
 impl Rounded {
-    /// Rounds `w[k × n]`; `None` where it is multiplied faster as it is.
-    pub fn new(w: &[f32], k: usize, n: usize) -> Option<Self> {
-        #[cfg(target_arch = "x86_64")]
-        return avx512::bf16::Kernel::new(w, k, n).map(Self);
-        #[cfg(not(target_arch = "x86_64"))]
+    pub fn new(_: &[f32], _: usize, _: usize) -> Option<Self> {
         None
     }
 
-    /// `out[m × n] = x[m × k] · self`, `x` rounded too.
-    pub fn product(&self, x: &[f32], out: &mut [f32]) {
-        #[cfg(target_arch = "x86_64")]
-        self.0.multiply(x, out);
-        #[cfg(not(target_arch = "x86_64"))]
-        match self.0 {}
+    pub fn product(&self, _: &[f32], _: &mut [f32]) {
+        match *self {}
     }
 }
 

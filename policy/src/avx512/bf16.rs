@@ -59,17 +59,17 @@ thread_local! {
     static ROUNDED: RefCell<Vec<Line<Pair>>> = RefCell::default();
 }
 
-/// The right-hand side of products, `k × n`, rounded: block after block of columns, and in each the pairs of `k` as rows.
-pub(crate) struct Kernel {
+/// The right-hand side of products, `k × n`, rounded to bfloat16: block after block of columns, and in each the pairs of `k` as rows.
+pub(crate) struct Rounded {
     blocks: Vec<Line<Pair>>,
     k: usize,
     n: usize,
 }
 
-impl Kernel {
+impl Rounded {
     /// Rounds a row-major matrix; `None` where this CPU cannot multiply with it, or it is not made of whole registers.
     pub fn new(matrix: &[f32], k: usize, n: usize) -> Option<Self> {
-        assert_eq!(matrix.len(), k * n, "a kernel's shape");
+        assert_eq!(matrix.len(), k * n, "the matrix's shape");
         let whole = k.is_multiple_of(COLUMNS) && n.is_multiple_of(COLUMNS);
         // SAFETY: what it asks for holds.
         (whole && available()).then(|| unsafe { Self::round(matrix, k, n) })
@@ -98,11 +98,11 @@ impl Kernel {
         Self { blocks, k, n }
     }
 
-    /// `c[m × n] = a[m × k] · self`, row-major, by AMX where the CPU has it.
-    pub fn multiply(&self, a: &[f32], c: &mut [f32]) {
+    /// `c[m × n] = a[m × k] · self`, `a` rounded too; row-major, by AMX where the CPU has it.
+    pub fn product(&self, a: &[f32], c: &mut [f32]) {
         let m = a.len() / self.k;
         assert!(a.len() == m * self.k && c.len() == m * self.n, "the product's shape");
-        // SAFETY: a kernel is only made where the CPU can; the shapes were checked here and there.
+        // SAFETY: one is only made where the CPU can; the shapes were checked here and there.
         unsafe { self.multiply_by(amx::available(), m, a.as_ptr(), c.as_mut_ptr()) };
     }
 
@@ -151,11 +151,11 @@ mod tests {
         let mut numbers = |len: usize| (0..len).map(|_| generator.random_range(-1.0..1.0)).collect::<Vec<f32>>();
         for (m, k, n) in [(1, 32, 32), (2, 64, 96), (16, 32, 32), (17, 32, 64), (33, 96, 32), (100, 256, 64)] {
             let (a, b) = (numbers(m * k), numbers(k * n));
-            let kernel = Kernel::new(&b, k, n).unwrap();
+            let right = Rounded::new(&b, k, n).unwrap();
             let by = |tiles| {
                 let mut c = vec![f32::NAN; m * n];
                 // SAFETY: AMX was found; a and c have m rows.
-                unsafe { kernel.multiply_by(tiles, m, a.as_ptr(), c.as_mut_ptr()) };
+                unsafe { right.multiply_by(tiles, m, a.as_ptr(), c.as_mut_ptr()) };
                 c
             };
             for (i, (x, y)) in by(true).into_iter().zip(by(false)).enumerate() {
