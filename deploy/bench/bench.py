@@ -98,10 +98,10 @@ class Peer:
         return json.loads(answer)
 
 
-def moment(bench, names):
-    """What a bench measures within some seconds, beside the machine's peaks within the same seconds."""
-    seconds = criterion("update", f"^(peak/{'' if bench == 'rollout' else '|' + names})")
-    if bench == "rollout":
+def moment(jax, *benches):
+    """What JAX took just now, and what benches (of which the first measures the machine's peaks) take now."""
+    seconds = {}
+    for bench, names in benches:
         seconds |= criterion(bench, names)
     threads = len(os.sched_getaffinity(0))
     elements = threads * PEAK_CALLS * PEAK_ROWS * PEAK_WIDTH
@@ -110,7 +110,7 @@ def moment(bench, names):
         "mish": elements / seconds["peak/mish"],
         "slope": elements / seconds["peak/mish and slope"],
     }
-    return {"seconds": seconds, "peak": peak, "threads": threads}
+    return {"jax": jax, "seconds": seconds, "peak": peak, "threads": threads}
 
 
 def measure(count):
@@ -122,9 +122,8 @@ def measure(count):
         print(f"bench: round {i + 1} of {count}", file=sys.stderr)
         for name in CONFIGURATIONS:
             jax = {"plain": plain.measure(name), "tuned": tuned.measure(name)}
-            rounds[name].append(moment("update", f"update(, bf16)?/{name}$|{name}/") | {"jax": jax})
-        jax = rollout.measure()
-        rounds["rollout"].append(moment("rollout", "") | {"jax": jax})
+            rounds[name].append(moment(jax, ("update", f"^(peak/|update(, bf16)?/{name}$|{name}/)")))
+        rounds["rollout"].append(moment(rollout.measure(), ("update", "^peak/"), ("rollout", "")))
     return rounds
 
 
