@@ -135,7 +135,8 @@ impl Network {
             }
             bias_mish(out, self.mlp.bias(parameters, layer));
         };
-        let states = (if rounded.is_some() { BLOCK } else { TILE } / input.repeat).max(1);
+        let block = if rounded.is_some() { BLOCK } else { TILE };
+        let states = (block / input.repeat).max(1);
         let rows = states * input.repeat;
         let blocks = input.base.chunks(states * h).zip(input.actions.chunks(rows * a));
         for ((base, actions), out) in blocks.zip(out.chunks_mut(rows * outputs)) {

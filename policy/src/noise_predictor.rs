@@ -112,8 +112,8 @@ impl NoisePredictor {
 
     /// Draws actions by the whole reverse process (DDPM), x_0 clipped to [-1, 1] at each step.
     ///
-    /// `rounded` is of the same parameters, `noise` is `T × rows × action_dim`, standard normal, rows being states × `repeat`: first a^T, then the noise of
-    /// the reverse steps from t = T down to 2. `actions` is `rows × action_dim`.
+    /// `rounded` is of the same parameters, `noise` is `T × rows × action_dim`, standard normal, rows being states ×
+    /// `repeat`: first a^T, then the noise of the reverse steps from t = T down to 2. `actions` is `rows × action_dim`.
     pub fn sample(
         &self,
         parameters: &[f32],

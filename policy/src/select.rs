@@ -32,7 +32,8 @@ pub struct TargetPolicy {
     actor: NoisePredictor,
     critics: CriticEnsemble,
     parameters: Parameters,
-    rounded: (RoundedActor, RoundedCritics),
+    rounded_actor: RoundedActor,
+    rounded_critics: RoundedCritics,
 }
 
 /// Candidates of a batch of states and what the critics say of them.
@@ -50,8 +51,9 @@ impl TargetPolicy {
     pub fn new(parameters: Parameters, precision: Precision) -> Self {
         let architecture = *parameters.architecture();
         let (actor, critics) = (NoisePredictor::new(&architecture), CriticEnsemble::new(&architecture));
-        let rounded = (actor.round(&parameters.actor, precision), critics.round(&parameters.critics, precision));
-        Self { actor, critics, parameters, rounded }
+        let rounded_actor = actor.round(&parameters.actor, precision);
+        let rounded_critics = critics.round(&parameters.critics, precision);
+        Self { actor, critics, parameters, rounded_actor, rounded_critics }
     }
 
     /// Reads a snapshot's tensors: exactly those of the architecture, all finite.
@@ -82,7 +84,7 @@ impl TargetPolicy {
             }
         }
         if candidates == 1 {
-            return self.actor.sample(&self.parameters.actor, &self.rounded.0, observations, 1, &draws, actions);
+            return self.actor.sample(&self.parameters.actor, &self.rounded_actor, observations, 1, &draws, actions);
         }
         let selection = self.select_with(observations, candidates, &draws);
         for (i, (action, chosen)) in actions.chunks_exact_mut(a).zip(&selection.chosen).enumerate() {
@@ -94,11 +96,11 @@ impl TargetPolicy {
     pub fn select_with(&self, observations: &[f32], candidates: usize, noise: &[f32]) -> Selection {
         let rows = observations.len() / self.architecture().observation_dim * candidates;
         let mut actions = vec![0.0; rows * self.architecture().action_dim];
-        self.actor.sample(&self.parameters.actor, &self.rounded.0, observations, candidates, noise, &mut actions);
+        self.actor.sample(&self.parameters.actor, &self.rounded_actor, observations, candidates, noise, &mut actions);
         let critics = self.architecture().critics;
         let mut each = vec![0.0; critics * rows];
         let input = StateActions { observations, actions: &actions, repeat: candidates };
-        self.critics.values(&self.parameters.critics, &self.rounded.1, input, &mut each);
+        self.critics.values(&self.parameters.critics, &self.rounded_critics, input, &mut each);
         let mut values = vec![0.0; rows];
         for critic in each.chunks_exact(rows) {
             values.iter_mut().zip(critic).for_each(|(sum, q)| *sum += q / critics as f32);

@@ -82,7 +82,7 @@ impl Rounded {
         // Lane i of the lower half beside lane i of the upper one.
         let interleave: [u16; 2 * LANES] = std::array::from_fn(|i| (i / 2 + i % 2 * LANES) as u16);
         let mut blocks = Vec::with_capacity(k / 2 * n / LANES);
-        for j in (0..n).step_by(LANES * 2) {
+        for j in (0..n).step_by(COLUMNS) {
             for i in 0..k {
                 // SAFETY: of the pairs' rows 2·(i/2) and the next, the left or right half of the block's columns.
                 blocks.push(unsafe {
