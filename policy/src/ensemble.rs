@@ -1,181 +1,337 @@
-//! The critic ensemble Q_1..Q_K: values, regression towards targets, gradients at actions.
+//! K networks of one shape side by side: critics Q_1..Q_K over [s, a], a value function or a policy's mean over s.
 //!
-//! Work is cut into (critic, tile of rows) and runs in parallel; the cut does not depend on the number of threads, so
-//! neither do the results.
+//! On the CPU a custom operation of candle's does the work. It is cut into (member, tile of rows) and runs in parallel; the
+//! cut does not depend on the number of threads, so neither do the results.
 
-use crate::matmul::Rounded;
-use crate::mlp::Mlp;
-use crate::network::{Input, Network, TILE, concatenate, with_workspace};
-use crate::{Architecture, Precision};
+use crate::layers::Layers;
+use crate::network::{Input, Network, TILE, part, with_workspace};
+use crate::plain;
+use crate::record::{Lent, Records, concatenate};
+use crate::rounded::RoundedOnce;
+use crate::slices::{read, slice};
+use crate::weights::{KeptGradient, Layout, Weights};
+use crate::Precision;
+use candle_core::{CpuStorage, CustomOp3, Result, Shape, Tensor, bail};
+use quad_kernels::product::Rounded;
 use rayon::prelude::*;
+use std::sync::{Arc, PoisonError};
 
-/// Shapes of an ensemble; its parameters are a flat slice, critic after critic.
-#[derive(Clone, Debug)]
-pub struct CriticEnsemble {
-    network: Network,
-    critics: usize,
+/// The shape of an ensemble.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct EnsembleShape {
+    /// Networks, K.
+    pub members: usize,
+    /// Numbers in an observation s.
+    pub observation_dim: usize,
+    /// Numbers in an action a; 0 for networks of s alone.
+    pub action_dim: usize,
+    /// Width of the three hidden layers.
+    pub hidden: usize,
+    /// Numbers that come out.
+    pub outputs: usize,
 }
 
-/// A batch of states, each with `repeat` actions.
-#[derive(Clone, Copy, Debug)]
-pub struct StateActions<'a> {
-    /// `states × observation_dim`.
-    pub observations: &'a [f32],
-    /// `states × repeat × action_dim`.
-    pub actions: &'a [f32],
-    /// Actions per state.
-    pub repeat: usize,
+impl EnsembleShape {
+    fn layers(&self) -> Layers {
+        let Self { observation_dim, action_dim, hidden, .. } = *self;
+        Layers::new(self.members, &[observation_dim + action_dim, hidden, hidden, hidden, self.outputs], 0)
+    }
+
+    /// Tensors `{0..3}.kernel` `[K, in, out]` and `{0..3}.bias` `[K, out]`.
+    pub fn layout(&self) -> Layout {
+        Layout::new(self.layers().named("", true))
+    }
 }
 
-/// An ensemble's hidden kernels as a [`Precision`] wants them, critic after critic; none in f32.
-pub struct RoundedCritics(Vec<[Rounded; 2]>);
+/// An ensemble and its weights.
+pub struct Ensemble {
+    shape: EnsembleShape,
+    layers: Arc<Layers>,
+    weights: Weights,
+    precision: Precision,
+    rounded: RoundedOnce<Vec<[Rounded; 2]>>,
+    records: Records,
+}
 
-impl CriticEnsemble {
-    /// The ensemble of an architecture.
-    pub fn new(architecture: &Architecture) -> Self {
-        let network = Network {
-            mlp: Mlp::new(&architecture.critic_widths()),
-            observation_dim: architecture.observation_dim,
-            action_dim: architecture.action_dim,
-            hidden: architecture.hidden,
+impl Ensemble {
+    /// `weights` are of the shape's layout; `precision` is for what no gradient is taken of.
+    pub fn new(shape: EnsembleShape, weights: Weights, precision: Precision) -> Self {
+        let layers = Arc::new(shape.layers());
+        Self { shape, layers, weights, precision, rounded: RoundedOnce::default(), records: Records::default() }
+    }
+
+    /// Its weights.
+    pub fn weights(&self) -> &Weights {
+        &self.weights
+    }
+
+    /// Its weights, to be changed.
+    pub fn weights_mut(&mut self) -> &mut Weights {
+        &mut self.weights
+    }
+
+    /// What comes out, `[K, rows, outputs]`, a row for each action.
+    ///
+    /// `observations` is `[n, o]`; `actions` `[rows, a]`, where equally many consecutive rows share an observation, or
+    /// `[K, n, a]` with actions for each member. Gradients flow to the weights, or to the actions.
+    pub fn outputs(&self, observations: &Tensor, actions: &Tensor) -> Result<Tensor> {
+        let weights = self.weights.values();
+        let gradients = (weights.track_op(), actions.track_op());
+        if !weights.device().is_cpu() || observations.track_op() || gradients == (true, true) {
+            return self.plain_outputs(observations, actions);
+        }
+        let own_actions = actions.rank() == 3;
+        let gradient = match gradients {
+            (false, false) => Gradient::None,
+            (false, true) if self.shape.outputs == 1 => Gradient::Actions(Unit::default()),
+            (true, false) if !own_actions && observations.dim(0)? == actions.dim(0)? => {
+                let Some(kept) = self.weights.kept_gradient() else { bail!("these weights are constants") };
+                Gradient::Weights(kept, self.records.lend())
+            }
+            _ => return self.plain_outputs(observations, actions),
         };
-        Self { network, critics: architecture.critics }
+        let rounds = self.precision == Precision::Bf16 && matches!(gradient, Gradient::None);
+        let rounded = if rounds { Some(self.rounded()?) } else { None };
+        let (shape, layers) = (self.shape, self.layers.clone());
+        let operation = Outputs { shape, layers, own_actions, rounded, gradient };
+        weights.apply_op3(&observations.contiguous()?, &actions.contiguous()?, operation)
     }
 
-    /// Parameters of one critic.
-    pub fn parameters_per_critic(&self) -> usize {
-        self.network.mlp.len()
+    /// Q_k(s, a), `[K, rows]`, of networks with one output; the arguments are those of [`Self::outputs`].
+    pub fn values(&self, observations: &Tensor, actions: &Tensor) -> Result<Tensor> {
+        self.outputs(observations, actions)?.squeeze(2)
     }
 
-    /// Parameters of all.
-    pub fn parameters(&self) -> usize {
-        self.critics * self.network.mlp.len()
+    /// The same of networks of s alone: `[K, n]`.
+    pub fn state_values(&self, observations: &Tensor) -> Result<Tensor> {
+        self.state_outputs(observations)?.squeeze(2)
     }
 
-    fn critic<'a>(&self, parameters: &'a [f32], k: usize) -> &'a [f32] {
-        let len = self.network.mlp.len();
-        &parameters[k * len..][..len]
+    /// What comes out of networks of s alone: `[K, n, outputs]`.
+    pub fn state_outputs(&self, observations: &Tensor) -> Result<Tensor> {
+        let none = Tensor::zeros((observations.dim(0)?, 0), observations.dtype(), observations.device())?;
+        self.outputs(observations, &none)
     }
 
-    /// Prepares parameters for [`Self::values`].
-    pub fn round(&self, parameters: &[f32], precision: Precision) -> RoundedCritics {
-        let round = |k| self.network.round(self.critic(parameters, k));
-        let critics = if precision == Precision::Bf16 { self.critics } else { 0 };
-        RoundedCritics((0..critics).into_par_iter().filter_map(round).collect())
+    fn rounded(&self) -> Result<Arc<Vec<[Rounded; 2]>>> {
+        self.rounded.get(&self.weights, |weights| {
+            let round = |k| Network::new(weights, &self.layers, k, self.shape.dims()).round();
+            (0..self.shape.members).into_par_iter().filter_map(round).collect()
+        })
     }
 
-    /// `out[K × rows] = Q_k(s, a)`, a row for each action. `rounded` is of the same parameters.
-    pub fn values(&self, parameters: &[f32], rounded: &RoundedCritics, input: StateActions<'_>, out: &mut [f32]) {
-        let network = &self.network;
-        let rows = input.actions.len() / network.action_dim;
-        let states = (TILE / input.repeat).max(1);
-        let tile = states * input.repeat;
-        out.par_chunks_mut(rows).enumerate().for_each(|(k, out)| {
-            let parameters = self.critic(parameters, k);
-            let (shift, rounded) = (network.mlp.bias(parameters, 0), rounded.0.get(k));
-            out.par_chunks_mut(tile).enumerate().for_each(|(i, out)| {
-                let observations = part(input.observations, i * states, states, network.observation_dim);
-                let actions = part(input.actions, i * tile, tile, network.action_dim);
+    /// [`Self::outputs`] in plain candle operations.
+    pub(crate) fn plain_outputs(&self, observations: &Tensor, actions: &Tensor) -> Result<Tensor> {
+        let EnsembleShape { members, action_dim, .. } = self.shape;
+        let weights = self.weights.layout().split(self.weights.values(), "")?;
+        let input = match (action_dim, actions.rank()) {
+            (0, _) => observations.unsqueeze(0)?,
+            (_, 3) => Tensor::cat(&[&observations.broadcast_left(members)?, actions], 2)?,
+            _ => {
+                let repeat = actions.dim(0)? / observations.dim(0)?;
+                Tensor::cat(&[&plain::repeat_rows(observations, repeat)?, actions], 1)?.unsqueeze(0)?
+            }
+        };
+        plain::mlp(&weights, "", 4, &input)
+    }
+}
+
+impl EnsembleShape {
+    fn dims(&self) -> (usize, usize) {
+        (self.observation_dim, self.action_dim)
+    }
+}
+
+/// What a gradient will be asked for of.
+enum Gradient {
+    None,
+    /// Of the actions: as the output is one number and rows do not depend on one another, its gradient is worked out on
+    /// the way forward, while a tile's activations are at hand, and scaled on the way back.
+    Actions(Unit),
+    /// Of the weights: activations are kept for the way back, which leaves the gradient with the weights.
+    Weights(Arc<KeptGradient>, Lent),
+}
+
+/// ∂Q_k/∂a, `K × rows × a`.
+#[derive(Default)]
+struct Unit(std::sync::OnceLock<Vec<f32>>);
+
+/// The custom operation of (weights, observations, actions).
+struct Outputs {
+    shape: EnsembleShape,
+    layers: Arc<Layers>,
+    own_actions: bool,
+    rounded: Option<Arc<Vec<[Rounded; 2]>>>,
+    gradient: Gradient,
+}
+
+impl Outputs {
+    fn network<'a>(&'a self, weights: &'a [f32], k: usize) -> Network<'a> {
+        let rounded = self.rounded.as_ref().and_then(|rounded| rounded.get(k));
+        Network::new(weights, &self.layers, k, self.shape.dims()).with_rounded(rounded)
+    }
+
+    /// The actions that member k is asked about.
+    fn actions_of<'a>(&self, actions: &'a [f32], k: usize, rows: usize) -> &'a [f32] {
+        let len = rows * self.shape.action_dim;
+        if self.own_actions { &actions[k * len..][..len] } else { actions }
+    }
+
+    fn forward(&self, weights: &[f32], observations: &[f32], actions: &[f32], repeat: usize, out: &mut [f32]) {
+        let EnsembleShape { members, observation_dim, action_dim, hidden, outputs } = self.shape;
+        let rows = out.len() / (members * outputs);
+        let states = (TILE / repeat).max(1);
+        let tile = states * repeat;
+        out.par_chunks_mut(rows * outputs).enumerate().for_each(|(k, out)| {
+            let (network, actions) = (self.network(weights, k), self.actions_of(actions, k, rows));
+            out.par_chunks_mut(tile * outputs).enumerate().for_each(|(i, out)| {
+                let observations = part(observations, i * states, states, observation_dim);
+                let actions = part(actions, i * tile, tile, action_dim);
                 with_workspace(|work| {
-                    let mut base = std::mem::take(&mut work.base);
-                    let len = observations.len() / network.observation_dim * network.hidden;
-                    network.state_part(parameters, observations, base.sized(len));
-                    let input = Input { base: base.first(len), repeat: input.repeat, shift, actions };
-                    network.forward(parameters, rounded, input, work, out);
-                    work.base = base;
+                    let len = observations.len() / observation_dim * hidden;
+                    work.with_base(len, 0, |base, _, work| {
+                        network.state_part(observations, base);
+                        network.forward(Input { base, repeat, shift: network.bias(0), actions }, work, out);
+                    });
                 });
             });
         });
     }
 
-    /// One pass of Σ_k Σ_rows (Q_k(s, a) - y)² · `scale`: returns the sum and writes the gradient.
-    ///
-    /// `gradient` holds the critics' flat gradients once per tile of 128 rows (see [`Self::gradient_tiles`]); the
-    /// gradient is their sum.
-    pub fn regress(
+    /// Also `unit[K × rows × a] = ∇_a Q_k(s, a)`.
+    fn forward_with_slopes(
         &self,
-        parameters: &[f32],
+        weights: &[f32],
         observations: &[f32],
         actions: &[f32],
-        targets: &[f32],
-        scale: f32,
-        gradient: &mut [f32],
-    ) -> f32 {
-        let network = &self.network;
-        let dims = (network.observation_dim, network.action_dim);
-        gradient
-            .par_chunks_mut(network.mlp.len())
-            .enumerate()
-            .map(|(task, gradient)| {
-                let (i, k) = (task / self.critics, task % self.critics);
-                let parameters = self.critic(parameters, k);
-                let observations = part(observations, i * TILE, TILE, dims.0);
-                let actions = part(actions, i * TILE, TILE, dims.1);
-                let targets = part(targets, i * TILE, TILE, 1);
+        repeat: usize,
+        out: &mut [f32],
+        unit: &mut [f32],
+    ) {
+        let EnsembleShape { members, observation_dim, action_dim, hidden, .. } = self.shape;
+        let rows = out.len() / members;
+        let states = (TILE / repeat).max(1);
+        let tile = states * repeat;
+        let both = out.par_chunks_mut(rows).zip(unit.par_chunks_mut(rows * action_dim));
+        both.enumerate().for_each(|(k, (out, unit))| {
+            let (network, actions) = (self.network(weights, k), self.actions_of(actions, k, rows));
+            let tiles = out.par_chunks_mut(tile).zip(unit.par_chunks_mut(tile * action_dim));
+            tiles.enumerate().for_each(|(i, (out, unit))| {
+                let observations = part(observations, i * states, states, observation_dim);
+                let actions = part(actions, i * tile, tile, action_dim);
                 with_workspace(|work| {
-                    let (mut base, mut input, mut out) = (
-                        std::mem::take(&mut work.base),
-                        std::mem::take(&mut work.input),
-                        std::mem::take(&mut work.out),
-                    );
-                    let len = targets.len() * network.hidden;
-                    network.state_part(parameters, observations, base.sized(len));
-                    let shift = network.mlp.bias(parameters, 0);
-                    let tile = Input { base: base.first(len), repeat: 1, shift, actions };
-                    let values = out.sized(targets.len());
-                    network.forward_recorded(parameters, tile, work, values);
-                    let mut loss = 0.0;
-                    for (q, y) in values.iter_mut().zip(targets) {
-                        let error = *q - y;
-                        loss += scale * error * error;
-                        *q = 2.0 * scale * error;
-                    }
-                    network.backward(parameters, values, work);
-                    concatenate(observations, actions, dims, &mut input);
-                    network.parameter_gradient(&input, values, work, gradient);
-                    (work.base, work.input, work.out) = (base, input, out);
-                    loss
-                })
-            })
-            .collect::<Vec<f32>>()
-            .iter()
-            .sum()
-    }
-
-    /// Copies of the gradient that [`Self::regress`] writes for a batch.
-    pub fn gradient_tiles(&self, batch: usize) -> usize {
-        batch.div_ceil(TILE)
-    }
-
-    /// `gradients[K × rows × action_dim] = ∇_a Q_k(s, a)`.
-    pub fn action_gradients(&self, parameters: &[f32], observations: &[f32], actions: &[f32], gradients: &mut [f32]) {
-        let network = &self.network;
-        let (o, a) = (network.observation_dim, network.action_dim);
-        gradients.par_chunks_mut(actions.len()).enumerate().for_each(|(k, gradients)| {
-            let parameters = self.critic(parameters, k);
-            let shift = network.mlp.bias(parameters, 0);
-            gradients.par_chunks_mut(TILE * a).enumerate().for_each(|(i, gradients)| {
-                let rows = gradients.len() / a;
-                let observations = part(observations, i * TILE, TILE, o);
-                let actions = part(actions, i * TILE, TILE, a);
-                with_workspace(|work| {
-                    let (mut base, mut out) = (std::mem::take(&mut work.base), std::mem::take(&mut work.out));
-                    network.state_part(parameters, observations, base.sized(rows * network.hidden));
-                    let input = Input { base: base.first(rows * network.hidden), repeat: 1, shift, actions };
-                    let ones = out.sized(rows);
-                    network.forward_recorded(parameters, input, work, ones);
-                    ones.fill(1.0);
-                    network.backward(parameters, ones, work);
-                    network.action_gradient(parameters, work, gradients);
-                    (work.base, work.out) = (base, out);
+                    let len = observations.len() / observation_dim * hidden;
+                    work.with_base(len, out.len(), |base, ones, work| {
+                        network.state_part(observations, base);
+                        let input = Input { base, repeat, shift: network.bias(0), actions };
+                        let (mut left, scratch) = work.activations(out.len() * hidden);
+                        network.forward_recorded(input, &mut left, scratch, out);
+                        ones.fill(1.0);
+                        let (mut left, scratch) = work.activations(out.len() * hidden);
+                        network.backward(ones, &mut left.slope, scratch);
+                        network.action_gradient(left.slope[0], unit);
+                    });
                 });
             });
         });
     }
+
+    fn forward_recorded(&self, weights: &[f32], observations: &[f32], actions: &[f32], lent: &Lent, out: &mut [f32]) {
+        let EnsembleShape { members, observation_dim, action_dim, hidden, outputs } = self.shape;
+        let mut record = lent.record.lock().unwrap_or_else(PoisonError::into_inner);
+        record.resize(members, out.len() / (members * outputs), hidden);
+        record.tiles(out).into_par_iter().for_each(|mut tile| {
+            let network = self.network(weights, tile.member);
+            let observations = part(observations, tile.index * TILE, TILE, observation_dim);
+            let actions = part(actions, tile.index * TILE, TILE, action_dim);
+            with_workspace(|work| {
+                work.with_base(observations.len() / observation_dim * hidden, 0, |base, _, work| {
+                    network.state_part(observations, base);
+                    let input = Input { base, repeat: 1, shift: network.bias(0), actions };
+                    network.forward_recorded(input, &mut tile.activations, work.scratch(), tile.out);
+                });
+            });
+        });
+    }
+
+    fn weight_gradient(&self, weights: &[f32], input: &[f32], output_gradient: &[f32], lent: &Lent, gradient: &mut [f32]) {
+        let mut record = lent.record.lock().unwrap_or_else(PoisonError::into_inner);
+        let mut of_tiles = output_gradient.to_vec();
+        record.tiles(&mut of_tiles).into_par_iter().for_each(|mut tile| {
+            let network = self.network(weights, tile.member);
+            with_workspace(|work| network.backward(tile.out, &mut tile.activations.slope, work.scratch()));
+        });
+        record.weight_gradients(self.layers.split_mut(gradient), input, output_gradient);
+    }
 }
 
-/// Rows `from .. from + count` (or fewer, at the end) of a matrix with `width` columns.
-pub(crate) fn part(matrix: &[f32], from: usize, count: usize, width: usize) -> &[f32] {
-    let end = ((from + count) * width).min(matrix.len());
-    &matrix[from * width..end]
+impl CustomOp3 for Outputs {
+    fn name(&self) -> &'static str {
+        "ensemble"
+    }
+
+    fn cpu_fwd(
+        &self,
+        weights: &CpuStorage,
+        weights_layout: &candle_core::Layout,
+        observations: &CpuStorage,
+        observations_layout: &candle_core::Layout,
+        actions: &CpuStorage,
+        actions_layout: &candle_core::Layout,
+    ) -> Result<(CpuStorage, Shape)> {
+        let EnsembleShape { members, observation_dim, action_dim, outputs, .. } = self.shape;
+        let (states, o) = observations_layout.shape().dims2()?;
+        let rows = actions_layout.dims()[actions_layout.dims().len() - 2];
+        let wanted = if self.own_actions { vec![members, rows, action_dim] } else { vec![rows, action_dim] };
+        if o != observation_dim || actions_layout.dims() != wanted || states == 0 || rows % states != 0 || rows == 0 {
+            bail!(
+                "an ensemble for {observation_dim} and {action_dim} numbers got observations {:?} and actions {:?}",
+                observations_layout.dims(),
+                actions_layout.dims()
+            );
+        }
+        let weights = slice(weights, weights_layout)?;
+        let (observations, actions) = (slice(observations, observations_layout)?, slice(actions, actions_layout)?);
+        let mut out = vec![0.0; members * rows * outputs];
+        let repeat = rows / states;
+        match &self.gradient {
+            Gradient::None => self.forward(weights, observations, actions, repeat, &mut out),
+            Gradient::Actions(unit) => {
+                let mut slopes = vec![0.0; members * rows * action_dim];
+                self.forward_with_slopes(weights, observations, actions, repeat, &mut out, &mut slopes);
+                unit.0.set(slopes).ok();
+            }
+            Gradient::Weights(_, lent) => self.forward_recorded(weights, observations, actions, lent, &mut out),
+        }
+        Ok((CpuStorage::F32(out), (members, rows, outputs).into()))
+    }
+
+    fn bwd(
+        &self,
+        weights: &Tensor,
+        observations: &Tensor,
+        actions: &Tensor,
+        _outputs: &Tensor,
+        output_gradient: &Tensor,
+    ) -> Result<(Option<Tensor>, Option<Tensor>, Option<Tensor>)> {
+        match &self.gradient {
+            Gradient::None => Ok((None, None, None)),
+            Gradient::Actions(unit) => {
+                let Some(unit) = unit.0.get() else { bail!("the way back comes before the way forward") };
+                let dims = (self.shape.members, output_gradient.dim(1)?, self.shape.action_dim);
+                let each = Tensor::from_slice(unit, dims, actions.device())?.broadcast_mul(output_gradient)?;
+                Ok((None, None, Some(if self.own_actions { each } else { each.sum(0)? })))
+            }
+            Gradient::Weights(kept, lent) => {
+                let input = read(observations, |s: &[f32]| read(actions, |a: &[f32]| concatenate(s, a, self.shape.dims())))??;
+                let output_gradient = output_gradient.contiguous()?;
+                read(weights, |weights: &[f32]| {
+                    read(&output_gradient, |output_gradient: &[f32]| {
+                        kept.write(|gradient| self.weight_gradient(weights, &input, output_gradient, lent, gradient))
+                    })
+                })???;
+                Ok((None, None, None))
+            }
+        }
+    }
 }

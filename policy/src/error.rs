@@ -1,16 +1,30 @@
-//! What can be wrong with weights.
+//! What can be wrong with a policy.
 
-/// Weights that are not what the architecture says.
+/// Weights that are not what they should be, or that lead to no action.
 #[derive(Debug, thiserror::Error)]
 pub enum PolicyError {
     /// The bytes are no safetensors file.
     #[error("the weights are not a readable safetensors file")]
     Unreadable(#[from] safetensors::SafeTensorError),
+    /// The file does not say which kind of policy it holds.
+    #[error("the weights do not say what kind of policy they are (metadata `policy`)")]
+    NoDescription,
+    /// What it says is not understood.
+    #[error("what the weights say about themselves is not understood: {0}")]
+    Description(#[from] serde_json::Error),
+    /// A shape that nobody can mean.
+    #[error("the weights' {field} is {value}, which is out of range")]
+    Range {
+        /// Name in the description.
+        field: &'static str,
+        /// What it says.
+        value: usize,
+    },
     /// A tensor is missing.
     #[error("the weights lack the tensor {0:?}")]
     Missing(String),
     /// A tensor that no network has.
-    #[error("the weights hold a tensor {0:?} that this architecture does not have")]
+    #[error("the weights hold a tensor {0:?} that this policy does not have")]
     Unexpected(String),
     /// A tensor of the wrong element type.
     #[error("tensor {name:?} holds {found}, expected F32")]
@@ -27,10 +41,16 @@ pub enum PolicyError {
         name: String,
         /// Its shape.
         found: Vec<usize>,
-        /// The architecture's.
+        /// The one that the policy has.
         expected: Vec<usize>,
     },
-    /// A NaN or an infinity.
+    /// A NaN or an infinity among the weights.
     #[error("tensor {0:?} holds a number that is not finite")]
     NotFinite(String),
+    /// A NaN on the way to an action.
+    #[error("a {0} is not a number (NaN)")]
+    NotANumber(&'static str),
+    /// A tensor cannot be computed or moved.
+    #[error("candle failed")]
+    Candle(#[from] candle_core::Error),
 }

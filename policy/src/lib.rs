@@ -1,43 +1,47 @@
-//! What the weights mean: the diffusion policy and the critic ensemble, forward and backward.
+//! What the weights mean: networks, the diffusion they predict the noise of, and the policies made of them.
 //!
 //! # Layout
 //!
-//! - [`Architecture`] (`architecture`): the shapes; [`Parameters`] (`parameters`): weights and their names in files.
-//! - [`Schedule`] (`schedule`): the variance-preserving noise schedule and one reverse step.
-//! - [`NoisePredictor`] (`noise_predictor`): ε_θ, its gradient, the sampler.
-//! - [`CriticEnsemble`] (`ensemble`): values, regression, gradients at actions.
-//! - [`TargetPolicy`] (`select`): acting by the best of N_a candidates.
+//! - [`Ensemble`] (`ensemble`): K networks side by side, as critics, value functions or means; [`NoisePredictor`]
+//!   (`noise_predictor`): ε_θ and the sampler; [`Schedule`] (`schedule`): the noise schedule and one reverse step.
+//!   Each works on candle's tensors, and has two bodies: a custom operation for the CPU, and plain operations (`plain`)
+//!   that run on any device.
+//! - [`Weights`] (`weights`): a network's weights as one vector with named tensors in it, and their gradient.
+//! - [`Policy`] (`kind`): any policy, read from a file that says what kind it is: [`DiffusionPolicy`] (`diffusion`, the
+//!   best of N_a samples) or [`GaussianPolicy`] (`gaussian`, a mean).
 //! - [`Precision`] (`precision`): how exactly networks are evaluated that no gradient is taken of.
-//! - below them `network` (the MLP that actor and critics share), `mlp` (where its layers lie), `elementwise` (Mish and
-//!   what is fused with it) and `matmul` (with `avx512`).
-//! - [`reference`]: the same networks as plain candle tensors, to read, to differentiate and to test against.
+//! - Below the custom operations: `layers` (where each layer lies in the vector), `network` (one network on one tile of
+//!   rows, over the crate `kernels`), `record` (what is kept for the way back), `rounded` (what is made once of
+//!   weights), `slices` (candle's tensors as slices).
 //!
-//! Buffers are row-major `f32` slices; a name's shape is given as `rows × columns`. Everything that draws random
-//! numbers takes them as an argument or from a seeded generator.
+//! Everything that draws random numbers takes them as an argument or from a seeded generator.
 
-mod architecture;
-#[cfg(target_arch = "x86_64")]
-mod avx512;
-mod buffer;
-mod elementwise;
+#[cfg(test)]
+#[allow(clippy::unwrap_used)]
+mod bodies;
+mod diffusion;
 mod ensemble;
 mod error;
-mod matmul;
-mod mlp;
+mod gaussian;
+mod kind;
+mod layers;
 mod network;
 mod noise_predictor;
-mod parameters;
+mod plain;
 mod precision;
-pub mod reference;
+mod record;
+mod rounded;
 mod schedule;
-mod select;
+mod slices;
+mod weights;
 
-pub use architecture::Architecture;
-pub use elementwise::{mish_in_place, mish_slope};
-pub use ensemble::{CriticEnsemble, RoundedCritics, StateActions};
+pub use diffusion::{ActionNoise, DiffusionPolicy, DiffusionShape};
+pub use ensemble::{Ensemble, EnsembleShape};
 pub use error::PolicyError;
-pub use noise_predictor::{NoisePredictor, NoisyActions, Recording, RoundedActor};
-pub use parameters::Parameters;
+pub use gaussian::{GaussianPolicy, GaussianShape, gaussian_mean};
+pub use kind::{Description, Policy, load_policy, read_tensors};
+pub use noise_predictor::{NoisePredictor, NoiseShape};
 pub use precision::Precision;
 pub use schedule::Schedule;
-pub use select::{ActionNoise, Selection, TargetPolicy};
+pub use slices::{modify, read};
+pub use weights::{Layout, Part, Tensors, Weights, check_finite};

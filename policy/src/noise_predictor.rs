@@ -1,29 +1,81 @@
-//! The noise predictor ε_θ(a^t, s, t), its gradient, and the sampler that denoises with it.
+//! The noise predictor ε_θ(a^t, s, t) and the sampler that denoises with it.
+//!
+//! On the CPU two custom operations of candle's do the work: one predicts, with a way back to the weights; the other
+//! runs the whole reverse process, tile by tile, so that activations stay in a core's cache.
 
-use crate::elementwise::{column_sums, mish_slope, multiply};
-use crate::ensemble::part;
-use crate::matmul::{Rounded, outer, product, product_transposed};
-use crate::mlp::Mlp;
-use crate::network::{Input, Network, TILE, Workspace, concatenate, with_workspace};
-use crate::{Architecture, Precision, Schedule};
+use crate::layers::{LayerMut, Layers};
+use crate::network::{Input, Network, TILE, Workspace, part, with_workspace};
+use crate::plain;
+use crate::record::{Lent, Records, concatenate};
+use crate::rounded::RoundedOnce;
+use crate::slices::{read, slice};
+use crate::weights::{KeptGradient, Layout, Tensors, Weights};
+use crate::{Precision, Schedule};
+use candle_core::{CpuStorage, CustomOp3, D, DType, Result, Shape, Tensor, bail};
+use quad_kernels::activation::{column_sums, mish_slope, multiply};
+use quad_kernels::product::{Rounded, outer, product, product_transposed};
 use rayon::prelude::*;
+use std::sync::{Arc, PoisonError};
 
-/// Shapes and constants of a noise predictor; its parameters are a flat slice: time embedding, then trunk.
-#[derive(Clone, Debug)]
-pub struct NoisePredictor {
-    time: Mlp,
-    trunk: Network,
-    /// Sinusoids of t = 1..T, `T × 16`.
-    features: Vec<f32>,
-    schedule: Schedule,
+/// Size of the sinusoidal features of a denoising step.
+const TIME_FEATURES: usize = 16;
+/// Width of the network that embeds them, and of its output.
+const TIME_EMBEDDING: usize = 32;
+
+/// The shape of a noise predictor.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct NoiseShape {
+    /// Numbers in an observation s.
+    pub observation_dim: usize,
+    /// Numbers in an action a.
+    pub action_dim: usize,
+    /// Width of the three hidden layers.
+    pub hidden: usize,
+    /// Denoising steps T.
+    pub diffusion_steps: usize,
 }
 
-/// A noise predictor's hidden kernels as a [`Precision`] wants them; none in f32.
-pub struct RoundedActor(Option<[Rounded; 2]>);
+impl NoiseShape {
+    fn time_layers(&self) -> Layers {
+        Layers::new(1, &[TIME_FEATURES, TIME_EMBEDDING, TIME_EMBEDDING], 0)
+    }
+
+    fn trunk_layers(&self) -> Layers {
+        let Self { observation_dim, action_dim, hidden, .. } = *self;
+        let input = observation_dim + action_dim + TIME_EMBEDDING;
+        Layers::new(1, &[input, hidden, hidden, hidden, action_dim], self.time_layers().end())
+    }
+
+    /// Tensors `time.{0,1}` and `trunk.{0..3}`, each with `.kernel` `[in, out]` and `.bias` `[out]`.
+    pub fn layout(&self) -> Layout {
+        let mut parts = self.time_layers().named("time.", false);
+        parts.extend(self.trunk_layers().named("trunk.", false));
+        Layout::new(parts)
+    }
+}
+
+/// A noise predictor and its weights.
+pub struct NoisePredictor {
+    parts: Arc<Parts>,
+    weights: Weights,
+    precision: Precision,
+    rounded: RoundedOnce<Option<[Rounded; 2]>>,
+    records: Records,
+}
+
+/// What does not change in training.
+struct Parts {
+    shape: NoiseShape,
+    time: Layers,
+    trunk: Layers,
+    schedule: Schedule,
+    /// Sinusoids of t = 1..T, `T × 16`.
+    features: Vec<f32>,
+}
 
 /// The time embedding for all t: everything but the state and the action in the trunk's first pre-activation.
 struct TimeEmbedding {
-    /// `T × 32`, before the activation between the two layers, after it, its slope; and the embedding.
+    /// `T × 32`: behind the activation between the two layers, its slope, and the embedding.
     hidden: Vec<f32>,
     slope: Vec<f32>,
     embedding: Vec<f32>,
@@ -31,250 +83,362 @@ struct TimeEmbedding {
     shift: Vec<f32>,
 }
 
-/// What [`NoisePredictor::record`] keeps for the way back.
-pub struct Recording {
-    embedding: TimeEmbedding,
-    /// Activations and slopes, tile by tile.
-    tiles: Vec<Workspace>,
-}
-
-/// cos(t·f_k), then sin(t·f_k), with f_k = exp(-k·ln(10000)/7) for k = 0..7.
-fn time_features(steps: usize, size: usize) -> Vec<f32> {
-    let half = size / 2;
+/// cos(t·f_k), then sin(t·f_k), with f_k = exp(-k·ln(10000)/7) for k = 0..7, of t = 1..T.
+fn time_features(steps: usize) -> Vec<f32> {
+    let half = TIME_FEATURES / 2;
     let angle = |t: usize, k: usize| t as f64 * (-(k as f64) * 10_000_f64.ln() / (half - 1) as f64).exp();
     let row = |t| (0..half).map(move |k| angle(t, k).cos()).chain((0..half).map(move |k| angle(t, k).sin()));
     (1..=steps).flat_map(row).map(|x| x as f32).collect()
 }
 
-/// Noisy actions of a batch, one per state, with their denoising steps.
-#[derive(Clone, Copy, Debug)]
-pub struct NoisyActions<'a> {
-    /// `batch × observation_dim`.
-    pub observations: &'a [f32],
-    /// a^t, `batch × action_dim`.
-    pub actions: &'a [f32],
-    /// t in 1..=T for each.
-    pub t: &'a [usize],
-}
-
 impl NoisePredictor {
-    /// The noise predictor of an architecture.
-    pub fn new(architecture: &Architecture) -> Self {
-        let trunk = Network {
-            mlp: Mlp::new(&architecture.trunk_widths()),
-            observation_dim: architecture.observation_dim,
-            action_dim: architecture.action_dim,
-            hidden: architecture.hidden,
+    /// `weights` are of the shape's layout; `precision` is for what no gradient is taken of.
+    pub fn new(shape: NoiseShape, weights: Weights, precision: Precision) -> Self {
+        let parts = Parts {
+            shape,
+            time: shape.time_layers(),
+            trunk: shape.trunk_layers(),
+            schedule: Schedule::variance_preserving(shape.diffusion_steps),
+            features: time_features(shape.diffusion_steps),
         };
-        let time = Mlp::new(&architecture.time_widths());
-        let features = time_features(architecture.diffusion_steps, time.shape(0).0);
-        Self { time, trunk, features, schedule: Schedule::variance_preserving(architecture.diffusion_steps) }
+        let (rounded, records) = (RoundedOnce::default(), Records::default());
+        Self { parts: Arc::new(parts), weights, precision, rounded, records }
     }
 
-    /// Number of parameters.
-    pub fn parameters(&self) -> usize {
-        self.time.len() + self.trunk.mlp.len()
+    /// Its weights.
+    pub fn weights(&self) -> &Weights {
+        &self.weights
+    }
+
+    /// Its weights, to be changed.
+    pub fn weights_mut(&mut self) -> &mut Weights {
+        &mut self.weights
+    }
+
+    /// Its shape.
+    pub fn shape(&self) -> NoiseShape {
+        self.parts.shape
     }
 
     /// The noise schedule that it was made for.
     pub fn schedule(&self) -> &Schedule {
-        &self.schedule
+        &self.parts.schedule
     }
 
-    fn split<'a>(&self, parameters: &'a [f32]) -> (&'a [f32], &'a [f32]) {
-        parameters.split_at(self.time.len())
-    }
-
-    /// Embeds every t = 1..T.
-    fn embed(&self, parameters: &[f32]) -> TimeEmbedding {
-        let (time, trunk) = self.split(parameters);
-        let ((inputs, width), (_, outputs)) = (self.time.shape(0), self.time.shape(1));
-        let steps = self.schedule.steps();
-        let affine = |x: &[f32], kernel: &[f32], bias: &[f32], k| {
-            let mut out = vec![0.0; steps * bias.len()];
-            product(x, kernel, &mut out, k, bias.len());
-            out.chunks_exact_mut(bias.len()).for_each(|row| row.iter_mut().zip(bias).for_each(|(x, b)| *x += b));
-            out
+    /// ε_θ(a^t, s, t): `observations [B, o]`, `actions [B, a]`, `t [B]` (u32, in 1..=T) → `[B, a]`. Gradients flow to the
+    /// weights.
+    pub fn predict(&self, observations: &Tensor, actions: &Tensor, t: &Tensor) -> Result<Tensor> {
+        let weights = self.weights.values();
+        if !weights.device().is_cpu() || observations.track_op() || actions.track_op() {
+            return self.plain_predict(observations, actions, t);
+        }
+        let gradient = match (weights.track_op(), self.weights.kept_gradient()) {
+            (true, Some(kept)) => Some((kept, self.records.lend())),
+            _ => None,
         };
-        let before = affine(&self.features, self.time.kernel(time, 0), self.time.bias(time, 0), inputs);
-        let (mut hidden, mut slope) = (vec![0.0; before.len()], vec![0.0; before.len()]);
-        mish_slope(&before, &mut hidden, &mut slope);
-        let embedding = affine(&hidden, self.time.kernel(time, 1), self.time.bias(time, 1), width);
-        let shift = affine(&embedding, self.trunk.tail_kernel(trunk), self.trunk.mlp.bias(trunk, 0), outputs);
-        TimeEmbedding { hidden, slope, embedding, shift }
+        let operation = Predict { parts: self.parts.clone(), t: read(t, <[u32]>::to_vec)?, gradient };
+        weights.apply_op3(&observations.contiguous()?, &actions.contiguous()?, operation)
     }
 
-    /// Prepares parameters for [`Self::sample`].
-    pub fn round(&self, parameters: &[f32], precision: Precision) -> RoundedActor {
-        let (_, trunk) = self.split(parameters);
-        RoundedActor(if precision == Precision::Bf16 { self.trunk.round(trunk) } else { None })
+    /// [`Self::predict`] without a way back.
+    pub fn predict_constant(&self, observations: &Tensor, actions: &Tensor, t: &Tensor) -> Result<Tensor> {
+        let weights = self.weights.values().detach();
+        if !weights.device().is_cpu() {
+            return Ok(self.plain_predict(observations, actions, t)?.detach());
+        }
+        let operation = Predict { parts: self.parts.clone(), t: read(t, <[u32]>::to_vec)?, gradient: None };
+        weights.apply_op3_no_bwd(&observations.contiguous()?, &actions.contiguous()?, &operation)
     }
 
     /// Draws actions by the whole reverse process (DDPM), x_0 clipped to [-1, 1] at each step.
     ///
-    /// `rounded` is of the same parameters, `noise` is `T × rows × action_dim`, standard normal, rows being states ×
-    /// `repeat`: first a^T, then the noise of the reverse steps from t = T down to 2. `actions` is `rows × action_dim`.
-    pub fn sample(
-        &self,
-        parameters: &[f32],
-        rounded: &RoundedActor,
-        observations: &[f32],
-        repeat: usize,
-        noise: &[f32],
-        actions: &mut [f32],
-    ) {
-        let a = self.trunk.action_dim;
-        let (_, trunk) = self.split(parameters);
-        let (embedding, all, steps) = (self.embed(parameters), actions.len(), self.schedule.steps());
+    /// `observations` is `[n, o]`; `noise` is `[T, rows, a]`, standard normal, where equally many consecutive rows share an
+    /// observation: first a^T, then the noise of the reverse steps from t = T down to 2. Gives `[rows, a]`, through which no
+    /// gradient flows.
+    pub fn sample(&self, observations: &Tensor, noise: &Tensor) -> Result<Tensor> {
+        let weights = self.weights.values().detach();
+        if !weights.device().is_cpu() {
+            return self.plain_sample(observations, noise);
+        }
+        let rounded = match self.precision {
+            Precision::F32 => None,
+            Precision::Bf16 => Some(self.rounded.get(&self.weights, |weights| self.parts.network(weights).round())?),
+        };
+        let operation = Sample { parts: self.parts.clone(), rounded };
+        weights.apply_op3_no_bwd(&observations.contiguous()?, &noise.contiguous()?, &operation)
+    }
+
+    /// [`Self::predict`] in plain candle operations.
+    pub(crate) fn plain_predict(&self, observations: &Tensor, actions: &Tensor, t: &Tensor) -> Result<Tensor> {
+        let weights = self.weights.layout().split(self.weights.values(), "")?;
+        self.plain_predict_with(&weights, observations, actions, t)
+    }
+
+    fn plain_predict_with(&self, weights: &Tensors, observations: &Tensor, actions: &Tensor, t: &Tensor) -> Result<Tensor> {
+        let steps = self.parts.shape.diffusion_steps;
+        let features = Tensor::from_slice(&self.parts.features, (steps, TIME_FEATURES), t.device())?;
+        let embedding = plain::mlp(weights, "time.", 2, &features)?;
+        let time = embedding.index_select(&(t.to_dtype(DType::F32)? - 1.0)?.to_dtype(DType::U32)?, 0)?;
+        plain::mlp(weights, "trunk.", 4, &Tensor::cat(&[observations, actions, &time], D::Minus1)?)
+    }
+
+    /// [`Self::sample`] in plain candle operations.
+    pub(crate) fn plain_sample(&self, observations: &Tensor, noise: &Tensor) -> Result<Tensor> {
+        let weights = self.weights.layout().split(&self.weights.values().detach(), "")?;
+        let (steps, rows, _) = noise.dims3()?;
+        let observations = plain::repeat_rows(observations, rows / observations.dim(0)?)?;
+        let mut actions = noise.get(0)?;
+        for t in (1..=steps).rev() {
+            let all = Tensor::full(t as u32, rows, noise.device())?;
+            let epsilon = self.plain_predict_with(&weights, &observations, &actions, &all)?;
+            let z = if t > 1 { Some(noise.get(steps - t + 1)?) } else { None };
+            actions = self.schedule().reverse(t, &actions, &epsilon, z.as_ref())?;
+        }
+        Ok(actions)
+    }
+}
+
+impl Parts {
+    fn network<'a>(&'a self, weights: &'a [f32]) -> Network<'a> {
+        Network::new(weights, &self.trunk, 0, (self.shape.observation_dim, self.shape.action_dim))
+    }
+
+    /// Embeds every t = 1..T.
+    fn embed(&self, weights: &[f32]) -> TimeEmbedding {
+        let ((inputs, width), (_, outputs)) = (self.time.shape(0), self.time.shape(1));
+        let affine = |x: &[f32], kernel: &[f32], bias: &[f32], k| {
+            let mut out = vec![0.0; self.shape.diffusion_steps * bias.len()];
+            product(x, kernel, &mut out, k, bias.len());
+            out.chunks_exact_mut(bias.len()).for_each(|row| row.iter_mut().zip(bias).for_each(|(x, b)| *x += b));
+            out
+        };
+        let time = |layer| (self.time.kernel(weights, layer, 0), self.time.bias(weights, layer, 0));
+        let ((kernel, bias), network) = (time(0), self.network(weights));
+        let before = affine(&self.features, kernel, bias, inputs);
+        let (mut hidden, mut slope) = (vec![0.0; before.len()], vec![0.0; before.len()]);
+        mish_slope(&before, &mut hidden, &mut slope);
+        let (kernel, bias) = time(1);
+        let embedding = affine(&hidden, kernel, bias, width);
+        let shift = affine(&embedding, network.tail_kernel(), network.bias(0), outputs);
+        TimeEmbedding { hidden, slope, embedding, shift }
+    }
+
+    fn sample(&self, weights: &[f32], rounded: Option<&[Rounded; 2]>, observations: &[f32], noise: &[f32], actions: &mut [f32]) {
+        let NoiseShape { observation_dim, action_dim: a, hidden, diffusion_steps: steps } = self.shape;
+        let (network, embedding) = (self.network(weights).with_rounded(rounded), self.embed(weights));
+        let (all, rows) = (actions.len(), actions.len() / a);
+        let repeat = rows / (observations.len() / observation_dim);
         // A small batch is cut finer, so that every thread gets a share.
-        let share = (all / a).div_ceil(rayon::current_num_threads()).clamp(1, TILE);
+        let share = rows.div_ceil(rayon::current_num_threads()).clamp(1, TILE);
         let states = (share / repeat).max(1);
         let tile = states * repeat * a;
         actions.par_chunks_mut(tile).enumerate().for_each(|(i, actions)| {
-            let observations = part(observations, i * states, states, self.trunk.observation_dim);
+            let observations = part(observations, i * states, states, observation_dim);
+            let len = observations.len() / observation_dim * hidden;
             with_workspace(|work| {
-                let (mut base, mut out) = (std::mem::take(&mut work.base), std::mem::take(&mut work.out));
-                let len = observations.len() / self.trunk.observation_dim * self.trunk.hidden;
-                self.trunk.state_part(trunk, observations, base.sized(len));
-                actions.copy_from_slice(&noise[i * tile..][..actions.len()]);
-                for t in (1..=steps).rev() {
-                    let shift = &embedding.shift[(t - 1) * self.trunk.hidden..][..self.trunk.hidden];
-                    let input = Input { base: base.first(len), repeat, shift, actions };
-                    let epsilon = out.sized(actions.len());
-                    self.trunk.forward(trunk, rounded.0.as_ref(), input, work, epsilon);
-                    let z = if t > 1 { &noise[(steps - t + 1) * all + i * tile..][..actions.len()] } else { &[] };
-                    self.schedule.reverse(t, actions, epsilon, z);
-                }
-                (work.base, work.out) = (base, out);
-            });
-        });
-    }
-
-    /// Runs one tile with its own t per row: the state part takes each row's time part along.
-    fn tile(
-        &self,
-        trunk: &[f32],
-        embedding: &TimeEmbedding,
-        input: NoisyActions<'_>,
-        work: &mut Workspace,
-        run: impl FnOnce(Input<'_>, &mut Workspace),
-    ) {
-        let (h, mut base) = (self.trunk.hidden, std::mem::take(&mut work.base));
-        let rows = base.sized(input.t.len() * h);
-        self.trunk.state_part(trunk, input.observations, rows);
-        for (row, t) in rows.chunks_exact_mut(h).zip(input.t) {
-            let shift = &embedding.shift[(t - 1) * h..][..h];
-            row.iter_mut().zip(shift).for_each(|(x, s)| *x += s);
-        }
-        let zero = vec![0.0; h];
-        run(Input { base: rows, repeat: 1, shift: &zero, actions: input.actions }, work);
-        work.base = base;
-    }
-
-    fn tile_of<'a>(&self, input: NoisyActions<'a>, i: usize) -> NoisyActions<'a> {
-        let from = i * TILE;
-        NoisyActions {
-            observations: part(input.observations, from, TILE, self.trunk.observation_dim),
-            actions: part(input.actions, from, TILE, self.trunk.action_dim),
-            t: &input.t[from..(from + TILE).min(input.t.len())],
-        }
-    }
-
-    /// `out[batch × action_dim] = ε_θ(a^t, s, t)`.
-    pub fn predict(&self, parameters: &[f32], input: NoisyActions<'_>, out: &mut [f32]) {
-        let (_, trunk) = self.split(parameters);
-        let embedding = self.embed(parameters);
-        out.par_chunks_mut(TILE * self.trunk.action_dim).enumerate().for_each(|(i, out)| {
-            with_workspace(|work| {
-                self.tile(trunk, &embedding, self.tile_of(input, i), work, |tile, work| {
-                    self.trunk.forward(trunk, None, tile, work, out);
+                work.with_base(len, actions.len(), |base, epsilon, work| {
+                    network.state_part(observations, base);
+                    actions.copy_from_slice(&noise[i * tile..][..actions.len()]);
+                    for t in (1..=steps).rev() {
+                        let shift = &embedding.shift[(t - 1) * hidden..][..hidden];
+                        network.forward(Input { base, repeat, shift, actions }, work, epsilon);
+                        let z = if t > 1 { &noise[(steps - t + 1) * all + i * tile..][..actions.len()] } else { &[] };
+                        self.schedule.reverse_in_place(t, actions, epsilon, z);
+                    }
                 });
             });
         });
     }
 
-    /// [`Self::predict`] that can be gone back through.
-    pub fn record(&self, parameters: &[f32], input: NoisyActions<'_>, out: &mut [f32]) -> Recording {
-        let (_, trunk) = self.split(parameters);
-        let embedding = self.embed(parameters);
-        let forward = |(i, out)| {
-            let mut work = Workspace::default();
-            self.tile(trunk, &embedding, self.tile_of(input, i), &mut work, |tile, work| {
-                self.trunk.forward_recorded(trunk, tile, work, out);
-            });
-            work
-        };
-        let tiles = out.par_chunks_mut(TILE * self.trunk.action_dim).enumerate().map(forward).collect();
-        Recording { embedding, tiles }
-    }
-
-    /// The gradient of a loss through ε_θ: from ∂L/∂ε, `batch × action_dim`, to that of the parameters. `recording` is
-    /// of the same parameters and input.
-    pub fn differentiate(
+    /// Runs one tile with its own t per row: the state part takes each row's time part along.
+    fn with_tile(
         &self,
-        parameters: &[f32],
-        input: NoisyActions<'_>,
-        recording: Recording,
-        output_gradient: &[f32],
-        gradient: &mut [f32],
+        (network, embedding): (Network<'_>, &TimeEmbedding),
+        (observations, actions, t): (&[f32], &[f32], &[u32]),
+        work: &mut Workspace,
+        run: impl FnOnce(Input<'_>, &mut Workspace),
     ) {
-        let (_, trunk) = self.split(parameters);
-        let Recording { embedding, tiles } = recording;
-        let (h, a, steps) = (self.trunk.hidden, self.trunk.action_dim, self.schedule.steps());
-        // Per tile: the trunk's gradient, and δ of the first layer summed by t.
-        let backward = |(i, mut work): (usize, Workspace)| {
-            let (input, out) = (self.tile_of(input, i), part(output_gradient, i * TILE, TILE, a));
-            let (mut trunk_gradient, mut by_step) = (vec![0.0; self.trunk.mlp.len()], vec![0.0; steps * h]);
-            self.trunk.backward(trunk, out, &mut work);
-            let mut inputs = Vec::new();
-            concatenate(input.observations, input.actions, (self.trunk.observation_dim, a), &mut inputs);
-            self.trunk.parameter_gradient(&inputs, out, &mut work, &mut trunk_gradient);
-            for (t, delta) in input.t.iter().zip(work.slope[0].first(input.t.len() * h).chunks_exact(h)) {
-                by_step[(t - 1) * h..][..h].iter_mut().zip(delta).for_each(|(sum, d)| *sum += d);
+        let h = self.shape.hidden;
+        work.with_base(t.len() * h, 0, |base, _, work| {
+            network.state_part(observations, base);
+            for (row, t) in base.chunks_exact_mut(h).zip(t) {
+                let shift = &embedding.shift[(*t as usize - 1) * h..][..h];
+                row.iter_mut().zip(shift).for_each(|(x, s)| *x += s);
             }
-            (trunk_gradient, by_step)
-        };
-        let results: Vec<(Vec<f32>, Vec<f32>)> = tiles.into_par_iter().enumerate().map(backward).collect();
-        let mut by_step = vec![0.0; steps * h];
-        let (time_gradient, trunk_gradient) = gradient.split_at_mut(self.time.len());
-        trunk_gradient.fill(0.0);
-        for (trunk, steps) in &results {
-            trunk_gradient.iter_mut().zip(trunk).for_each(|(sum, g)| *sum += g);
-            by_step.iter_mut().zip(steps).for_each(|(sum, g)| *sum += g);
-        }
-        self.differentiate_time(parameters, &embedding, &by_step, time_gradient, trunk_gradient);
+            let zero = vec![0.0; h];
+            run(Input { base, repeat: 1, shift: &zero, actions }, work);
+        });
     }
 
-    /// The way back into the time embedding, once per t rather than once per row.
-    fn differentiate_time(
-        &self,
-        parameters: &[f32],
-        embedding: &TimeEmbedding,
-        by_step: &[f32],
-        time_gradient: &mut [f32],
-        trunk_gradient: &mut [f32],
-    ) {
-        let (time, trunk) = self.split(parameters);
+    /// The way back into the time embedding, once per t rather than once per row: `by_step` is the gradient before the
+    /// trunk's first activation, summed by t, `T × hidden`.
+    fn time_gradient(&self, weights: &[f32], by_step: &[f32], time: Vec<LayerMut<'_>>, tail: &mut [f32]) {
         let ((inputs, width), (_, outputs)) = (self.time.shape(0), self.time.shape(1));
-        let (h, steps) = (self.trunk.hidden, self.schedule.steps());
-        let (kernel, _) = self.trunk.mlp.layer_mut(trunk_gradient, 0);
-        let tail = kernel.len() - outputs * h;
-        outer(&embedding.embedding, by_step, &mut kernel[tail..], outputs, h);
+        let (h, steps) = (self.shape.hidden, self.shape.diffusion_steps);
+        let embedding = self.embed(weights);
+        outer(&embedding.embedding, by_step, tail, outputs, h);
         let mut d_embedding = vec![0.0; steps * outputs];
-        product_transposed(by_step, self.trunk.tail_kernel(trunk), &mut d_embedding, outputs, h);
-        let (kernel, bias) = self.time.layer_mut(time_gradient, 1);
-        outer(&embedding.hidden, &d_embedding, kernel, width, outputs);
-        column_sums(&d_embedding, bias);
+        product_transposed(by_step, self.network(weights).tail_kernel(), &mut d_embedding, outputs, h);
         let mut d_hidden = vec![0.0; steps * width];
-        product_transposed(&d_embedding, self.time.kernel(time, 1), &mut d_hidden, width, outputs);
+        product_transposed(&d_embedding, self.time.kernel(weights, 1, 0), &mut d_hidden, width, outputs);
         multiply(&mut d_hidden, &embedding.slope);
-        let (kernel, bias) = self.time.layer_mut(time_gradient, 0);
-        outer(&self.features, &d_hidden, kernel, inputs, width);
-        column_sums(&d_hidden, bias);
-    }
-
-    /// Layers of the time embedding and of the trunk.
-    pub(crate) fn layers(&self) -> (&Mlp, &Mlp) {
-        (&self.time, &self.trunk.mlp)
+        for LayerMut { layer, kernel, bias, .. } in time {
+            let (x, inputs, delta) = match layer {
+                0 => (&self.features, inputs, &d_hidden),
+                _ => (&embedding.hidden, width, &d_embedding),
+            };
+            outer(x, delta, kernel, inputs, bias.len());
+            column_sums(delta, bias);
+        }
     }
 }
+
+fn check_shapes(shape: &NoiseShape, observations: &[usize], actions: &[usize]) -> Result<()> {
+    let fits = |dims: &[usize], width| dims.len() == 2 && dims[0] > 0 && dims[1] == width;
+    if fits(observations, shape.observation_dim) && fits(actions, shape.action_dim) && actions[0] % observations[0] == 0 {
+        return Ok(());
+    }
+    bail!("a noise predictor of {shape:?} got observations {observations:?} and actions {actions:?}")
+}
+
+/// The custom operation of (weights, observations, noisy actions).
+struct Predict {
+    parts: Arc<Parts>,
+    t: Vec<u32>,
+    gradient: Option<(Arc<KeptGradient>, Lent)>,
+}
+
+impl Predict {
+    fn tile<'a>(&'a self, observations: &'a [f32], actions: &'a [f32], i: usize) -> (&'a [f32], &'a [f32], &'a [u32]) {
+        let NoiseShape { observation_dim, action_dim, .. } = self.parts.shape;
+        let t = &self.t[i * TILE..((i + 1) * TILE).min(self.t.len())];
+        (part(observations, i * TILE, TILE, observation_dim), part(actions, i * TILE, TILE, action_dim), t)
+    }
+
+    fn forward(&self, weights: &[f32], observations: &[f32], actions: &[f32], out: &mut [f32]) {
+        let of = (self.parts.network(weights), &self.parts.embed(weights));
+        out.par_chunks_mut(TILE * self.parts.shape.action_dim).enumerate().for_each(|(i, out)| {
+            let rows = self.tile(observations, actions, i);
+            with_workspace(|work| self.parts.with_tile(of, rows, work, |input, work| of.0.forward(input, work, out)));
+        });
+    }
+
+    fn forward_recorded(&self, weights: &[f32], observations: &[f32], actions: &[f32], lent: &Lent, out: &mut [f32]) {
+        let of = (self.parts.network(weights), &self.parts.embed(weights));
+        let mut record = lent.record.lock().unwrap_or_else(PoisonError::into_inner);
+        record.resize(1, self.t.len(), self.parts.shape.hidden);
+        record.tiles(out).into_par_iter().for_each(|mut tile| {
+            let rows = self.tile(observations, actions, tile.index);
+            with_workspace(|work| {
+                self.parts.with_tile(of, rows, work, |input, work| {
+                    of.0.forward_recorded(input, &mut tile.activations, work.scratch(), tile.out);
+                });
+            });
+        });
+    }
+
+    fn weight_gradient(&self, weights: &[f32], input: &[f32], output_gradient: &[f32], lent: &Lent, gradient: &mut [f32]) {
+        let Parts { shape, time, trunk, .. } = &*self.parts;
+        let network = self.parts.network(weights);
+        let mut record = lent.record.lock().unwrap_or_else(PoisonError::into_inner);
+        let mut of_tiles = output_gradient.to_vec();
+        record.tiles(&mut of_tiles).into_par_iter().for_each(|mut tile| {
+            with_workspace(|work| network.backward(tile.out, &mut tile.activations.slope, work.scratch()));
+        });
+        let (of_time, of_trunk) = gradient.split_at_mut(time.end());
+        record.weight_gradients(trunk.split_mut(of_trunk), input, output_gradient);
+        let h = shape.hidden;
+        let mut by_step = vec![0.0; shape.diffusion_steps * h];
+        for (t, delta) in self.t.iter().zip(record.first_delta(0).chunks_exact(h)) {
+            by_step[(*t as usize - 1) * h..][..h].iter_mut().zip(delta).for_each(|(sum, d)| *sum += d);
+        }
+        let tail = &mut of_trunk[(shape.observation_dim + shape.action_dim) * h..][..TIME_EMBEDDING * h];
+        self.parts.time_gradient(weights, &by_step, time.split_mut(of_time), tail);
+    }
+}
+
+impl CustomOp3 for Predict {
+    fn name(&self) -> &'static str {
+        "noise-predictor"
+    }
+
+    fn cpu_fwd(
+        &self,
+        weights: &CpuStorage,
+        weights_layout: &candle_core::Layout,
+        observations: &CpuStorage,
+        observations_layout: &candle_core::Layout,
+        actions: &CpuStorage,
+        actions_layout: &candle_core::Layout,
+    ) -> Result<(CpuStorage, Shape)> {
+        let shape = self.parts.shape;
+        check_shapes(&shape, observations_layout.dims(), actions_layout.dims())?;
+        let known = |t: &u32| (1..=shape.diffusion_steps).contains(&(*t as usize));
+        if observations_layout.dims()[0] != self.t.len() || !self.t.iter().all(known) {
+            bail!("a denoising step in 1..={} is needed for each row", shape.diffusion_steps);
+        }
+        let weights = slice(weights, weights_layout)?;
+        let (observations, actions) = (slice(observations, observations_layout)?, slice(actions, actions_layout)?);
+        let mut out = vec![0.0; actions.len()];
+        match &self.gradient {
+            None => self.forward(weights, observations, actions, &mut out),
+            Some((_, lent)) => self.forward_recorded(weights, observations, actions, lent, &mut out),
+        }
+        Ok((CpuStorage::F32(out), actions_layout.shape().clone()))
+    }
+
+    fn bwd(
+        &self,
+        weights: &Tensor,
+        observations: &Tensor,
+        actions: &Tensor,
+        _noise: &Tensor,
+        output_gradient: &Tensor,
+    ) -> Result<(Option<Tensor>, Option<Tensor>, Option<Tensor>)> {
+        if let Some((kept, lent)) = &self.gradient {
+            let dims = (self.parts.shape.observation_dim, self.parts.shape.action_dim);
+            let input = read(observations, |s: &[f32]| read(actions, |a: &[f32]| concatenate(s, a, dims)))??;
+            let output_gradient = output_gradient.contiguous()?;
+            read(weights, |weights: &[f32]| {
+                read(&output_gradient, |output_gradient: &[f32]| {
+                    kept.write(|gradient| self.weight_gradient(weights, &input, output_gradient, lent, gradient))
+                })
+            })???;
+        }
+        Ok((None, None, None))
+    }
+}
+
+/// The custom operation of (weights, observations, noise) that draws actions.
+struct Sample {
+    parts: Arc<Parts>,
+    rounded: Option<Arc<Option<[Rounded; 2]>>>,
+}
+
+impl CustomOp3 for Sample {
+    fn name(&self) -> &'static str {
+        "sampler"
+    }
+
+    fn cpu_fwd(
+        &self,
+        weights: &CpuStorage,
+        weights_layout: &candle_core::Layout,
+        observations: &CpuStorage,
+        observations_layout: &candle_core::Layout,
+        noise: &CpuStorage,
+        noise_layout: &candle_core::Layout,
+    ) -> Result<(CpuStorage, Shape)> {
+        let (steps, rows, a) = noise_layout.shape().dims3()?;
+        check_shapes(&self.parts.shape, observations_layout.dims(), &[rows, a])?;
+        if steps != self.parts.shape.diffusion_steps {
+            bail!("noise for {} denoising steps is needed, not for {steps}", self.parts.shape.diffusion_steps);
+        }
+        let (observations, noise) = (slice(observations, observations_layout)?, slice(noise, noise_layout)?);
+        let mut actions = vec![0.0; rows * a];
+        let rounded = self.rounded.as_deref().and_then(Option::as_ref);
+        self.parts.sample(slice(weights, weights_layout)?, rounded, observations, noise, &mut actions);
+        Ok((CpuStorage::F32(actions), (rows, a).into()))
+    }
+}
+

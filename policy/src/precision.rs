@@ -24,10 +24,7 @@ impl Precision {
     pub fn is_available(self) -> bool {
         match self {
             Precision::F32 => true,
-            #[cfg(target_arch = "x86_64")]
-            Precision::Bf16 => crate::avx512::bf16::available(),
-            #[cfg(not(target_arch = "x86_64"))]
-            Precision::Bf16 => false,
+            Precision::Bf16 => quad_kernels::product::rounding_is_faster(),
         }
     }
 }

@@ -1,28 +1,26 @@
 //! The variance-preserving noise schedule and one step of the reverse process.
 
+use candle_core::{Device, Result, Tensor};
+
 /// Constants of the diffusion over t = 1..T (Eq. 3–5; DAC's "vp" schedule).
 #[derive(Clone, Debug, PartialEq)]
 pub struct Schedule {
-    /// β_t, `beta[t - 1]`.
-    pub beta: Vec<f32>,
-    /// ᾱ_t, `alpha_bar[t - 1]`; ᾱ_0 = 1.
-    pub alpha_bar: Vec<f32>,
-    steps: Vec<Reverse>,
+    steps: Vec<Step>,
 }
 
-/// Coefficients of one reverse step.
+/// Of one t.
 #[derive(Clone, Copy, Debug, PartialEq)]
-struct Reverse {
-    /// 1/sqrt(ᾱ_t).
-    clean_scale: f32,
+struct Step {
+    /// sqrt(ᾱ_t).
+    signal: f32,
     /// sqrt(1 - ᾱ_t).
-    noise_scale: f32,
+    deviation: f32,
     /// Of the clipped x_0 in the posterior's mean.
     from_clean: f32,
     /// Of x_t in the posterior's mean.
     from_noisy: f32,
     /// sqrt(1 - α_t), or 0 at t = 1.
-    deviation: f32,
+    noise: f32,
 }
 
 impl Schedule {
@@ -30,44 +28,54 @@ impl Schedule {
     pub fn variance_preserving(steps: usize) -> Self {
         let total = steps as f64;
         let mut before = 1.0; // ᾱ_{t-1}
-        let mut schedule = Self { beta: Vec::new(), alpha_bar: Vec::new(), steps: Vec::new() };
-        for t in 1..=steps {
+        let step = |t: usize| {
             let alpha = (-0.1 / total - 0.5 * (10.0 - 0.1) * (2 * t - 1) as f64 / (total * total)).exp();
             let alpha_bar = before * alpha;
-            schedule.beta.push((1.0 - alpha) as f32);
-            schedule.alpha_bar.push(alpha_bar as f32);
-            schedule.steps.push(Reverse {
-                clean_scale: (1.0 / alpha_bar.sqrt()) as f32,
-                noise_scale: (1.0 - alpha_bar).sqrt() as f32,
+            let step = Step {
+                signal: alpha_bar.sqrt() as f32,
+                deviation: (1.0 - alpha_bar).sqrt() as f32,
                 from_clean: (before.sqrt() * (1.0 - alpha) / (1.0 - alpha_bar)) as f32,
                 from_noisy: (alpha.sqrt() * (1.0 - before) / (1.0 - alpha_bar)) as f32,
-                deviation: if t == 1 { 0.0 } else { (1.0 - alpha).sqrt() as f32 },
-            });
+                noise: if t == 1 { 0.0 } else { (1.0 - alpha).sqrt() as f32 },
+            };
             before = alpha_bar;
-        }
-        schedule
+            step
+        };
+        Self { steps: (1..=steps).map(step).collect() }
     }
 
-    /// T.
-    pub fn steps(&self) -> usize {
-        self.steps.len()
+    /// sqrt(ᾱ_t) and sqrt(1 - ᾱ_t) for each t in 1..=T, `[B, 1]` each; the second is also the guidance weight w(t).
+    pub fn noising(&self, t: &[u32], device: &Device) -> Result<(Tensor, Tensor)> {
+        let column = |of: fn(&Step) -> f32| {
+            let values: Vec<f32> = t.iter().map(|t| of(&self.steps[*t as usize - 1])).collect();
+            Tensor::from_vec(values, (t.len(), 1), device)
+        };
+        Ok((column(|step| step.signal)?, column(|step| step.deviation)?))
     }
 
-    /// (sqrt(ᾱ_t), sqrt(1 - ᾱ_t)) of Eq. 5; the second is also the guidance weight w(t).
-    pub fn noising(&self, t: usize) -> (f32, f32) {
-        (self.alpha_bar[t - 1].sqrt(), self.steps[t - 1].noise_scale)
-    }
-
-    /// x_t → x_{t-1} in place: the posterior's mean with x_0 clipped to [-1, 1], plus its noise for t > 1.
+    /// x_t → x_{t-1}: the posterior's mean with x_0 clipped to [-1, 1], plus its noise for t > 1. All `[rows, a]`.
     ///
-    /// `epsilon` is the predicted noise; `z`, standard normal, is not read at t = 1.
-    pub fn reverse(&self, t: usize, x: &mut [f32], epsilon: &[f32], z: &[f32]) {
-        let step = self.steps[t - 1];
+    /// `epsilon` is the predicted noise, `z` standard normal.
+    pub fn reverse(&self, t: usize, x: &Tensor, epsilon: &Tensor, z: Option<&Tensor>) -> Result<Tensor> {
+        let Step { signal, deviation, from_clean, from_noisy, noise } = self.steps[t - 1];
+        let scale = |x: &Tensor, by: f32| x * f64::from(by);
+        let clean = scale(&(x - scale(epsilon, deviation)?)?, 1.0 / signal)?.clamp(-1f32, 1f32)?;
+        let mean = (scale(&clean, from_clean)? + scale(x, from_noisy)?)?;
+        match z {
+            Some(z) if t > 1 => mean + scale(z, noise)?,
+            _ => Ok(mean),
+        }
+    }
+
+    /// [`Self::reverse`] on slices; `z` is not read at t = 1.
+    pub(crate) fn reverse_in_place(&self, t: usize, x: &mut [f32], epsilon: &[f32], z: &[f32]) {
+        let Step { signal, deviation, from_clean, from_noisy, noise } = self.steps[t - 1];
+        let scale = 1.0 / signal;
         for (i, (x, epsilon)) in x.iter_mut().zip(epsilon).enumerate() {
-            let clean = ((*x - step.noise_scale * epsilon) * step.clean_scale).clamp(-1.0, 1.0);
-            *x = step.from_clean * clean + step.from_noisy * *x;
+            let clean = ((*x - deviation * epsilon) * scale).clamp(-1.0, 1.0);
+            *x = from_clean * clean + from_noisy * *x;
             if t > 1 {
-                *x += step.deviation * z[i];
+                *x += noise * z[i];
             }
         }
     }

@@ -5,7 +5,7 @@ const LINE: usize = 64;
 
 /// Numbers from the beginning of a cache line on: a register of them elsewhere costs two accesses. Grows, never shrinks.
 #[derive(Default)]
-pub(crate) struct Buffer(Vec<f32>);
+pub struct Buffer(Vec<f32>);
 
 impl Buffer {
     /// `len` numbers; what they hold is left over from earlier use.

@@ -85,7 +85,7 @@ vectorised! {
 
 vectorised! {
     /// `x = mish(x + bias)`, row by row.
-    pub(crate) fn bias_mish(x: &mut [f32], bias: &[f32]) {
+    pub fn bias_mish(x: &mut [f32], bias: &[f32]) {
         for row in x.chunks_exact_mut(bias.len()) {
             for (x, b) in row.iter_mut().zip(bias) {
                 *x = mish(*x + b);
@@ -96,7 +96,7 @@ vectorised! {
 
 vectorised! {
     /// `x = mish(x + bias)`, `slope = mish'(x + bias)`, row by row.
-    pub(crate) fn bias_mish_slope(x: &mut [f32], bias: &[f32], slope: &mut [f32]) {
+    pub fn bias_mish_slope(x: &mut [f32], bias: &[f32], slope: &mut [f32]) {
         for (row, slope) in x.chunks_exact_mut(bias.len()).zip(slope.chunks_exact_mut(bias.len())) {
             for ((x, b), slope) in row.iter_mut().zip(bias).zip(slope) {
                 (*x, *slope) = mish_and_slope(*x + b);
@@ -134,20 +134,27 @@ fn load(x: &[f32], at: usize) -> [f32; LANES] {
 }
 
 /// Operands of the first layer: what the rows share, and what they do not.
-pub(crate) struct FirstLayer<'a> {
+pub struct FirstLayer<'a> {
     /// Pre-activation of the state part, one row per state: `states × width`.
     pub base: &'a [f32],
     /// Consecutive rows that share a state.
     pub repeat: usize,
     /// Added to every row: the bias, and for the actor the time embedding's part.
     pub shift: &'a [f32],
-    /// `rows × action_dim`.
+    /// `rows × action_dim`; the action may have no numbers at all.
     pub actions: &'a [f32],
     /// The kernel's rows that multiply the action: `action_dim × width`.
     pub kernel: &'a [f32],
 }
 
 impl FirstLayer<'_> {
+    /// The action of a row; empty where the network has none.
+    #[inline(always)]
+    fn action(&self, row: usize) -> &[f32] {
+        let action_dim = self.kernel.len() / self.shift.len();
+        &self.actions[row * action_dim..][..action_dim]
+    }
+
     /// base + shift + a · kernel of one row, [`LANES`] columns from `at` on.
     #[inline(always)]
     fn before_activation(&self, base: &[f32], a: &[f32], at: usize) -> [f32; LANES] {
@@ -161,10 +168,10 @@ impl FirstLayer<'_> {
 
 vectorised! {
     /// `out = mish(base + shift + actions · kernel)`, `rows × width`.
-    pub(crate) fn first_layer(layer: &FirstLayer<'_>, out: &mut [f32]) {
+    pub fn first_layer(layer: &FirstLayer<'_>, out: &mut [f32]) {
         let width = layer.shift.len();
-        let action_dim = layer.kernel.len() / width;
-        for (row, (out, a)) in out.chunks_exact_mut(width).zip(layer.actions.chunks_exact(action_dim)).enumerate() {
+        for (row, out) in out.chunks_exact_mut(width).enumerate() {
+            let a = layer.action(row);
             let base = &layer.base[row / layer.repeat * width..][..width];
             let whole = width - width % LANES;
             for at in (0..whole).step_by(LANES) {
@@ -183,11 +190,10 @@ vectorised! {
 
 vectorised! {
     /// `first_layer` that also keeps the slope for the way back.
-    pub(crate) fn first_layer_slope(layer: &FirstLayer<'_>, out: &mut [f32], slope: &mut [f32]) {
+    pub fn first_layer_slope(layer: &FirstLayer<'_>, out: &mut [f32], slope: &mut [f32]) {
         let width = layer.shift.len();
-        let action_dim = layer.kernel.len() / width;
-        let rows = out.chunks_exact_mut(width).zip(slope.chunks_exact_mut(width));
-        for (row, ((out, slope), a)) in rows.zip(layer.actions.chunks_exact(action_dim)).enumerate() {
+        for (row, (out, slope)) in out.chunks_exact_mut(width).zip(slope.chunks_exact_mut(width)).enumerate() {
+            let a = layer.action(row);
             let base = &layer.base[row / layer.repeat * width..][..width];
             let whole = width - width % LANES;
             for at in (0..whole).step_by(LANES) {
@@ -208,7 +214,7 @@ vectorised! {
 vectorised! {
     /// `slope = slope ⊙ (coefficients · vectors)`: the gradient before an activation whose output feeds a narrow
     /// linear layer. `coefficients` is `rows × n`, `vectors` `n × width`.
-    pub(crate) fn scale_by_combination(slope: &mut [f32], coefficients: &[f32], vectors: &[f32], width: usize) {
+    pub fn scale_by_combination(slope: &mut [f32], coefficients: &[f32], vectors: &[f32], width: usize) {
         let n = vectors.len() / width;
         for (slope, c) in slope.chunks_exact_mut(width).zip(coefficients.chunks_exact(n)) {
             let whole = width - width % LANES;
@@ -228,7 +234,7 @@ vectorised! {
 
 vectorised! {
     /// `out[row, j] = offset[j] + x[row] · vectors[j]`: a narrow linear layer. `vectors` is `n × width`.
-    pub(crate) fn dots(x: &[f32], vectors: &[f32], offset: &[f32], out: &mut [f32], width: usize) {
+    pub fn dots(x: &[f32], vectors: &[f32], offset: &[f32], out: &mut [f32], width: usize) {
         for (x, out) in x.chunks_exact(width).zip(out.chunks_exact_mut(offset.len())) {
             for ((out, v), offset) in out.iter_mut().zip(vectors.chunks_exact(width)).zip(offset) {
                 let whole = width - width % LANES;
@@ -254,7 +260,7 @@ vectorised! {
 
 vectorised! {
     /// `x = x ⊙ y`.
-    pub(crate) fn multiply(x: &mut [f32], y: &[f32]) {
+    pub fn multiply(x: &mut [f32], y: &[f32]) {
         for (x, y) in x.iter_mut().zip(y) {
             *x *= y;
         }
@@ -263,7 +269,7 @@ vectorised! {
 
 vectorised! {
     /// `out = Σ rows of x`, `out` is one row wide.
-    pub(crate) fn column_sums(x: &[f32], out: &mut [f32]) {
+    pub fn column_sums(x: &[f32], out: &mut [f32]) {
         out.fill(0.0);
         for row in x.chunks_exact(out.len()) {
             for (out, x) in out.iter_mut().zip(row) {

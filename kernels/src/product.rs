@@ -7,7 +7,7 @@ use gemm::{Parallelism, gemm};
 #[cfg(target_arch = "x86_64")]
 use crate::avx512;
 #[cfg(target_arch = "x86_64")]
-pub(crate) use crate::avx512::bf16::Rounded;
+pub use crate::avx512::bf16::Rounded;
 
 /// A row-major matrix or its transpose, as `gemm` wants it: first element, column stride, row stride.
 type Operand = (*const f32, isize, isize);
@@ -53,8 +53,17 @@ fn multiply_row_major(m: usize, n: usize, k: usize, out: &mut [f32], a: Operand,
     multiply(m, n, k, out, a, (b.as_ptr(), 1, n as isize));
 }
 
+/// Whether this CPU multiplies rounded operands ([`Rounded`]), and faster than in f32.
+pub fn rounding_is_faster() -> bool {
+    #[cfg(target_arch = "x86_64")]
+    let available = avx512::bf16::available();
+    #[cfg(not(target_arch = "x86_64"))]
+    let available = false;
+    available
+}
+
 /// `out[m × n] = x[m × k] · w[k × n]`.
-pub(crate) fn product(x: &[f32], w: &[f32], out: &mut [f32], k: usize, n: usize) {
+pub fn product(x: &[f32], w: &[f32], out: &mut [f32], k: usize, n: usize) {
     let m = x.len() / k;
     assert!(x.len() == m * k && w.len() == k * n, "operands of a product");
     multiply_row_major(m, n, k, out, (x.as_ptr(), 1, k as isize), w);
@@ -62,7 +71,7 @@ pub(crate) fn product(x: &[f32], w: &[f32], out: &mut [f32], k: usize, n: usize)
 
 /// There are none where no such CPU is.
 #[cfg(not(target_arch = "x86_64"))]
-pub(crate) enum Rounded {}
+pub enum Rounded {}
 
 #[cfg(not(target_arch = "x86_64"))]
 impl Rounded {
@@ -76,7 +85,7 @@ impl Rounded {
 }
 
 /// `out[m × k] = g[m × n] · w[k × n]ᵀ`: a gradient's way back through `product`.
-pub(crate) fn product_transposed(g: &[f32], w: &[f32], out: &mut [f32], k: usize, n: usize) {
+pub fn product_transposed(g: &[f32], w: &[f32], out: &mut [f32], k: usize, n: usize) {
     let m = g.len() / n;
     assert!(g.len() == m * n && w.len() == k * n, "operands of a product");
     #[cfg(target_arch = "x86_64")]
@@ -89,7 +98,7 @@ pub(crate) fn product_transposed(g: &[f32], w: &[f32], out: &mut [f32], k: usize
 }
 
 /// `out[k × n] = x[m × k]ᵀ · g[m × n]`: the gradient of `w` in `product`.
-pub(crate) fn outer(x: &[f32], g: &[f32], out: &mut [f32], k: usize, n: usize) {
+pub fn outer(x: &[f32], g: &[f32], out: &mut [f32], k: usize, n: usize) {
     let m = x.len() / k;
     assert!(x.len() == m * k && g.len() == m * n, "operands of a product");
     multiply_row_major(k, n, m, out, (x.as_ptr(), k as isize, 1), g);

@@ -60,7 +60,7 @@ thread_local! {
 }
 
 /// The right-hand side of products, `k × n`, rounded to bfloat16: block after block of columns, and in each the pairs of `k` as rows.
-pub(crate) struct Rounded {
+pub struct Rounded {
     blocks: Vec<Line<Pair>>,
     k: usize,
     n: usize,

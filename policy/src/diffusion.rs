@@ -1,0 +1,184 @@
+//! The diffusion policy: the best of N_a candidates (Eq. 25), drawn from the target actor and valued by the target critics.
+
+use crate::kind::check_range;
+use crate::slices::read;
+use crate::weights::{Tensors, Weights};
+use crate::{Ensemble, EnsembleShape, NoisePredictor, NoiseShape, Policy, PolicyError, Precision};
+use candle_core::{Device, Tensor};
+use rand::SeedableRng;
+use rand_chacha::ChaCha8Rng;
+use rand_distr::{Distribution, StandardNormal};
+use serde::{Deserialize, Serialize};
+
+/// The stream, among those of an episode's seed, that action noise is drawn from.
+const ACTION_STREAM: u64 = 2;
+/// Before the names of the two networks' tensors.
+const ACTOR: &str = "actor.";
+const CRITIC: &str = "critic.";
+
+/// The noise that one episode's actions are drawn from. A stream for each episode: its result does not depend on which
+/// other episodes shared a batch with it.
+pub struct ActionNoise(ChaCha8Rng);
+
+impl ActionNoise {
+    /// The stream of an episode's seed, apart from any other use of that seed.
+    pub fn new(episode_seed: u64) -> Self {
+        let mut generator = ChaCha8Rng::seed_from_u64(episode_seed);
+        generator.set_stream(ACTION_STREAM);
+        Self(generator)
+    }
+
+    fn fill(&mut self, out: &mut [f32]) {
+        out.fill_with(|| StandardNormal.sample(&mut self.0));
+    }
+}
+
+/// The shapes of a diffusion policy's networks.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+pub struct DiffusionShape {
+    /// Numbers in an observation s.
+    pub observation_dim: usize,
+    /// Numbers in an action a.
+    pub action_dim: usize,
+    /// Width of the three hidden layers of noise predictor and critics.
+    pub hidden: usize,
+    /// Ensemble size K.
+    pub critics: usize,
+    /// Denoising steps T.
+    pub diffusion_steps: usize,
+}
+
+impl DiffusionShape {
+    /// Of the noise predictor.
+    pub fn actor(&self) -> NoiseShape {
+        let Self { observation_dim, action_dim, hidden, diffusion_steps, .. } = *self;
+        NoiseShape { observation_dim, action_dim, hidden, diffusion_steps }
+    }
+
+    /// Of the critics.
+    pub fn critics(&self) -> EnsembleShape {
+        let Self { observation_dim, action_dim, hidden, critics, .. } = *self;
+        EnsembleShape { members: critics, observation_dim, action_dim, hidden, outputs: 1 }
+    }
+
+    fn check(&self) -> Result<(), PolicyError> {
+        check_range("observation_dim", self.observation_dim)?;
+        check_range("action_dim", self.action_dim)?;
+        check_range("hidden", self.hidden)?;
+        check_range("critics", self.critics)?;
+        // The tensors' shapes do not bound it.
+        check_range("diffusion_steps", self.diffusion_steps * 64)
+    }
+}
+
+/// Target actor and target critics.
+pub struct DiffusionPolicy {
+    shape: DiffusionShape,
+    actor: NoisePredictor,
+    critics: Ensemble,
+}
+
+/// Candidates of some states and what the critics say of them.
+struct Candidates {
+    /// `states × candidates × action_dim`.
+    actions: Vec<f32>,
+    /// Ensemble-mean value of each, `states × candidates`.
+    values: Vec<f32>,
+}
+
+impl DiffusionPolicy {
+    /// What it is called on the wire.
+    pub const KIND: &str = "diffusion";
+
+    /// The tensors of a policy of these networks, as they are named in a file.
+    pub fn tensors(actor: &NoisePredictor, critics: &Ensemble) -> candle_core::Result<Tensors> {
+        let mut tensors = actor.weights().tensors(ACTOR)?;
+        tensors.extend(critics.weights().tensors(CRITIC)?);
+        Ok(tensors)
+    }
+
+    pub(crate) fn load(shape: DiffusionShape, tensors: &mut Tensors, precision: Precision) -> Result<Self, PolicyError> {
+        shape.check()?;
+        let mut weights = |layout: crate::Layout, prefix: &str| -> Result<Weights, PolicyError> {
+            let values = layout.join(tensors, prefix)?;
+            Ok(Weights::constant(layout, values))
+        };
+        let actor = NoisePredictor::new(shape.actor(), weights(shape.actor().layout(), ACTOR)?, precision);
+        let critics = Ensemble::new(shape.critics(), weights(shape.critics().layout(), CRITIC)?, precision);
+        Ok(Self { shape, actor, critics })
+    }
+
+    /// Draws and values candidates; `noise` is `T × states × candidates × action_dim`.
+    fn candidates(&self, observations: &[f32], candidates: usize, noise: Vec<f32>) -> candle_core::Result<Candidates> {
+        let DiffusionShape { observation_dim, action_dim, critics, diffusion_steps, .. } = self.shape;
+        let states = observations.len() / observation_dim;
+        let rows = states * candidates;
+        let observations = Tensor::from_slice(observations, (states, observation_dim), &Device::Cpu)?;
+        let noise = Tensor::from_vec(noise, (diffusion_steps, rows, action_dim), &Device::Cpu)?;
+        let actions = self.actor.sample(&observations, &noise)?;
+        let mut values = vec![0.0; rows];
+        if candidates > 1 {
+            read(&self.critics.values(&observations, &actions)?, |each: &[f32]| {
+                for critic in each.chunks_exact(rows) {
+                    values.iter_mut().zip(critic).for_each(|(mean, q)| *mean += q / critics as f32);
+                }
+            })?;
+        }
+        Ok(Candidates { actions: read(&actions, <[f32]>::to_vec)?, values })
+    }
+}
+
+impl Policy for DiffusionPolicy {
+    fn kind(&self) -> &'static str {
+        Self::KIND
+    }
+
+    fn observation_dim(&self) -> usize {
+        self.shape.observation_dim
+    }
+
+    fn action_dim(&self) -> usize {
+        self.shape.action_dim
+    }
+
+    /// With one candidate the critics are not asked.
+    fn act(
+        &self,
+        observations: &[f32],
+        candidates: usize,
+        noise: &mut [ActionNoise],
+        actions: &mut [f32],
+    ) -> Result<(), PolicyError> {
+        let (n, a, steps) = (noise.len(), self.shape.action_dim, self.shape.diffusion_steps);
+        let row = candidates * a;
+        let mut draws = vec![0.0; steps * n * row];
+        for (i, stream) in noise.iter_mut().enumerate() {
+            for step in 0..steps {
+                stream.fill(&mut draws[(step * n + i) * row..][..row]);
+            }
+        }
+        let drawn = self.candidates(observations, candidates, draws)?;
+        let choices = drawn.actions.chunks_exact(row).zip(drawn.values.chunks_exact(candidates));
+        for (action, (drawn, values)) in actions.chunks_exact_mut(a).zip(choices) {
+            action.copy_from_slice(&drawn[best(values)? * a..][..a]);
+            if action.iter().any(|x| x.is_nan()) {
+                return Err(PolicyError::NotANumber("sampled action"));
+            }
+        }
+        Ok(())
+    }
+}
+
+/// The place of the largest value, the first of equals.
+fn best(values: &[f32]) -> Result<usize, PolicyError> {
+    let mut best = 0;
+    for (i, value) in values.iter().enumerate() {
+        if value.is_nan() {
+            return Err(PolicyError::NotANumber("value of a candidate"));
+        }
+        if *value > values[best] {
+            best = i;
+        }
+    }
+    Ok(best)
+}

@@ -1,0 +1,90 @@
+//! The Gaussian policy: its mean, tanh of a network of the state, is the action. Nothing is sampled.
+
+use crate::kind::check_range;
+use crate::slices::read;
+use crate::weights::{Tensors, Weights};
+use crate::{ActionNoise, Ensemble, EnsembleShape, Policy, PolicyError, Precision};
+use candle_core::{Device, Result, Tensor};
+use serde::{Deserialize, Serialize};
+
+/// Before the names of the network's tensors.
+const ACTOR: &str = "actor.";
+
+/// The shape of a Gaussian policy's network.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+pub struct GaussianShape {
+    /// Numbers in an observation s.
+    pub observation_dim: usize,
+    /// Numbers in an action a.
+    pub action_dim: usize,
+    /// Width of the three hidden layers.
+    pub hidden: usize,
+}
+
+impl GaussianShape {
+    /// Of the network whose tanh is the mean.
+    pub fn actor(&self) -> EnsembleShape {
+        let Self { observation_dim, action_dim, hidden } = *self;
+        EnsembleShape { members: 1, observation_dim, action_dim: 0, hidden, outputs: action_dim }
+    }
+}
+
+/// A policy that does what its network says.
+pub struct GaussianPolicy {
+    shape: GaussianShape,
+    actor: Ensemble,
+}
+
+/// The mean of the policy with this network: `observations [n, o]` → `[n, a]`, each number in (-1, 1).
+pub fn gaussian_mean(actor: &Ensemble, observations: &Tensor) -> Result<Tensor> {
+    actor.state_outputs(observations)?.squeeze(0)?.tanh()
+}
+
+impl GaussianPolicy {
+    /// What it is called on the wire.
+    pub const KIND: &str = "gaussian";
+
+    /// The tensors of a policy with this network, as they are named in a file.
+    pub fn tensors(actor: &Ensemble) -> Result<Tensors> {
+        actor.weights().tensors(ACTOR)
+    }
+
+    pub(crate) fn load(shape: GaussianShape, tensors: &mut Tensors) -> std::result::Result<Self, PolicyError> {
+        check_range("observation_dim", shape.observation_dim)?;
+        check_range("action_dim", shape.action_dim)?;
+        check_range("hidden", shape.hidden)?;
+        let layout = shape.actor().layout();
+        let values = layout.join(tensors, ACTOR)?;
+        Ok(Self { shape, actor: Ensemble::new(shape.actor(), Weights::constant(layout, values), Precision::F32) })
+    }
+}
+
+impl Policy for GaussianPolicy {
+    fn kind(&self) -> &'static str {
+        Self::KIND
+    }
+
+    fn observation_dim(&self) -> usize {
+        self.shape.observation_dim
+    }
+
+    fn action_dim(&self) -> usize {
+        self.shape.action_dim
+    }
+
+    fn act(
+        &self,
+        observations: &[f32],
+        _candidates: usize,
+        noise: &mut [ActionNoise],
+        actions: &mut [f32],
+    ) -> std::result::Result<(), PolicyError> {
+        let observations = Tensor::from_slice(observations, (noise.len(), self.shape.observation_dim), &Device::Cpu)?;
+        let means = gaussian_mean(&self.actor, &observations)?;
+        read(&means, |means: &[f32]| actions.copy_from_slice(means))?;
+        if actions.iter().any(|x| x.is_nan()) {
+            return Err(PolicyError::NotANumber("action"));
+        }
+        Ok(())
+    }
+}

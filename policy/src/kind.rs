@@ -1,0 +1,110 @@
+//! Kinds of policy: what any of them can do, and how one is read from a file that says which it is.
+
+use crate::diffusion::DiffusionPolicy;
+use crate::gaussian::GaussianPolicy;
+use crate::weights::Tensors;
+use crate::{ActionNoise, DiffusionShape, GaussianShape, PolicyError, Precision, check_finite};
+use candle_core::Device;
+use candle_core::safetensors::Load;
+use safetensors::SafeTensors;
+use serde::{Deserialize, Serialize};
+use std::collections::{BTreeMap, HashMap};
+
+/// Key of the description in a safetensors file's metadata.
+const DESCRIPTION: &str = "policy";
+/// Widest hidden layer, most critics and most denoising steps that are believed.
+pub(crate) const MOST: usize = u16::MAX as usize;
+
+/// A trained policy, ready to act.
+pub trait Policy: Send + Sync {
+    /// What kind it is, e.g. `diffusion`.
+    fn kind(&self) -> &'static str;
+
+    /// Numbers in an observation.
+    fn observation_dim(&self) -> usize;
+
+    /// Numbers in an action.
+    fn action_dim(&self) -> usize;
+
+    /// Chooses an action for each of n states.
+    ///
+    /// `observations` is `n × observation_dim`, `actions` (written) `n × action_dim`; `noise` has the stream of each
+    /// state's episode. A kind that samples draws `candidates` actions per state and takes the best of them.
+    ///
+    /// # Errors
+    /// An action or its value is not a number, or candle fails.
+    fn act(
+        &self,
+        observations: &[f32],
+        candidates: usize,
+        noise: &mut [ActionNoise],
+        actions: &mut [f32],
+    ) -> Result<(), PolicyError>;
+}
+
+/// What a file of weights says about itself: the kind of policy and the shapes of its networks.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(tag = "kind", rename_all = "lowercase")]
+pub enum Description {
+    /// Best of several samples of a diffusion model.
+    Diffusion(DiffusionShape),
+    /// The mean of a Gaussian.
+    Gaussian(GaussianShape),
+}
+
+impl Description {
+    /// The kind as it is called on the wire.
+    pub fn kind(&self) -> &'static str {
+        match self {
+            Self::Diffusion(_) => DiffusionPolicy::KIND,
+            Self::Gaussian(_) => GaussianPolicy::KIND,
+        }
+    }
+
+    /// A safetensors file of a policy's weights that says what they are: always the same bytes for the same numbers.
+    ///
+    /// # Errors
+    /// A number that is not finite.
+    pub fn to_safetensors(&self, tensors: &Tensors) -> Result<Vec<u8>, PolicyError> {
+        let mut here = BTreeMap::new();
+        for (name, tensor) in tensors {
+            check_finite(name, tensor)?;
+            here.insert(name, tensor.to_device(&Device::Cpu)?);
+        }
+        let metadata = HashMap::from([(DESCRIPTION.to_owned(), serde_json::to_string(self)?)]);
+        Ok(safetensors::serialize(here, Some(metadata))?)
+    }
+}
+
+/// Reads a policy from a safetensors file: exactly the tensors that its description asks for, all finite.
+///
+/// # Errors
+/// A file that is not what it should be, or a kind of policy that is not known here.
+pub fn load_policy(bytes: &[u8], precision: Precision) -> Result<Box<dyn Policy>, PolicyError> {
+    let (_, metadata) = SafeTensors::read_metadata(bytes)?;
+    let described = metadata.metadata().as_ref().and_then(|metadata| metadata.get(DESCRIPTION));
+    let description = serde_json::from_str(described.ok_or(PolicyError::NoDescription)?)?;
+    let mut tensors = read_tensors(bytes)?;
+    let policy: Box<dyn Policy> = match description {
+        Description::Diffusion(shape) => Box::new(DiffusionPolicy::load(shape, &mut tensors, precision)?),
+        Description::Gaussian(shape) => Box::new(GaussianPolicy::load(shape, &mut tensors)?),
+    };
+    match tensors.into_keys().next() {
+        Some(name) => Err(PolicyError::Unexpected(name)),
+        None => Ok(policy),
+    }
+}
+
+/// All tensors of a safetensors file, on the CPU.
+///
+/// # Errors
+/// A file that cannot be read.
+pub fn read_tensors(bytes: &[u8]) -> Result<Tensors, PolicyError> {
+    let file = SafeTensors::deserialize(bytes)?;
+    file.tensors().into_iter().map(|(name, view)| Ok((name, view.load(&Device::Cpu)?))).collect()
+}
+
+/// That a shape's number is one that somebody could mean.
+pub(crate) fn check_range(field: &'static str, value: usize) -> Result<(), PolicyError> {
+    if (1..=MOST).contains(&value) { Ok(()) } else { Err(PolicyError::Range { field, value }) }
+}
