@@ -143,7 +143,7 @@ fn noise_predictors_give_the_plain_bodys_values_and_gradients() {
         let fast = actor.predict(&observations, &actions, &t).unwrap();
         let plain = actor.plain_predict(&observations, &actions, &t).unwrap();
         close("prediction", &fast, &plain);
-        close("constant prediction", &actor.predict_constant(&observations, &actions, &t).unwrap(), &plain);
+        close("frozen prediction", &actor.frozen().predict(&observations, &actions, &t).unwrap(), &plain);
         let gradient = |predicted: Tensor| {
             let loss = (predicted - &epsilon).unwrap().sqr().unwrap().mean_all().unwrap();
             actor.weights().gradient(&loss.backward().unwrap()).unwrap().copy().unwrap()

@@ -70,11 +70,19 @@ impl Ensemble {
         &mut self.weights
     }
 
+    /// The same networks with their weights as constants, which share their memory with these.
+    pub fn frozen(&self) -> Self {
+        let (layers, weights) = (self.layers.clone(), self.weights.frozen());
+        let (rounded, records) = (RoundedOnce::default(), Records::default());
+        Self { shape: self.shape, layers, weights, precision: Precision::F32, rounded, records }
+    }
+
     /// What comes out, `[K, rows, outputs]`, a row for each action.
     ///
     /// `observations` is `[n, o]`; `actions` `[rows, a]`, where equally many consecutive rows share an observation, or
     /// `[K, n, a]` with actions for each member. Gradients flow to the weights, or to the actions.
     pub fn outputs(&self, observations: &Tensor, actions: &Tensor) -> Result<Tensor> {
+        self.check(observations.dims(), actions.dims())?;
         let weights = self.weights.values();
         let gradients = (weights.track_op(), actions.track_op());
         if !weights.device().is_cpu() || observations.track_op() || gradients == (true, true) {
@@ -111,6 +119,19 @@ impl Ensemble {
     pub fn state_outputs(&self, observations: &Tensor) -> Result<Tensor> {
         let none = Tensor::zeros((observations.dim(0)?, 0), observations.dtype(), observations.device())?;
         self.outputs(observations, &none)
+    }
+
+    fn check(&self, observations: &[usize], actions: &[usize]) -> Result<()> {
+        let EnsembleShape { members, observation_dim, action_dim, .. } = self.shape;
+        let fits = match (observations, actions) {
+            ([n, o], [rows, a]) => *n > 0 && *rows > 0 && rows % n == 0 && (*o, *a) == (observation_dim, action_dim),
+            ([n, o], [k, rows, a]) => *n > 0 && n == rows && (*k, *o, *a) == (members, observation_dim, action_dim),
+            _ => false,
+        };
+        if !fits {
+            bail!("networks of {observation_dim} and {action_dim} numbers got {observations:?} and {actions:?}");
+        }
+        Ok(())
     }
 
     fn rounded(&self) -> Result<Arc<Vec<[Rounded; 2]>>> {
@@ -279,17 +300,9 @@ impl CustomOp3 for Outputs {
         actions: &CpuStorage,
         actions_layout: &candle_core::Layout,
     ) -> Result<(CpuStorage, Shape)> {
-        let EnsembleShape { members, observation_dim, action_dim, outputs, .. } = self.shape;
-        let (states, o) = observations_layout.shape().dims2()?;
-        let rows = actions_layout.dims()[actions_layout.dims().len() - 2];
-        let wanted = if self.own_actions { vec![members, rows, action_dim] } else { vec![rows, action_dim] };
-        if o != observation_dim || actions_layout.dims() != wanted || states == 0 || rows % states != 0 || rows == 0 {
-            bail!(
-                "an ensemble for {observation_dim} and {action_dim} numbers got observations {:?} and actions {:?}",
-                observations_layout.dims(),
-                actions_layout.dims()
-            );
-        }
+        let EnsembleShape { members, action_dim, outputs, .. } = self.shape;
+        let dims = actions_layout.dims();
+        let (states, rows) = (observations_layout.dims()[0], dims[dims.len() - 2]);
         let weights = slice(weights, weights_layout)?;
         let (observations, actions) = (slice(observations, observations_layout)?, slice(actions, actions_layout)?);
         let mut out = vec![0.0; members * rows * outputs];

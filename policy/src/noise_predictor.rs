@@ -140,14 +140,10 @@ impl NoisePredictor {
         weights.apply_op3(&observations.contiguous()?, &actions.contiguous()?, operation)
     }
 
-    /// [`Self::predict`] without a way back.
-    pub fn predict_constant(&self, observations: &Tensor, actions: &Tensor, t: &Tensor) -> Result<Tensor> {
-        let weights = self.weights.values().detach();
-        if !weights.device().is_cpu() {
-            return Ok(self.plain_predict(observations, actions, t)?.detach());
-        }
-        let operation = Predict { parts: self.parts.clone(), t: read(t, <[u32]>::to_vec)?, gradient: None };
-        weights.apply_op3_no_bwd(&observations.contiguous()?, &actions.contiguous()?, &operation)
+    /// The same network with its weights as constants, which share their memory with these.
+    pub fn frozen(&self) -> Self {
+        let (parts, weights) = (self.parts.clone(), self.weights.frozen());
+        Self { parts, weights, precision: Precision::F32, rounded: RoundedOnce::default(), records: Records::default() }
     }
 
     /// Draws actions by the whole reverse process (DDPM), x_0 clipped to [-1, 1] at each step.

@@ -108,6 +108,11 @@ impl Weights {
         Ok(Self::constant(self.layout.clone(), self.values.detach().copy()?))
     }
 
+    /// The same vector as a constant; it changes with this one.
+    pub(crate) fn frozen(&self) -> Self {
+        Self::constant(self.layout.clone(), self.values.detach())
+    }
+
     /// Xavier-uniform kernels, U(±√(6/(in + out))), and zero biases.
     pub fn initial(layout: &Layout, generator: &mut impl Rng, device: &Device) -> Result<Tensor> {
         let mut values = vec![0.0; layout.count()];

@@ -1,0 +1,283 @@
+//! QUAD (Algorithm 1 of the paper): a diffusion policy is cloned from the data and pulled along the critics' gradients,
+//! as far as the critics agree on them. Equations are the paper's; where it is silent, docs/deviations.md says what holds.
+
+mod config;
+#[cfg(test)]
+mod golden;
+
+use super::{Algorithm, AlgorithmError, Definition, Metric, Minibatch, Setting, numbers};
+use crate::optimiser::{Adam, AdamStep, cosine_decay, follow};
+use crate::random::{Purpose, stream};
+use candle_core::{DType, Device, Result, Tensor, Var};
+use candle_nn::loss::mse;
+use config::{Guidance, Quad as Config, TargetReduce};
+use quad_policy::{Description, DiffusionPolicy, DiffusionShape, Ensemble, NoisePredictor, PolicyError, Tensors, Weights};
+use rand::Rng;
+use rand_distr::{Distribution, StandardNormal};
+
+/// What the learner has to know of it.
+pub const DEFINITION: Definition = Definition { name: "quad", metrics: METRICS, read: config::read };
+
+const METRICS: &[Metric] = &[
+    Metric { name: "q_mean", label: "", help: "Mean over the batch of the critics' target y (Eq. 20). A value that grows without end is overestimation." },
+    Metric { name: "critic_loss", label: "critic loss", help: "Mean over critics and batch of (y − Q_k(s, a))² with y = r + γ·mask·Q_LCB(s', a'), Q_LCB = mean_k Q̂_k − ρ·std_k Q̂_k (Eq. 20)." },
+    Metric { name: "bc_loss", label: "BC loss", help: "Mean over batch and dimensions of (ε − ε_θ(a^t, s, t))², the behaviour-cloning term of Eq. 19 before η. 1 is a predictor that always says 0; a policy that knows the data lies well below." },
+    Metric { name: "actor_loss", label: "", help: "Eq. 19: η·(BC loss) + mean of λ·w(t)·ε_θ·ḡ, where ḡ is the Q-gradient (Eq. 10) over the mean of |Q̂_k(s, a)| and w(t) = √(1 − ᾱ_t)." },
+    Metric { name: "eta", label: "η", help: "Strength η of behaviour cloning (Eq. 19). With a threshold b it rises while the BC loss is above b and falls while it is below; without one, or without guidance, it is constant." },
+    Metric { name: "lambda_mean", label: "λ", help: "Mean over the batch of λ = ν̂²/(ν̂² + σ²/τ + δ) (Eq. 24), in (0, 1]: how far the critics' gradients are trusted. 1 with guidance dac, 0 with guidance none." },
+    Metric { name: "delta_share", label: "", help: "Share of the batch, 0 to 1, in which δ is more than a hundredth of the denominator of λ (Eq. 24), so that it decides λ and not the critics. 0 unless guidance is quad." },
+    Metric { name: "nu_squared", label: "", help: "ν̂²: moving average of the variance over the batch of the critics' mean alignment (Eq. 21–23). 0 without guidance." },
+    Metric { name: "critic_gradient_norm", label: "", help: "Global norm of the critics' gradient before clipping." },
+    Metric { name: "actor_gradient_norm", label: "", help: "Global norm of the actor's gradient before clipping." },
+    Metric { name: "learning_rate", label: "", help: "The actor's learning rate; falls to 0 along a cosine." },
+];
+
+/// QUAD in the middle of a run.
+pub(super) struct Quad {
+    config: Config,
+    setting: Setting,
+    shape: DiffusionShape,
+    /// ε_θ and its EMA.
+    actor: NoisePredictor,
+    target_actor: NoisePredictor,
+    /// Q_1..Q_K and their EMA Q̂.
+    critics: Ensemble,
+    target_critics: Ensemble,
+    actor_adam: Adam,
+    critic_adam: Adam,
+    /// Strength η of behaviour cloning, `[]`.
+    eta: Tensor,
+    /// ν̂² (Eq. 23), `[]`; none before the first guided update.
+    nu_squared: Option<Tensor>,
+}
+
+/// The random numbers of one update.
+struct Noise {
+    /// Of the sampled next actions, `[T, B·S, a]`: a^T, then the reverse steps' noise from t = T down to 2.
+    next: Tensor,
+    /// Denoising step of each transition, in 1..=T, `[B]`.
+    t: Vec<u32>,
+    /// ε of Eq. 5, `[B, a]`.
+    epsilon: Tensor,
+}
+
+/// What the critics say about noisy actions, and how far they are trusted.
+struct Advice {
+    /// g_k: ∇_a Q̂_k(s, a^t) over the mean of |Q̂_k(s, a)|, `[K, B, a]`; ḡ is their mean (Eq. 10).
+    gradients: Tensor,
+    /// σ² (Eq. 22), `[B]`.
+    variance: Tensor,
+    /// ν̂² after this batch (Eq. 23), `[]`.
+    nu_squared: Tensor,
+    /// λ (Eq. 24), `[B]`.
+    lambda: Tensor,
+    /// Share of the batch in which δ decides λ, `[]`.
+    delta_share: Tensor,
+}
+
+impl Quad {
+    fn new(config: Config, setting: Setting) -> std::result::Result<Self, AlgorithmError> {
+        let shape = DiffusionShape {
+            observation_dim: setting.observation_dim,
+            action_dim: setting.action_dim,
+            hidden: config.hidden,
+            critics: config.critics,
+            diffusion_steps: config.diffusion_steps,
+        };
+        let weights = |layout: quad_policy::Layout, network| {
+            let mut generator = stream(setting.seed, Purpose::Weights, network);
+            let values = Weights::initial(&layout, &mut generator, &setting.device)?;
+            Weights::trainable(layout, &values)
+        };
+        let (actor, critics) = (weights(shape.actor().layout(), 0)?, weights(shape.critics().layout(), 1)?);
+        let precision = setting.precision;
+        Ok(Self {
+            actor_adam: Adam::new(&actor)?,
+            critic_adam: Adam::new(&critics)?,
+            target_actor: NoisePredictor::new(shape.actor(), actor.copy()?, precision),
+            target_critics: Ensemble::new(shape.critics(), critics.copy()?, precision),
+            actor: NoisePredictor::new(shape.actor(), actor, precision),
+            critics: Ensemble::new(shape.critics(), critics, precision),
+            eta: Tensor::new(config.eta.initial, &setting.device)?,
+            nu_squared: None,
+            shape,
+            config,
+            setting,
+        })
+    }
+
+    fn noise(&self, step: u64) -> Result<Noise> {
+        let mut generator = stream(self.setting.seed, Purpose::Noise, step);
+        let (b, a, device) = (self.setting.batch_size, self.shape.action_dim, &self.setting.device);
+        let (steps, rows) = (self.config.diffusion_steps, b * self.config.samples);
+        let mut normal = |n: usize| -> Vec<f32> { (0..n).map(|_| StandardNormal.sample(&mut generator)).collect() };
+        let (next, epsilon) = (normal(steps * rows * a), normal(b * a));
+        Ok(Noise {
+            next: Tensor::from_vec(next, (steps, rows, a), device)?,
+            epsilon: Tensor::from_vec(epsilon, (b, a), device)?,
+            t: (0..b).map(|_| generator.random_range(1..=steps as u32)).collect(),
+        })
+    }
+
+    /// One pass through Algorithm 1's loop; `step` counts from 0.
+    fn step(&mut self, step: u64, batch: &Minibatch, noise: &Noise) -> Result<Vec<f32>> {
+        let decay = cosine_decay(step, self.setting.total_steps);
+        let (clip, count, ema_rate) = (Some(self.config.gradient_clip), step + 1, self.config.ema_rate);
+
+        // Lines 4–7: every critic towards the lower confidence bound (Eq. 20).
+        let targets = self.targets(batch, noise)?;
+        let q = self.critics.values(&batch.observations, &batch.actions)?;
+        let critic_loss = q.broadcast_sub(&targets)?.sqr()?.mean_all()?;
+        let adam = AdamStep { rate: self.config.critic_learning_rate * decay, clip, count };
+        let critic_gradient_norm = self.critic_adam.step(self.critics.weights_mut(), &critic_loss.backward()?, adam)?;
+        follow(self.target_critics.weights_mut(), self.critics.weights(), ema_rate)?;
+
+        // Lines 8–11: behaviour cloning, pulled along the gradients that the critics agree on (Eq. 5 and 19).
+        let (signal, deviation) = self.actor.schedule().noising(&noise.t, &self.setting.device)?;
+        let noisy = (batch.actions.broadcast_mul(&signal)? + noise.epsilon.broadcast_mul(&deviation)?)?;
+        let t = Tensor::from_slice(&noise.t, noise.t.len(), &self.setting.device)?;
+        let predicted = self.actor.predict(&batch.observations, &noisy, &t)?;
+        let bc_loss = mse(&predicted, &noise.epsilon)?;
+        let mut actor_loss = (&bc_loss * &self.eta)?;
+        let zero = self.eta.zeros_like()?;
+        let (mut lambda_mean, mut delta_share) = (zero.clone(), zero.clone());
+        if self.config.guidance != Guidance::None {
+            let advice = self.advice(batch, &noisy, &predicted.detach())?;
+            let weight = (advice.lambda.unsqueeze(1)? * &deviation)?;
+            let pull = advice.gradients.mean(0)?.broadcast_mul(&weight)?;
+            actor_loss = (actor_loss + (&predicted * pull)?.mean_all()?)?;
+            (lambda_mean, delta_share) = (advice.lambda.mean_all()?, advice.delta_share);
+            self.nu_squared = Some(advice.nu_squared);
+        }
+        let rate = self.config.actor_learning_rate * decay;
+        let adam = AdamStep { rate, clip, count };
+        let actor_gradient_norm = self.actor_adam.step(self.actor.weights_mut(), &actor_loss.backward()?, adam)?;
+
+        // Line 12: dual ascent on η, with the actor as it is now.
+        if let Some(threshold) = self.config.eta.threshold
+            && self.config.guidance != Guidance::None
+        {
+            let predicted = self.actor.frozen().predict(&batch.observations, &noisy, &t)?;
+            let excess = (mse(&predicted, &noise.epsilon)? - f64::from(threshold))?.clamp(-1f32, 1f32)?;
+            let raised = (&self.eta + (excess * f64::from(self.config.eta.rate))?)?;
+            self.eta = raised.clamp(self.config.eta.minimum, self.config.eta.maximum)?;
+        }
+        if step.is_multiple_of(self.config.actor_ema_every) && step > self.config.actor_ema_start {
+            follow(self.target_actor.weights_mut(), self.actor.weights(), ema_rate)?;
+        }
+
+        let nu_squared = self.nu_squared.as_ref().unwrap_or(&zero);
+        let mut metrics = numbers(&[
+            &targets.mean_all()?,
+            &critic_loss,
+            &bc_loss,
+            &actor_loss,
+            &self.eta,
+            &lambda_mean,
+            &delta_share,
+            nu_squared,
+            &critic_gradient_norm,
+            &actor_gradient_norm,
+        ])?;
+        metrics.push(rate);
+        Ok(metrics)
+    }
+
+    /// y = r + γ·mask·(mean - ρ·std over the critics of each one's value of s') (Eq. 20), `[B]`. Each critic's value of s'
+    /// is the mean, or the largest, of its values of the sampled actions.
+    fn targets(&self, batch: &Minibatch, noise: &Noise) -> Result<Tensor> {
+        let next_actions = self.target_actor.sample(&batch.next_observations, &noise.next)?;
+        let q = self.target_critics.values(&batch.next_observations, &next_actions)?;
+        let q = q.reshape((self.config.critics, (), self.config.samples))?;
+        let value = match self.config.target_reduce {
+            TargetReduce::Mean => q.mean(2)?,
+            // A maximum would drop a NaN; zero times their sum lets none get lost.
+            TargetReduce::Max => (q.max(2)? + (q.sum(2)? * 0.0)?)?,
+        };
+        let (mean, variance) = mean_and_variance(&value)?;
+        let bound = (mean - (variance.sqrt()? * f64::from(self.config.rho))?)?;
+        &batch.rewards + ((bound * &batch.masks)? * f64::from(self.config.gamma))?
+    }
+
+    /// The target critics' gradients at noisy actions, and λ for each (Eq. 10 and 21–24); all of it constants.
+    fn advice(&self, batch: &Minibatch, noisy: &Tensor, predicted: &Tensor) -> Result<Advice> {
+        let (tau, delta) = (f64::from(self.config.tau), f64::from(self.config.delta));
+        let scale = (self.target_critics.values(&batch.observations, &batch.actions)?.abs()?.mean_all()? + 1e-6)?;
+        // Actions for each critic, so that one pass gives the gradients of all: none has a part in another's.
+        let actions = Var::from_tensor(&noisy.broadcast_left(self.config.critics)?)?;
+        let q = self.target_critics.values(&batch.observations, &actions)?;
+        let gradients = q.sum_all()?.backward()?.remove(&actions);
+        let gradients = gradients.ok_or_else(|| candle_core::Error::Msg("no gradient at actions".into()))?;
+        let gradients = gradients.broadcast_div(&scale)?;
+
+        let size = (predicted.sqr()?.sum_keepdim(1)?.sqrt()? + 1e-8)?;
+        let direction = predicted.broadcast_div(&size)?; // u, Eq. 21
+        let alignment = gradients.broadcast_mul(&direction)?.sum(2)?; // l_k = u·g_k, [K, B]
+        let (mean, variance) = mean_and_variance(&alignment)?;
+        let spread = mean.broadcast_sub(&mean.mean_all()?)?.sqr()?.mean_all()?;
+        let nu_squared = match &self.nu_squared {
+            Some(before) => (before + ((spread - before)? * f64::from(self.config.nu_ema_rate))?)?,
+            None => spread,
+        };
+        let (lambda, delta_share) = match self.config.guidance {
+            Guidance::Quad => {
+                let denominator = ((&variance / tau)? + delta)?.broadcast_add(&nu_squared)?;
+                let decided = denominator.lt(100.0 * delta)?.to_dtype(DType::F32)?.mean_all()?;
+                (denominator.recip()?.broadcast_mul(&nu_squared)?, decided)
+            }
+            Guidance::Dac | Guidance::None => (variance.ones_like()?, nu_squared.zeros_like()?),
+        };
+        Ok(Advice { gradients, variance, nu_squared, lambda, delta_share })
+    }
+}
+
+/// `[K, B]` → mean over K, and population variance over K.
+fn mean_and_variance(x: &Tensor) -> Result<(Tensor, Tensor)> {
+    let mean = x.mean_keepdim(0)?;
+    let variance = x.broadcast_sub(&mean)?.sqr()?.mean(0)?;
+    Ok((mean.squeeze(0)?, variance))
+}
+
+impl Algorithm for Quad {
+    fn update(&mut self, step: u64, batch: &Minibatch) -> Result<Vec<f32>> {
+        let noise = self.noise(step)?;
+        self.step(step, batch, &noise)
+    }
+
+    fn policy(&self) -> Result<(Description, Tensors)> {
+        let tensors = DiffusionPolicy::tensors(&self.target_actor, &self.target_critics)?;
+        Ok((Description::Diffusion(self.shape), tensors))
+    }
+
+    fn state(&self) -> Result<Tensors> {
+        let (actor, critics) = (self.actor.weights(), self.critics.weights());
+        let mut tensors = actor.tensors("actor.")?;
+        tensors.extend(critics.tensors("critic.")?);
+        tensors.extend(self.target_actor.weights().tensors("target_actor.")?);
+        tensors.extend(self.target_critics.weights().tensors("target_critic.")?);
+        tensors.extend(self.actor_adam.tensors(actor, "actor.")?);
+        tensors.extend(self.critic_adam.tensors(critics, "critic.")?);
+        tensors.insert("eta".to_owned(), self.eta.reshape(1)?);
+        if let Some(nu_squared) = &self.nu_squared {
+            tensors.insert("nu_squared".to_owned(), nu_squared.reshape(1)?);
+        }
+        Ok(tensors)
+    }
+
+    fn load(&mut self, tensors: &mut Tensors) -> std::result::Result<(), PolicyError> {
+        self.actor.weights_mut().load(tensors, "actor.")?;
+        self.critics.weights_mut().load(tensors, "critic.")?;
+        self.target_actor.weights_mut().load(tensors, "target_actor.")?;
+        self.target_critics.weights_mut().load(tensors, "target_critic.")?;
+        self.actor_adam.load(self.actor.weights(), tensors, "actor.")?;
+        self.critic_adam.load(self.critics.weights(), tensors, "critic.")?;
+        self.eta = scalar(tensors, "eta", &self.setting.device)?.ok_or_else(|| PolicyError::Missing("eta".to_owned()))?;
+        self.nu_squared = scalar(tensors, "nu_squared", &self.setting.device)?;
+        Ok(())
+    }
+}
+
+/// Takes a tensor of one number out of `tensors`, if it is there.
+fn scalar(tensors: &mut Tensors, name: &str, device: &Device) -> Result<Option<Tensor>> {
+    tensors.remove(name).map(|tensor| tensor.reshape(())?.to_device(device)).transpose()
+}

@@ -1,0 +1,33 @@
+//! Where the learner's random numbers come from: a stream per purpose, each a function of the run's seed and a counter, so
+//! that no generator holds anything that a saved run would have to remember.
+
+use rand::SeedableRng;
+use rand_chacha::ChaCha8Rng;
+
+/// What random numbers are for.
+#[derive(Clone, Copy, Debug)]
+pub enum Purpose {
+    /// Initial weights; counted by network.
+    Weights,
+    /// The noise of an update; counted by gradient step.
+    Noise,
+    /// The seeds of an evaluation's episodes; counted by gradient step.
+    Episodes,
+}
+
+impl Purpose {
+    fn key(self) -> u64 {
+        u64::from_be_bytes(match self {
+            Self::Weights => *b"weights ",
+            Self::Noise => *b"noise   ",
+            Self::Episodes => *b"episodes",
+        })
+    }
+}
+
+/// The stream of a run's seed for a purpose.
+pub fn stream(seed: u64, purpose: Purpose, count: u64) -> ChaCha8Rng {
+    let mut generator = ChaCha8Rng::seed_from_u64(seed ^ purpose.key());
+    generator.set_stream(count);
+    generator
+}
