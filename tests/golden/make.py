@@ -15,6 +15,7 @@ from pathlib import Path
 import numpy as np
 from safetensors.numpy import save_file
 
+import iql
 import quad
 
 HERE = Path(__file__).parent
@@ -31,8 +32,9 @@ FOLDERS = {
     "eta-clip-down": (8, "eta-clip-down", "narrow"),
     "eta-maximum": (9, "eta-maximum", "narrow"),
     "eta-minimum": (10, "eta-minimum", "narrow"),
+    "iql": (13, "iql", "small"),
 }
-ALGORITHMS = {variant: algorithm for algorithm in (quad,) for variant in algorithm.VARIANTS}
+ALGORITHMS = {variant: algorithm for algorithm in (quad, iql) for variant in algorithm.VARIANTS}
 
 
 def make(seed, variant, size):
