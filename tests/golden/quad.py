@@ -1,0 +1,350 @@
+"""One update of QUAD. Equation numbers are its paper's; where that is silent, the rules are DAC's (docs/golden.md)."""
+
+import math
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from networks import (
+    ADAM,
+    adam_step,
+    clip_by_norm,
+    compiled,
+    decayed,
+    follow,
+    layers,
+    mlp,
+    near,
+    random_moments,
+    random_network,
+    single,
+    values,
+)
+
+TIME_FEATURES, TIME_EMBEDDING = 16, 32
+
+# Large rates, so that a mistake in an optimiser or an average is far larger than float32's rounding.
+AGENT = {
+    "diffusion_steps": 5,
+    "gamma": 0.99,
+    "rho": 1.5,
+    "guidance": "quad",
+    "tau": 0.5,
+    "delta": 6e-3,
+    "target_reduce": "mean",
+    "eta": {"initial": 1.0, "threshold": 0.7, "rate": 0.05, "minimum": 1e-3, "maximum": 100.0},
+    "actor_learning_rate": 0.02,
+    "critic_learning_rate": 0.03,
+    "gradient_clip": 0.5,
+    "ema_rate": 0.05,
+    "nu_ema_rate": 0.1,
+    "actor_ema_every": 5,
+    "actor_ema_start": 1000,
+}
+# Small and odd, so that no row is a whole number of vector registers.
+SIZES = {
+    "narrow": {"hidden": 5, "critics": 2, "samples": 2, "batch_size": 7, "select": 3},
+    "small": {"hidden": 11, "critics": 3, "samples": 2, "batch_size": 8, "select": 6},
+    "hopper": {"hidden": 256, "critics": 10, "samples": 10, "batch_size": 256, "select": 32},
+}
+
+
+class Variant(NamedTuple):
+    step: int  # early, where Adam's bias correction is large, or late, where the learning rate has decayed
+    follows: bool  # whether the target actor moves
+    eta: str  # what becomes of η, in the words of what_eta_does
+    agent: dict  # where it differs from AGENT
+    epsilon: float = 1.0  # the size of ε; larger, it makes the BC loss larger
+
+
+def eta(**changes):
+    return {"eta": AGENT["eta"] | changes}
+
+
+VARIANTS = {
+    "quad": Variant(1235, True, "moves", {}),
+    "dac": Variant(1000, False, "moves", {"guidance": "dac", "gradient_clip": 100.0}),
+    "maxq": Variant(
+        4,
+        False,
+        "stays",
+        {"target_reduce": "max", "samples": 3, "rho": 1.0, "tau": 10.0, "delta": 2e-3, "actor_ema_start": 3}
+        | {"eta": {"initial": 0.1, "rate": 0.05, "minimum": 1e-3, "maximum": 100.0}},
+    ),
+    "none": Variant(0, False, "stays", {"guidance": "none", "actor_ema_start": 0}),
+    "one-sample": Variant(1005, True, "moves", {"samples": 1}),
+    "ten-critics": Variant(1234, False, "moves", {"critics": 10, "samples": 4}),
+    "eta-clip-up": Variant(20, False, "clipped at +1", eta(rate=0.3), epsilon=1.7),
+    "eta-clip-down": Variant(1100, True, "clipped at -1", eta(threshold=3.5, rate=0.3)),
+    "eta-maximum": Variant(1500, True, "at the maximum", eta(initial=1.99, threshold=0.6, rate=0.3, maximum=2.0)),
+    "eta-minimum": Variant(1999, False, "at the minimum", eta(initial=0.51, threshold=1.8, rate=0.3, minimum=0.5)),
+}
+
+
+def make_config(variant, size):
+    sizes = SIZES[size].copy()
+    batch_size = sizes.pop("batch_size")
+    sizes.pop("select")
+    return {
+        "algorithm": "quad",
+        "observation_dim": 11,
+        "action_dim": 3,
+        "batch_size": batch_size,
+        "candidates": 10,
+        "total_steps": 2000,
+        "step": VARIANTS[variant].step,
+        "adam": ADAM,
+        "agent": AGENT | sizes | VARIANTS[variant].agent,
+    }
+
+
+# The noise predictor and the diffusion. Arrays over t have T + 1 entries, so that index t is step t; ᾱ_0 = 1.
+
+
+def predict_noise(actor, states, noisy_actions, t):
+    """ε_θ(s, a^t, t), shapes [..., o], [..., a], [...]."""
+    frequencies = jnp.exp(-jnp.arange(8) * math.log(10_000) / 7)
+    angles = t[..., None] * frequencies
+    features = jnp.concatenate([jnp.cos(angles), jnp.sin(angles)], -1)
+    time = mlp(actor, "time.", 2, features)
+    return mlp(actor, "trunk.", 4, jnp.concatenate([states, noisy_actions, time], -1))
+
+
+fast_noise, fast_values = compiled(predict_noise), compiled(values)
+
+
+def schedule(steps):
+    t = np.arange(1, steps + 1)
+    beta = np.concatenate([[0.0], 1 - np.exp(-0.1 / steps - 0.5 * (10 - 0.1) * (2 * t - 1) / steps**2)])
+    return beta, np.cumprod(1 - beta)
+
+
+def denoise(actor, states, noisy_actions, t, steps):
+    """x0 and the mean of one reverse step at the whole number t, without its noise."""
+    beta, alpha_bar = schedule(steps)
+    epsilon = fast_noise(actor, states, noisy_actions, np.full(states.shape[:-1], t))
+    x0 = (noisy_actions - math.sqrt(1 - alpha_bar[t]) * epsilon) / math.sqrt(alpha_bar[t])
+    x0 = np.clip(x0, -1, 1)
+    of_x0 = math.sqrt(alpha_bar[t - 1]) * float(beta[t])
+    of_noisy = math.sqrt(1 - beta[t]) * float(1 - alpha_bar[t - 1])
+    return x0, (of_x0 * x0 + of_noisy * noisy_actions) / float(1 - alpha_bar[t])
+
+
+def sample(actor, states, noise):
+    """Actions for states [n, o] with noise [T, n, samples, a]; also the states, once for each action."""
+    steps = len(noise)
+    beta, _ = schedule(steps)
+    states = np.broadcast_to(states[:, None], noise.shape[1:-1] + states.shape[-1:])
+    actions = noise[0]
+    for t in range(steps, 0, -1):
+        _, actions = denoise(actor, states, actions, t, steps)
+        if t > 1:
+            actions = actions + math.sqrt(beta[t]) * noise[steps - t + 1]
+    return actions, states
+
+
+# Losses and their gradients.
+
+
+def critic_loss(critics, states, actions, targets):
+    return jnp.mean((values(critics, states, actions) - targets) ** 2)
+
+
+def actor_loss(actor, states, noisy_actions, t, epsilon, eta, weight, gradient):
+    """Eq. 19, given weight λ·w(t) [B, 1] and the normalised gradient ḡ [B, a]; also its two terms."""
+    predicted = predict_noise(actor, states, noisy_actions, t)
+    bc = jnp.mean((epsilon - predicted) ** 2)
+    guidance = jnp.mean(weight * predicted * gradient)
+    return eta * bc + guidance, (bc, guidance)
+
+
+@compiled
+def action_gradients(critics, states, actions):
+    """∂Q_k/∂a for each critic and row, [K, B, a]; rows do not depend on one another, so their sum will do."""
+
+    def total(critic, actions):
+        return mlp(critic, "", 4, jnp.concatenate([states, actions], -1)).sum()
+
+    return jax.vmap(jax.grad(total, 1), (0, None))(critics, actions)
+
+
+critic_gradient = compiled(jax.value_and_grad(critic_loss))
+actor_gradient = compiled(jax.value_and_grad(actor_loss, has_aux=True))
+
+
+# One update.
+
+
+def target_values(config, state, inputs):
+    """Next actions [B, S, a] and the bootstrapped targets y [B], Eq. 20."""
+    agent = config["agent"]
+    next_actions, next_states = sample(state["target_actor"], inputs["next_observations"], inputs["next_noise"])
+    q = fast_values(state["target_critic"], next_states, next_actions)  # [K, B, S]
+    q = q.max(-1) if agent["target_reduce"] == "max" else q.mean(-1)  # each critic's own, [K, B]
+    lcb = q.mean(0) - agent["rho"] * q.std(0)
+    return next_actions, inputs["rewards"] + agent["gamma"] * inputs["masks"] * lcb
+
+
+def guide(config, state, inputs, noisy, target_critic):
+    """Eq. 10 and 21-24: λ [B], ḡ [B, a], and what else of them is compared or of interest."""
+    agent, s, a = config["agent"], inputs["observations"], inputs["actions"]
+    if agent["guidance"] == "none":
+        nothing = {"nu_squared": state["nu_squared"], "lambda_mean": 0.0, "delta_share": 0.0}
+        return np.zeros(len(s)), np.zeros_like(a), nothing, np.ones(len(s))
+    gradients = action_gradients(target_critic, s, noisy)
+    q_scale = np.abs(fast_values(target_critic, s, a)).mean() + 1e-6
+    g = gradients / q_scale
+    predicted = fast_noise(state["actor"], s, noisy, inputs["t"])
+    u = predicted / (np.linalg.norm(predicted, axis=-1, keepdims=True) + 1e-8)
+    alignment = (u * g).sum(-1)  # [K, B]
+    sigma_squared = alignment.var(0)
+    nu_squared, batch_nu, rate = state["nu_squared"][0], alignment.mean(0).var(), agent["nu_ema_rate"]
+    nu_squared = batch_nu if nu_squared < 0 else (1 - rate) * nu_squared + rate * batch_nu
+    weights, share_of_delta = np.ones(len(s)), np.zeros(len(s))
+    if agent["guidance"] == "quad":
+        denominator = nu_squared + sigma_squared / agent["tau"] + agent["delta"]
+        weights, share_of_delta = nu_squared / denominator, agent["delta"] / denominator
+    out = {"critic_action_gradients": gradients, "q_scale": q_scale, "u": u, "sigma_squared": sigma_squared}
+    out |= {"nu_squared": nu_squared, "lambda": weights, "lambda_mean": weights.mean()}
+    return weights, g.mean(0), out | {"delta_share": np.mean(share_of_delta > 0.01)}, share_of_delta
+
+
+def update(config, state, inputs):
+    """All that must come out; and, for whoever draws the inputs, how each row's δ and η's step came out."""
+    agent, step = config["agent"], config["step"]
+    beta, alpha_bar = schedule(agent["diffusion_steps"])
+    s, a, t, epsilon = (inputs[name] for name in ("observations", "actions", "t", "epsilon"))
+    out = {"schedule.beta": beta[1:], "schedule.alpha_bar": alpha_bar[1:]}
+
+    next_actions, targets = target_values(config, state, inputs)
+    out |= {"next_actions": next_actions, "targets": targets, "q_mean": targets.mean()}
+
+    # Critics, and their targets.
+    loss, gradients = critic_gradient(state["critic"], s, a, targets)
+    gradients, norm = clip_by_norm(gradients, agent["gradient_clip"])
+    out |= adam_step(state, "critic", gradients, decayed(agent["critic_learning_rate"], config), step)
+    out |= {"critic_loss": loss, "critic_gradient_norm": norm}
+    out["target_critic"] = follow(state["target_critic"], out["critic"], agent["ema_rate"])
+
+    # Noisy actions, Eq. 5, and their guidance by the critics' new targets.
+    noise_level = np.sqrt(1 - alpha_bar[t])[:, None]  # also w(t)
+    out["noisy_actions"] = noisy = np.sqrt(alpha_bar[t])[:, None] * a + noise_level * epsilon
+    weights, mean_gradient, more, share_of_delta = guide(config, state, inputs, noisy, out["target_critic"])
+    out |= more
+
+    # Actor, Eq. 19.
+    arguments = (s, noisy, t, epsilon, state["eta"][0], weights[:, None] * noise_level, mean_gradient)
+    (loss, (bc, guidance)), gradients = actor_gradient(state["actor"], *arguments)
+    gradients, norm = clip_by_norm(gradients, agent["gradient_clip"])
+    out |= adam_step(state, "actor", gradients, decayed(agent["actor_learning_rate"], config), step)
+    out |= {"actor_loss": loss, "bc_loss": bc, "guidance_loss": guidance, "actor_gradient_norm": norm}
+
+    # Dual ascent on η, with the actor that has just moved.
+    (_, (bc, _)), _ = actor_gradient(out["actor"], *arguments)
+    eta, difference = state["eta"][0], 0.0
+    if agent["guidance"] != "none" and "threshold" in agent["eta"]:
+        difference = bc - agent["eta"]["threshold"]
+        eta = eta + agent["eta"]["rate"] * np.clip(difference, -1, 1)
+    out["eta"] = np.clip(eta, agent["eta"]["minimum"], agent["eta"]["maximum"])
+
+    # The target actor: the count is tested before this update raises it.
+    follows = step % agent["actor_ema_every"] == 0 and step > agent["actor_ema_start"]
+    target = state["target_actor"]
+    out["target_actor"] = follow(target, out["actor"], agent["ema_rate"]) if follows else target
+    return out, {"share_of_delta": share_of_delta, "difference": difference, "unbounded_eta": eta}
+
+
+def act(state, inputs):
+    """Eq. 25, and single reverse steps, with the target networks as they are before the update."""
+    noise = inputs["select_noise"]
+    candidates, states = sample(state["target_actor"], inputs["select_observations"], noise)
+    q = fast_values(state["target_critic"], states, candidates).mean(0)
+    index = q.argmax(-1)
+    steps = len(noise)
+    reverse = [
+        denoise(state["target_actor"], inputs["observations"], inputs["denoise_actions"][t - 1], t, steps)
+        for t in range(1, steps + 1)
+    ]
+    return {
+        "denoise.x0": np.stack([x0 for x0, _ in reverse]),
+        "denoise.mean": np.stack([mean for _, mean in reverse]),
+        "select.q": q,
+        "select.index": index,
+        "select.actions": candidates[np.arange(len(states)), index],
+    }
+
+
+# Random states and inputs.
+
+
+def random_state(config, rng):
+    agent, o, a = config["agent"], config["observation_dim"], config["action_dim"]
+    hidden = [agent["hidden"]] * 3
+    actor = layers([TIME_FEATURES, TIME_EMBEDDING, TIME_EMBEDDING], prefix="time.")
+    actor |= layers([o + a + TIME_EMBEDDING, *hidden, a], prefix="trunk.")
+    state = {
+        "actor": random_network(rng, actor),
+        "critic": random_network(rng, layers([o + a, *hidden, 1], agent["critics"])),
+    }
+    for name in "actor", "critic":
+        state[f"target_{name}"] = near(rng, state[name])
+        state |= random_moments(rng, name, state[name])
+    state["eta"] = single([agent["eta"]["initial"]])
+    state["nu_squared"] = single([-1.0 if agent["target_reduce"] == "max" else 0.5])
+    return state
+
+
+def random_inputs(config, rng, variant, size, state):
+    agent, o, a = config["agent"], config["observation_dim"], config["action_dim"]
+    steps, b, n = agent["diffusion_steps"], config["batch_size"], SIZES[size]["select"]
+    inputs = {
+        "observations": single(rng.normal(size=(b, o))),
+        "actions": single(rng.uniform(-0.99999, 0.99999, (b, a))),
+        "rewards": single(rng.normal(size=b)),
+        "next_observations": single(rng.normal(size=(b, o))),
+        "masks": (np.arange(b) % 4 != 3).astype(np.float64),
+        "next_noise": single(rng.normal(size=(steps, b, agent["samples"], a))),
+        "t": rng.permutation(np.arange(b) % steps + 1),
+        "epsilon": single(VARIANTS[variant].epsilon * rng.normal(size=(b, a))),
+        "denoise_actions": single(rng.normal(size=(steps, b, a))),
+        "select_observations": single(rng.normal(size=(n, o))),
+    }
+    # A choice between candidates of nearly equal value would depend on rounding: draw such states' noise again.
+    noise = np.zeros((steps, n, config["candidates"], a))
+    close = np.full(n, True)
+    while close.any():
+        noise[:, close] = single(rng.normal(size=noise[:, close].shape))
+        q = np.sort(act(state, inputs | {"select_noise": noise})["select.q"])
+        close = q[:, -1] - q[:, -2] < 1e-3
+    return inputs | {"select_noise": noise}
+
+
+def what_eta_does(config, came):
+    """In a word what became of η, or "too close" where a mistake in the clip or the bound would hardly show."""
+    agent, eta, difference = config["agent"], came["unbounded_eta"], came["difference"]
+    low, high = agent["eta"]["minimum"], agent["eta"]["maximum"]
+    if agent["guidance"] == "none" or "threshold" not in agent["eta"]:
+        return "stays"
+    if min(abs(eta - low), abs(eta - high)) < 0.01 or abs(abs(difference) - 1) < 0.05:
+        return "too close"
+    happens = {"at the minimum": eta < low, "at the maximum": eta > high}
+    happens |= {"clipped at +1": difference > 1, "clipped at -1": difference < -1}
+    return ", ".join(name for name, true in happens.items() if true) or "moves"
+
+
+def draw(config, variant, size, rng):
+    """A state, inputs and what comes out; None where η does not do what this variant is for."""
+    state = random_state(config, rng)
+    inputs = random_inputs(config, rng, variant, size, state)
+    expected, came = update(config, state, inputs)
+    # δ's share of a row must not be so close to a hundredth that rounding could take it to the other side.
+    while np.any(abs(came["share_of_delta"] / 0.01 - 1) < 2e-3):
+        if state["nu_squared"][0] < 0:
+            return None
+        state["nu_squared"] = single([rng.uniform(0.3, 0.7)])
+        expected, came = update(config, state, inputs)
+    if what_eta_does(config, came) != VARIANTS[variant].eta:
+        return None
+    return state, inputs, expected | act(state, inputs)
