@@ -175,7 +175,7 @@ fn run_config(
     Ok(RunConfig {
         run: RunInfo {
             name: name.to_string(),
-            epoch: SystemTime::now().duration_since(UNIX_EPOCH)?.as_millis() as u64,
+            incarnation: SystemTime::now().duration_since(UNIX_EPOCH)?.as_millis() as u64,
             preset: config::preset_label(&args.preset),
             version: env!("CARGO_PKG_VERSION").to_owned(),
             device: args.device,

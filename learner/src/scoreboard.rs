@@ -22,8 +22,8 @@ const SCORE_TOLERANCE: f64 = 1e-6;
 pub struct Rules {
     /// The run.
     pub run: Name,
-    /// The learner's life.
-    pub epoch: u64,
+    /// Which start of the learner this is.
+    pub incarnation: u64,
     /// Where policies are evaluated.
     pub environment: &'static EnvironmentSpec,
     /// Actions sampled per state.
@@ -96,8 +96,8 @@ pub enum Refusal {
     #[error("it is for another run")]
     Run,
     /// From before the learner's restart.
-    #[error("it is from another life of the learner (epoch)")]
-    Epoch,
+    #[error("it is from another incarnation of the learner")]
+    Incarnation,
     /// No such job was handed out.
     #[error("no such job was handed out")]
     Job,
@@ -123,7 +123,7 @@ impl Refusal {
     pub fn label(&self) -> &'static str {
         match self {
             Self::Run => "unknown_run",
-            Self::Epoch => "unknown_epoch",
+            Self::Incarnation => "unknown_incarnation",
             Self::Job => "unknown_job",
             Self::Evaluator => "wrong_evaluator",
             Self::Step => "unknown_step",
@@ -183,7 +183,7 @@ impl Scoreboard {
             return JobReply::Job(Job {
                 id,
                 run: rules.run.clone(),
-                epoch: rules.epoch,
+                incarnation: rules.incarnation,
                 step,
                 weights: evaluation.weights,
                 environment: rules.environment.name.to_owned(),
@@ -210,7 +210,7 @@ impl Scoreboard {
     /// new scores down first, then calls [`record`](Self::record).
     pub fn screen(&self, report: &ScoreReport) -> Result<Screened, Refusal> {
         require(report.run == self.rules.run, Refusal::Run)?;
-        require(report.epoch == self.rules.epoch, Refusal::Epoch)?;
+        require(report.incarnation == self.rules.incarnation, Refusal::Incarnation)?;
         let job = self.jobs.get(&report.job).ok_or(Refusal::Job)?;
         require(job.evaluator == report.evaluator, Refusal::Evaluator)?;
         require(job.step == report.step, Refusal::Step)?;

@@ -63,7 +63,7 @@ impl Threads {
         let experiment = &config.experiment;
         let rules = Rules {
             run: run.clone(),
-            epoch: config.run.epoch,
+            incarnation: config.run.incarnation,
             environment,
             candidates: experiment.candidates,
             job_episodes: JOB_EPISODES,
@@ -75,7 +75,8 @@ impl Threads {
         let (hub, hub_messages) = inbox();
         let hub_thread = spawn("hub", move || state.run(&hub_messages))?;
 
-        let identity = Identity { run: run.clone(), epoch: config.run.epoch, schema: schema(experiment, environment) };
+        let identity =
+            Identity { run: run.clone(), incarnation: config.run.incarnation, schema: schema(experiment, environment) };
         let state = WeightKeeper::new(identity, run_dir.clone(), metrics.clone(), hub.clone(), notices.clone());
         let (weights, weights_messages) = inbox();
         let weights_thread = spawn("weights", move || state.run(&weights_messages))?;

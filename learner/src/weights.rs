@@ -43,8 +43,8 @@ pub enum Event {
 pub struct Identity {
     /// The run.
     pub run: Name,
-    /// The learner's life.
-    pub epoch: u64,
+    /// Which start of the learner this is.
+    pub incarnation: u64,
     /// Environment and shapes.
     pub schema: Schema,
 }
@@ -119,8 +119,8 @@ impl WeightKeeper {
     }
 
     fn message(&self, step: u64, hash: Hash, tensors: Vec<u8>) -> quad_protocol::Snapshot {
-        let Identity { run, epoch, schema } = self.identity.clone();
-        quad_protocol::Snapshot { run, epoch, step, schema, hash, tensors }
+        let Identity { run, incarnation, schema } = self.identity.clone();
+        quad_protocol::Snapshot { run, incarnation, step, schema, hash, tensors }
     }
 
     fn answer(&self, query: &Query) {

@@ -23,7 +23,7 @@ use zenoh::Session;
 
 const PATIENCE: Duration = Duration::from_secs(20);
 const LEASE: Duration = Duration::from_millis(800);
-const EPOCH: u64 = 5;
+const INCARNATION: u64 = 5;
 
 /// A learner without training: its threads, its declarations, its folder.
 struct Bench {
@@ -55,7 +55,14 @@ impl Bench {
         let (metrics, _) = Metrics::new(&run, 100).unwrap();
         let (notify, notices) = tokio::sync::mpsc::unbounded_channel();
         let environment = quad_dataset::environment::find("hopper").unwrap();
-        let rules = Rules { run: run.clone(), epoch: EPOCH, environment, candidates: 3, job_episodes: 2, lease: LEASE };
+        let rules = Rules {
+            run: run.clone(),
+            incarnation: INCARNATION,
+            environment,
+            candidates: 3,
+            job_episodes: 2,
+            lease: LEASE,
+        };
         let plan = EvaluationPlan { seed: 1, episodes: 4 };
         let log = run_dir.score_log().unwrap();
         let state = Hub::new(run.clone(), plan, Scoreboard::new(rules), log, metrics.clone(), notify.clone());
@@ -69,7 +76,7 @@ impl Bench {
             critics: 2,
             diffusion_steps: 2,
         };
-        let identity = Identity { run: run.clone(), epoch: EPOCH, schema };
+        let identity = Identity { run: run.clone(), incarnation: INCARNATION, schema };
         let state = WeightKeeper::new(identity, run_dir.clone(), metrics.clone(), hub.clone(), notify);
         let (weights, messages) = inbox();
         std::thread::spawn(move || state.run(&messages));
@@ -115,7 +122,7 @@ fn config() -> quad_learner::config::RunConfig {
     let text = r#"
         [run]
         name = "bench"
-        epoch = 5
+        incarnation = 5
         preset = "hopper-demo"
         version = "0"
         [dataset]
@@ -170,9 +177,9 @@ fn report(job: &Job, evaluator: &str) -> ScoreReport {
     let hopper = quad_dataset::environment::find("hopper").unwrap();
     let episode =
         |&seed| EpisodeScore { seed, episode_return: 1000.0, length: 300, score: hopper.normalised_score(1000.0) };
-    let Job { run, epoch, step, weights, .. } = job.clone();
+    let Job { run, incarnation, step, weights, .. } = job.clone();
     let episodes = job.seeds.iter().map(episode).collect();
-    ScoreReport { evaluator: name(evaluator), run, epoch, job: job.id, step, weights, episodes }
+    ScoreReport { evaluator: name(evaluator), run, incarnation, job: job.id, step, weights, episodes }
 }
 
 async fn deliver(session: &Session, report: &ScoreReport) -> ScoreReply {
@@ -187,7 +194,7 @@ async fn a_job_goes_out_and_its_scores_are_on_disk_before_the_thanks() {
     bench.snapshot(10).await;
 
     let job = claim_eventually(&client, &bench.run, "a").await;
-    assert_eq!((job.step, job.epoch, job.candidates, job.seeds.len()), (10, EPOCH, 3, 2));
+    assert_eq!((job.step, job.incarnation, job.candidates, job.seeds.len()), (10, INCARNATION, 3, 2));
     assert_eq!(job.weights, Hash::of(&tensors(10)));
 
     let recorded = deliver(&client, &report(&job, "a")).await;

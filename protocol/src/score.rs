@@ -23,8 +23,8 @@ pub struct ScoreReport {
     pub evaluator: Name,
     /// The run.
     pub run: Name,
-    /// The life of its learner that handed the job out.
-    pub epoch: u64,
+    /// The learner's incarnation when it handed the job out.
+    pub incarnation: u64,
     /// The job.
     pub job: u64,
     /// Gradient step of the snapshot.

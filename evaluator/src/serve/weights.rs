@@ -61,7 +61,7 @@ impl WeightsError {
 /// Builds the policy of `snapshot` if it is exactly the one that `job` names. Its hash was verified by the codec.
 pub fn policy_for(job: &Job, snapshot: &Snapshot, precision: Precision) -> Result<TargetPolicy, WeightsError> {
     same("run", &job.run, &snapshot.run)?;
-    same("epoch", &job.epoch, &snapshot.epoch)?;
+    same("incarnation", &job.incarnation, &snapshot.incarnation)?;
     same("step", &job.step, &snapshot.step)?;
     same("hash", &job.weights, &snapshot.hash)?;
     same("environment", &job.environment, &snapshot.schema.environment)?;
@@ -146,10 +146,10 @@ impl NewestWeights {
         Ok(NewestWeights { newest, _listener: listener })
     }
 
-    /// The snapshot that `job` names, if it is the newest. Of another life of the learner it is another one.
+    /// The snapshot that `job` names, if it is the newest. The same step of another incarnation does not count.
     pub fn get(&self, job: &Job) -> Option<Arc<Snapshot>> {
         let named = |snapshot: &&Arc<Snapshot>| {
-            (snapshot.epoch, snapshot.step, snapshot.hash) == (job.epoch, job.step, job.weights)
+            (snapshot.incarnation, snapshot.step, snapshot.hash) == (job.incarnation, job.step, job.weights)
         };
         self.newest.lock().unwrap_or_else(PoisonError::into_inner).as_ref().filter(named).cloned()
     }
@@ -179,7 +179,7 @@ mod tests {
         let job = Job {
             id: 1,
             run: run.clone(),
-            epoch: 3,
+            incarnation: 3,
             step: 100,
             weights,
             environment: "hopper".to_owned(),
@@ -187,7 +187,7 @@ mod tests {
             candidates: 1,
             lease_milliseconds: 1000,
         };
-        (job, Snapshot { run, epoch: 3, step: 100, schema, hash: weights, tensors })
+        (job, Snapshot { run, incarnation: 3, step: 100, schema, hash: weights, tensors })
     }
 
     fn label(change: impl Fn(&mut Job, &mut Snapshot)) -> &'static str {
@@ -201,7 +201,7 @@ mod tests {
         let (job, snapshot) = job_and_snapshot();
         assert!(policy_for(&job, &snapshot, Precision::F32).is_ok());
         assert_eq!(label(|job, _| job.run = Name::new("other").unwrap()), "other_snapshot");
-        assert_eq!(label(|job, _| job.epoch += 1), "other_snapshot");
+        assert_eq!(label(|job, _| job.incarnation += 1), "other_snapshot");
         assert_eq!(label(|job, _| job.step += 1), "other_snapshot");
         assert_eq!(label(|job, _| job.weights = Hash::of(b"others")), "other_snapshot");
         assert_eq!(label(|job, _| job.environment = "walker2d".to_owned()), "other_snapshot");

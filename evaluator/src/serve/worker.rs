@@ -158,8 +158,8 @@ impl Worker {
                 return Err(error.context(format!("job {} of step {} failed", job.id, job.step)));
             }
         };
-        let Job { id, run: of, epoch, step, weights, .. } = job;
-        run.keep(ScoreReport { evaluator: self.name.clone(), run: of, epoch, job: id, step, weights, episodes });
+        let Job { id, run: of, incarnation, step, weights, .. } = job;
+        run.keep(ScoreReport { evaluator: self.name.clone(), run: of, incarnation, job: id, step, weights, episodes });
         run.deliver().await
     }
 
