@@ -6,6 +6,7 @@ use std::path::PathBuf;
 use clap::builder::{PossibleValuesParser, TypedValueParser};
 use clap::{Args, Parser, Subcommand};
 use quad_policy::Precision;
+use quad_service::parse_endpoint;
 
 use crate::agent::Guidance;
 use crate::config::{self, Overrides};
@@ -131,13 +132,6 @@ fn parse_preset(text: &str) -> Result<String, String> {
     }
     let known: Vec<_> = config::PRESETS.iter().map(|(name, _)| *name).collect();
     Err(format!("presets are {}; a file of your own must end in .toml", known.join(", ")))
-}
-
-fn parse_endpoint(text: &str) -> Result<String, String> {
-    match text.parse::<zenoh::config::EndPoint>() {
-        Ok(_) => Ok(text.to_owned()),
-        Err(_) => Err("write it like Zenoh does, e.g. tcp/127.0.0.1:7447".to_owned()),
-    }
 }
 
 fn guidance_parser() -> impl TypedValueParser<Value = Guidance> {

@@ -19,5 +19,5 @@ mod shutdown;
 pub use exit::{Hint, run_main};
 pub use logging::init_logging;
 pub use metrics_server::{BindError, MetricsServer, serve_metrics};
-pub use session::{Endpoints, SessionError, open_session, reachable_at};
+pub use session::{Endpoints, SessionError, open_session, parse_endpoint, reachable_at};
 pub use shutdown::shutdown_signal;

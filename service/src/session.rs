@@ -5,6 +5,7 @@ use std::time::Duration;
 
 use serde_json::{Value, json};
 use tokio::sync::oneshot;
+use zenoh::config::EndPoint;
 use zenoh::{Config, Session, Wait};
 
 /// A node that is frozen, or cut off without a word, counts as gone after so long. (One that ends or is killed is
@@ -42,9 +43,9 @@ pub enum SessionError {
     /// Nothing to listen at and nothing to connect to.
     #[error("no endpoint to listen at or to connect to")]
     NoEndpoint,
-    /// Not an endpoint that this program can use. Zenoh would try for ever to connect to it.
-    #[error("{endpoint:?} is no endpoint like {PROTOCOL}127.0.0.1:7447")]
-    Protocol {
+    /// Not an endpoint that this program can use. Zenoh would try for ever to connect to one of another protocol.
+    #[error("{endpoint:?} is not an endpoint; write it like {PROTOCOL}127.0.0.1:7447")]
+    NotAnEndpoint {
         /// What was given.
         endpoint: String,
     },
@@ -61,6 +62,18 @@ pub enum SessionError {
     Unknown,
 }
 
+/// Checks an endpoint that a person wrote, and gives it back as it is: a `value_parser` for a command line.
+///
+/// # Errors
+///
+/// [`SessionError::NotAnEndpoint`]: it is malformed, or names another protocol than TCP.
+pub fn parse_endpoint(text: &str) -> Result<String, SessionError> {
+    if text.starts_with(PROTOCOL) && text.parse::<EndPoint>().is_ok() {
+        return Ok(text.to_owned());
+    }
+    Err(SessionError::NotAnEndpoint { endpoint: text.to_owned() })
+}
+
 /// Opens a session. Needs a multi-thread tokio runtime.
 ///
 /// A session that listens is there at once. A client is there as soon as it has a connection: it waits for a meeting
@@ -70,8 +83,8 @@ pub async fn open_session(endpoints: &Endpoints) -> Result<Session, SessionError
     if endpoints.listen.is_empty() && endpoints.connect.is_empty() {
         return Err(SessionError::NoEndpoint);
     }
-    if let Some(endpoint) = endpoints.listen.iter().chain(&endpoints.connect).find(|e| !e.starts_with(PROTOCOL)) {
-        return Err(SessionError::Protocol { endpoint: endpoint.clone() });
+    for endpoint in endpoints.listen.iter().chain(&endpoints.connect) {
+        parse_endpoint(endpoint)?;
     }
     let wrong = |error| {
         let endpoints = [&endpoints.listen[..], &endpoints.connect[..]].concat().join(", ");

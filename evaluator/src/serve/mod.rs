@@ -26,7 +26,7 @@ use anyhow::Context;
 use clap::Args;
 use quad_policy::Precision;
 use quad_protocol::Name;
-use quad_service::Hint;
+use quad_service::{Hint, parse_endpoint};
 use rand::Rng;
 use tracing::{info, warn};
 
@@ -123,13 +123,6 @@ fn keep_heap_small() {
     const LARGE_BLOCK: i32 = 2 << 20;
     // SAFETY: sets a parameter of the allocator, which may be done at any time.
     unsafe { libc::mallopt(libc::M_MMAP_THRESHOLD, LARGE_BLOCK) };
-}
-
-fn parse_endpoint(text: &str) -> Result<String, String> {
-    match text.parse::<zenoh::config::EndPoint>() {
-        Ok(_) => Ok(text.to_owned()),
-        Err(_) => Err("write it like Zenoh does, e.g. tcp/127.0.0.1:7447".to_owned()),
-    }
 }
 
 /// Host and process for people, a random part because containers share both.
