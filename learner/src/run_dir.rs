@@ -47,7 +47,7 @@ pub enum RunDirError {
 }
 
 /// Where a learner can be reached: `endpoints.json`.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Serialize)]
 pub struct RunEndpoints {
     /// Zenoh endpoints that an evaluator can connect to.
     pub zenoh: Vec<String>,
@@ -145,19 +145,18 @@ impl RunDir {
         replace(&path, text.as_bytes())
     }
 
-    /// File of the snapshot of a gradient step.
-    pub fn snapshot(&self, step: u64) -> PathBuf {
+    fn snapshot_path(&self, step: u64) -> PathBuf {
         self.path.join("snapshots").join(format!("step_{step:09}.safetensors"))
     }
 
     /// Saves the snapshot of a gradient step.
     pub fn write_snapshot(&self, step: u64, tensors: &[u8]) -> Result<(), RunDirError> {
-        replace(&self.snapshot(step), tensors)
+        replace(&self.snapshot_path(step), tensors)
     }
 
     /// Reads the snapshot of a gradient step.
     pub fn read_snapshot(&self, step: u64) -> Result<Vec<u8>, RunDirError> {
-        let path = self.snapshot(step);
+        let path = self.snapshot_path(step);
         fs::read(&path).map_err(io_error("read", &path))
     }
 

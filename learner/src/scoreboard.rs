@@ -153,12 +153,6 @@ impl Scoreboard {
         self.evaluations.values().map(|evaluation| evaluation.episodes.iter().filter(scored).count()).sum()
     }
 
-    /// Evaluations with an episode that has no score yet.
-    pub fn pending_evaluations(&self) -> usize {
-        let open = |evaluation: &&Evaluation| evaluation.scores().is_none();
-        self.evaluations.values().filter(open).count()
-    }
-
     /// Hands out a job: waiting episodes of the oldest step that has any.
     pub fn claim(&mut self, request: &JobRequest, now: Instant) -> JobReply {
         let wait = |time: Duration| JobReply::Wait { milliseconds: time.as_millis() as u64 };

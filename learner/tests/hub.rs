@@ -237,7 +237,7 @@ async fn weights_are_published_and_older_ones_are_answered_from_the_disk() {
     let missing = ask::<Snapshot>(&client, keys::weights_at(&bench.run, 11), None).await.unwrap();
     assert!(missing.unwrap_err().contains("no snapshot"));
 
-    let path = bench.run_dir.snapshot(10);
+    let path = bench.run_dir.path().join("snapshots/step_000000010.safetensors");
     std::fs::write(path, "something else").unwrap();
     let changed = ask::<Snapshot>(&client, keys::weights_at(&bench.run, 10), None).await.unwrap();
     assert!(changed.unwrap_err().contains("was changed"));

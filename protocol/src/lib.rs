@@ -24,7 +24,7 @@ mod score;
 mod snapshot;
 
 pub use codec::{CodecError, Message, PROTOCOL_VERSION, decode, decode_from, encode};
-pub use hash::{Hash, InvalidHash};
+pub use hash::Hash;
 pub use job::{Job, JobReply, JobRequest};
 pub use name::{InvalidName, Name};
 pub use progress::Progress;

@@ -6,8 +6,7 @@
 mod hopper;
 mod physics;
 
-pub use hopper::Hopper;
-
+use hopper::Hopper;
 use quad_dataset::environment::EnvironmentSpec;
 use thiserror::Error;
 
