@@ -151,8 +151,8 @@ impl Conductor {
         self.reachable_at = quad_service::reachable_at(&session, &self.endpoints).await?;
         let endpoints = RunEndpoints { zenoh: self.reachable_at.clone(), metrics: self.metrics_address.clone() };
         let ready = || Ok(self.run_dir.write_endpoints(&endpoints)?);
-        let (hub, weights) = (&self.threads.hub, &self.threads.weights);
-        let wire = Wire::declare(session, &self.run, hub, weights, &self.metrics, ready).await?;
+        let (hub, publisher) = (&self.threads.hub, &self.threads.publisher);
+        let wire = Wire::declare(session, &self.run, hub, publisher, &self.metrics, ready).await?;
         let (zenoh, metrics) = (endpoints.zenoh.join(", "), &endpoints.metrics);
         self.display.say(&format!("run {} is at {zenoh}, its metrics at http://{metrics}/metrics", self.run));
         Ok(wire)

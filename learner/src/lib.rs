@@ -6,7 +6,7 @@
 //! - [`cli`] is what can be typed, [`config`] what it resolves to: a preset with flags on top, validated once.
 //! - [`run`] goes from the command line to the exit; [`conduct`] is the main loop in between.
 //! - [`threads`] starts the threads that do the work: [`train`] (nothing but gradient steps, with an [`agent`] on a
-//!   [`device`]), [`weights`] (keeps and publishes snapshots) and [`hub`] (hands out jobs, takes scores in).
+//!   [`device`]), [`publisher`] (publishes and saves snapshots) and [`hub`] (hands out jobs, takes scores in).
 //! - [`scoreboard`] is the hub's state without any I/O; [`seeds`] says which episodes an evaluation has.
 //! - [`wire`] declares everything on Zenoh; its callbacks fill an [`inbox`]; [`notice`] is what threads tell the loop.
 //! - [`run_dir`] is the folder of a run, [`metrics`] what Prometheus asks, [`display`] what a person sees meanwhile.
@@ -23,6 +23,7 @@ pub mod inbox;
 pub mod metrics;
 pub mod notice;
 pub mod plot;
+pub mod publisher;
 pub mod report;
 pub mod run;
 pub mod run_dir;
@@ -30,5 +31,4 @@ pub mod scoreboard;
 pub mod seeds;
 pub mod threads;
 pub mod train;
-pub mod weights;
 pub mod wire;

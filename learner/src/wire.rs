@@ -11,7 +11,7 @@ use zenoh::{Session, Wait};
 
 use crate::inbox::{Inbox, MOST_BYTES};
 use crate::metrics::Metrics;
-use crate::{hub, weights};
+use crate::{hub, publisher};
 
 /// The learner's declarations; they end with it.
 pub struct Wire {
@@ -28,17 +28,17 @@ impl Wire {
         session: Session,
         run: &Name,
         hub: &Inbox<hub::Event>,
-        weights: &Inbox<weights::Event>,
+        publisher: &Inbox<publisher::Event>,
         metrics: &Metrics,
         ready: impl FnOnce() -> anyhow::Result<()>,
     ) -> anyhow::Result<Self> {
         // A subscriber that does not keep up loses a snapshot, which it can ask for, instead of holding up the others.
-        let publisher = session.declare_publisher(keys::weights(run)).congestion_control(CongestionControl::Drop).await;
-        weights.send(weights::Event::Online(publisher.map_err(zenoh_error)?));
+        let weights = session.declare_publisher(keys::weights(run)).congestion_control(CongestionControl::Drop).await;
+        publisher.send(publisher::Event::Online(weights.map_err(zenoh_error)?));
         hub.send(hub::Event::Online(session.clone()));
 
         let queryables = [
-            serve(&session, keys::weights_at_any_step(run), weights, weights::Event::Query, metrics).await?,
+            serve(&session, keys::weights_at_any_step(run), publisher, publisher::Event::Query, metrics).await?,
             serve(&session, keys::jobs(run), hub, hub::Event::Claim, metrics).await?,
             serve(&session, keys::scores(run), hub, hub::Event::Report, metrics).await?,
         ];

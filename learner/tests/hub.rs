@@ -8,10 +8,10 @@ use quad_learner::hub::{self, EvaluationPlan, Hub};
 use quad_learner::inbox::{Inbox, inbox};
 use quad_learner::metrics::Metrics;
 use quad_learner::notice::Notice;
+use quad_learner::publisher::{self, Identity, SnapshotPublisher};
 use quad_learner::run_dir::RunDir;
 use quad_learner::scoreboard::{Rules, Scoreboard};
-use quad_learner::train;
-use quad_learner::weights::{self, Identity, WeightKeeper};
+use quad_learner::train::TrainedPolicy;
 use quad_learner::wire::Wire;
 use quad_protocol::{
     EpisodeScore, Hash, Job, JobReply, JobRequest, Message, Name, Progress, RecordedScores, Schema, ScoreReply,
@@ -32,7 +32,7 @@ struct Bench {
     endpoint: String,
     metrics: Metrics,
     notices: UnboundedReceiver<Notice>,
-    weights: Inbox<weights::Event>,
+    publisher: Inbox<publisher::Event>,
     hub: Inbox<hub::Event>,
     _wire: Wire,
     _folder: tempfile::TempDir,
@@ -77,15 +77,15 @@ impl Bench {
             diffusion_steps: 2,
         };
         let identity = Identity { run: run.clone(), incarnation: INCARNATION, schema };
-        let state = WeightKeeper::new(identity, run_dir.clone(), metrics.clone(), hub.clone(), notify);
-        let (weights, messages) = inbox();
+        let state = SnapshotPublisher::new(identity, run_dir.clone(), metrics.clone(), hub.clone(), notify);
+        let (publisher, messages) = inbox();
         std::thread::spawn(move || state.run(&messages));
 
         let port = TcpListener::bind("127.0.0.1:0").unwrap().local_addr().unwrap().port();
         let endpoint = format!("tcp/127.0.0.1:{port}");
         let session = open_session(&Endpoints { listen: vec![endpoint.clone()], connect: Vec::new() }).await.unwrap();
-        let wire = Wire::declare(session, &run, &hub, &weights, &metrics, || Ok(())).await.unwrap();
-        Self { run, run_dir, endpoint, metrics, notices, weights, hub, _wire: wire, _folder: folder }
+        let wire = Wire::declare(session, &run, &hub, &publisher, &metrics, || Ok(())).await.unwrap();
+        Self { run, run_dir, endpoint, metrics, notices, publisher, hub, _wire: wire, _folder: folder }
     }
 
     async fn client(&self) -> Session {
@@ -93,7 +93,8 @@ impl Bench {
     }
 
     async fn snapshot(&mut self, step: u64) {
-        self.weights.send(weights::Event::Snapshot(train::Snapshot { step, tensors: tensors(step), evaluate: true }));
+        let policy = TrainedPolicy { step, tensors: tensors(step), evaluate: true };
+        self.publisher.send(publisher::Event::Trained(policy));
         self.until(|notice| matches!(notice, Notice::Published { step: published } if *published == step)).await;
     }
 
@@ -216,7 +217,7 @@ async fn a_job_goes_out_and_its_scores_are_on_disk_before_the_thanks() {
     };
     assert_eq!(scores.len(), 4);
     assert_eq!(bench.metrics.evaluation.step.get(), 10);
-    bench.weights.send(weights::Event::TrainingCompleted);
+    bench.publisher.send(publisher::Event::TrainingCompleted);
     bench.until(|notice| matches!(notice, Notice::Settled)).await;
 }
 

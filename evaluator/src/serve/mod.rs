@@ -7,7 +7,7 @@
 //! - `discovery`: which runs are there.
 //! - `worker`: whose turn it is, and what a turn consists of.
 //! - `run`: one run, as its learner is spoken to; `query`: how a question is put.
-//! - `weights`: from a snapshot on the wire to a policy.
+//! - `receiver`: from a snapshot on the wire to a policy.
 //! - `job`: all episodes of a job, as one batch.
 //!
 //! An evaluator keeps nothing that must last: killed at any point, it costs its learner a lease.
@@ -15,8 +15,8 @@
 mod discovery;
 mod job;
 mod query;
+mod receiver;
 mod run;
-mod weights;
 mod worker;
 
 use std::net::SocketAddr;

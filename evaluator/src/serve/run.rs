@@ -11,7 +11,7 @@ use zenoh::Session;
 use zenoh::liveliness::LivelinessToken;
 
 use super::query::{AskError, ask};
-use super::weights::NewestWeights;
+use super::receiver::SnapshotReceiver;
 use crate::metrics::{JobOutcome, Metrics};
 
 /// A learner answers in milliseconds; one that takes this long hangs, and other runs wait behind it.
@@ -29,7 +29,7 @@ pub struct RunClient {
     evaluator: Name,
     session: Session,
     metrics: Metrics,
-    weights: NewestWeights,
+    snapshots: SnapshotReceiver,
     /// Scores that the learner has not acknowledged. While there are some, nothing new is asked for.
     undelivered: Option<ScoreReport>,
     ready_at: Instant,
@@ -38,19 +38,19 @@ pub struct RunClient {
 }
 
 impl RunClient {
-    /// Subscribes to the run's weights and announces `evaluator` in it; `weights_arrived` is told of new weights.
+    /// Subscribes to the run's snapshots and announces `evaluator` in it; `snapshot_arrived` is told of each new one.
     pub async fn attach(
         session: Session,
         run: Name,
         evaluator: Name,
         metrics: Metrics,
-        weights_arrived: Arc<Notify>,
+        snapshot_arrived: Arc<Notify>,
     ) -> anyhow::Result<RunClient> {
         let readable = |error: zenoh::Error| anyhow::anyhow!(error);
-        let weights = NewestWeights::listen(&session, run.clone(), metrics.clone(), weights_arrived)
+        let snapshots = SnapshotReceiver::listen(&session, run.clone(), metrics.clone(), snapshot_arrived)
             .await
             .map_err(readable)
-            .with_context(|| format!("cannot listen to the weights of run {run}"))?;
+            .with_context(|| format!("cannot listen to the snapshots of run {run}"))?;
         let token = session
             .liveliness()
             .declare_token(keys::live_evaluator(&run, &evaluator))
@@ -63,7 +63,7 @@ impl RunClient {
             evaluator,
             session,
             metrics,
-            weights,
+            snapshots,
             undelivered: None,
             ready_at,
             back_off,
@@ -110,7 +110,7 @@ impl RunClient {
 
     /// The snapshot that `job` names: as it was published, or asked for where that was missed.
     pub async fn snapshot(&self, job: &Job) -> Result<Arc<Snapshot>, AskError> {
-        if let Some(snapshot) = self.weights.get(job) {
+        if let Some(snapshot) = self.snapshots.get(job) {
             return Ok(snapshot);
         }
         let key = keys::weights_at(&self.run, job.step);

@@ -13,8 +13,8 @@ use tracing::{info, warn};
 
 use super::discovery::{RunKey, Runs};
 use super::job::{self, Running};
+use super::receiver::policy_for;
 use super::run::RunClient;
-use super::weights::policy_for;
 use crate::environment::ENVIRONMENTS;
 use crate::metrics::{JobOutcome, Metrics};
 
@@ -34,7 +34,7 @@ pub struct Worker {
     turns: VecDeque<RunKey>,
     /// When the learner of a run went whose scores are kept.
     gone: BTreeMap<RunKey, Instant>,
-    weights_arrived: Arc<Notify>,
+    snapshot_arrived: Arc<Notify>,
     /// The policy of the last job: the next one is often about the same.
     policy: Option<(Hash, Arc<TargetPolicy>)>,
 }
@@ -50,7 +50,7 @@ impl Worker {
             runs: BTreeMap::new(),
             turns: VecDeque::new(),
             gone: BTreeMap::new(),
-            weights_arrived: Arc::new(Notify::new()),
+            snapshot_arrived: Arc::new(Notify::new()),
             policy: None,
         }
     }
@@ -89,7 +89,7 @@ impl Worker {
             if self.runs.contains_key(key) {
                 continue;
             }
-            let (metrics, arrived) = (self.metrics.clone(), self.weights_arrived.clone());
+            let (metrics, arrived) = (self.metrics.clone(), self.snapshot_arrived.clone());
             match RunClient::attach(session.clone(), key.1.clone(), self.name.clone(), metrics, arrived).await {
                 Ok(run) => {
                     self.runs.insert(key.clone(), run);
@@ -114,7 +114,7 @@ impl Worker {
         self.metrics.runs.set(self.runs.len() as i64);
     }
 
-    /// Waits until a run is due, runs come or go, or new weights promise work.
+    /// Waits until a run is due, runs come or go, or a new snapshot promises work.
     async fn wait(&mut self) -> anyhow::Result<()> {
         let there = self.runs.iter().filter(|(key, _)| self.is_there(key)).map(|(_, run)| run.ready_at());
         let forget = self.gone.values().map(|since| *since + KEEP_SCORES);
@@ -128,7 +128,7 @@ impl Worker {
         tokio::select! {
             () = timer => {}
             changed = self.found.changed() => changed.context("nobody looks for learners any more")?,
-            () = self.weights_arrived.notified() => self.runs.values_mut().for_each(RunClient::wake),
+            () = self.snapshot_arrived.notified() => self.runs.values_mut().for_each(RunClient::wake),
         }
         Ok(())
     }

@@ -18,7 +18,7 @@ const MAX_DIFFUSION_STEPS: u32 = 1_000;
 
 /// Why a snapshot does not fit the job it came for.
 #[derive(Debug, thiserror::Error)]
-pub enum WeightsError {
+pub enum SnapshotError {
     /// It is another one.
     #[error("the job names {field} {wanted}, the snapshot is of {found}")]
     Other {
@@ -47,19 +47,19 @@ pub enum WeightsError {
     Policy(#[from] PolicyError),
 }
 
-impl WeightsError {
+impl SnapshotError {
     /// The reason as a metric's label.
     pub fn label(&self) -> &'static str {
         match self {
-            WeightsError::Other { .. } => "other_snapshot",
-            WeightsError::Schema { .. } | WeightsError::Environment(_) => "schema",
-            WeightsError::Policy(_) => "tensors",
+            SnapshotError::Other { .. } => "other_snapshot",
+            SnapshotError::Schema { .. } | SnapshotError::Environment(_) => "schema",
+            SnapshotError::Policy(_) => "tensors",
         }
     }
 }
 
 /// Builds the policy of `snapshot` if it is exactly the one that `job` names. Its hash was verified by the codec.
-pub fn policy_for(job: &Job, snapshot: &Snapshot, precision: Precision) -> Result<TargetPolicy, WeightsError> {
+pub fn policy_for(job: &Job, snapshot: &Snapshot, precision: Precision) -> Result<TargetPolicy, SnapshotError> {
     same("run", &job.run, &snapshot.run)?;
     same("incarnation", &job.incarnation, &snapshot.incarnation)?;
     same("step", &job.step, &snapshot.step)?;
@@ -68,27 +68,27 @@ pub fn policy_for(job: &Job, snapshot: &Snapshot, precision: Precision) -> Resul
     Ok(TargetPolicy::from_safetensors(architecture(&snapshot.schema)?, &snapshot.tensors, precision)?)
 }
 
-fn same<T: PartialEq + ToString>(field: &'static str, wanted: &T, found: &T) -> Result<(), WeightsError> {
+fn same<T: PartialEq + ToString>(field: &'static str, wanted: &T, found: &T) -> Result<(), SnapshotError> {
     if wanted == found {
         return Ok(());
     }
-    Err(WeightsError::Other { field, wanted: wanted.to_string(), found: found.to_string() })
+    Err(SnapshotError::Other { field, wanted: wanted.to_string(), found: found.to_string() })
 }
 
 /// The shapes that `schema` promises, if they suit its environment.
-fn architecture(schema: &Schema) -> Result<Architecture, WeightsError> {
+fn architecture(schema: &Schema) -> Result<Architecture, SnapshotError> {
     let spec =
-        environment::find(&schema.environment).map_err(|_| WeightsError::Environment(schema.environment.clone()))?;
+        environment::find(&schema.environment).map_err(|_| SnapshotError::Environment(schema.environment.clone()))?;
     let exactly = |field, found: u32, wanted: usize| {
         let fits = found as usize == wanted;
-        if fits { Ok(wanted) } else { Err(WeightsError::Schema { field, found, wanted: wanted.to_string() }) }
+        if fits { Ok(wanted) } else { Err(SnapshotError::Schema { field, found, wanted: wanted.to_string() }) }
     };
     let at_most = |field, found: u32, most: u32| {
         let fits = (1..=most).contains(&found);
         if fits {
             Ok(found as usize)
         } else {
-            Err(WeightsError::Schema { field, found, wanted: format!("1..={most}") })
+            Err(SnapshotError::Schema { field, found, wanted: format!("1..={most}") })
         }
     };
     Ok(Architecture {
@@ -102,20 +102,20 @@ fn architecture(schema: &Schema) -> Result<Architecture, WeightsError> {
 }
 
 /// The newest good snapshot that one run's learner published while this evaluator listened.
-pub struct NewestWeights {
+pub struct SnapshotReceiver {
     newest: Arc<Mutex<Option<Arc<Snapshot>>>>,
     // Aborted with the cache; owns the subscriber.
     _listener: JoinSet<()>,
 }
 
-impl NewestWeights {
+impl SnapshotReceiver {
     /// Listens to `quad/<run>/weights`; `arrived` is told of each good snapshot.
     pub async fn listen(
         session: &Session,
         run: Name,
         metrics: Metrics,
         arrived: Arc<Notify>,
-    ) -> zenoh::Result<NewestWeights> {
+    ) -> zenoh::Result<SnapshotReceiver> {
         // Newest wins: a queue would hold snapshots nobody wants, and a full one stops the whole session.
         let subscriber = session.declare_subscriber(keys::weights(&run)).with(RingChannel::new(1)).await?;
         let newest = Arc::new(Mutex::new(None));
@@ -143,7 +143,7 @@ impl NewestWeights {
                 }
             }
         });
-        Ok(NewestWeights { newest, _listener: listener })
+        Ok(SnapshotReceiver { newest, _listener: listener })
     }
 
     /// The snapshot that `job` names, if it is the newest. The same step of another incarnation does not count.

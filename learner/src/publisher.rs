@@ -1,11 +1,11 @@
-//! The thread that keeps the snapshots: takes them from the training thread, publishes them, saves them, asks for their
-//! evaluation, and answers evaluators that missed one.
+//! The thread that publishes snapshots: takes policies from the training thread, publishes and saves them as snapshots,
+//! asks for their evaluation, and answers evaluators that missed one.
 
 use std::collections::BTreeMap;
 use std::time::Duration;
 
 use anyhow::Context;
-use quad_protocol::{Hash, Name, Schema, encode, keys};
+use quad_protocol::{Hash, Name, Schema, Snapshot, encode, keys};
 use tokio::sync::mpsc::UnboundedSender;
 use tracing::debug;
 use zenoh::Wait;
@@ -18,7 +18,7 @@ use crate::inbox::{Inbox, Messages};
 use crate::metrics::Metrics;
 use crate::notice::Notice;
 use crate::run_dir::RunDir;
-use crate::train;
+use crate::train::TrainedPolicy;
 
 /// Nothing happens by itself here, so this only bounds how long an idle wait is.
 const IDLE: Duration = Duration::from_secs(60);
@@ -26,8 +26,8 @@ const IDLE: Duration = Duration::from_secs(60);
 /// What the thread is told.
 #[derive(Debug)]
 pub enum Event {
-    /// A new snapshot, from the training thread.
-    Snapshot(train::Snapshot),
+    /// A policy from the training thread.
+    Trained(TrainedPolicy),
     /// All gradient steps are done; no snapshot will follow.
     TrainingCompleted,
     /// The Zenoh session is there; publish with this.
@@ -50,7 +50,7 @@ pub struct Identity {
 }
 
 /// State of the thread.
-pub struct WeightKeeper {
+pub struct SnapshotPublisher {
     identity: Identity,
     run_dir: RunDir,
     metrics: Metrics,
@@ -63,7 +63,7 @@ pub struct WeightKeeper {
     newest: Option<(u64, ZBytes)>,
 }
 
-impl WeightKeeper {
+impl SnapshotPublisher {
     /// State before the first snapshot.
     pub fn new(
         identity: Identity,
@@ -80,8 +80,8 @@ impl WeightKeeper {
         while let Ok(event) = messages.next(IDLE) {
             match event {
                 None => {}
-                Some(Event::Snapshot(snapshot)) => {
-                    if let Err(error) = self.keep(snapshot) {
+                Some(Event::Trained(policy)) => {
+                    if let Err(error) = self.publish(policy) {
                         self.notices.send(Notice::Failed(error)).ok();
                     }
                 }
@@ -93,8 +93,8 @@ impl WeightKeeper {
         }
     }
 
-    fn keep(&mut self, snapshot: train::Snapshot) -> anyhow::Result<()> {
-        let train::Snapshot { step, tensors, evaluate } = snapshot;
+    fn publish(&mut self, policy: TrainedPolicy) -> anyhow::Result<()> {
+        let TrainedPolicy { step, tensors, evaluate } = policy;
         let hash = Hash::of(&tensors);
         self.metrics.evaluation.snapshot_bytes.set(tensors.len() as i64);
         if !evaluate {
@@ -118,9 +118,9 @@ impl WeightKeeper {
         Ok(())
     }
 
-    fn message(&self, step: u64, hash: Hash, tensors: Vec<u8>) -> quad_protocol::Snapshot {
+    fn message(&self, step: u64, hash: Hash, tensors: Vec<u8>) -> Snapshot {
         let Identity { run, incarnation, schema } = self.identity.clone();
-        quad_protocol::Snapshot { run, incarnation, step, schema, hash, tensors }
+        Snapshot { run, incarnation, step, schema, hash, tensors }
     }
 
     fn answer(&self, query: &Query) {
