@@ -78,7 +78,7 @@ struct OverrideArgs {
     /// Gradient steps
     #[arg(long, value_name = "N", value_parser = clap::value_parser!(u64).range(1..))]
     steps: Option<u64>,
-    /// Gradient steps between two evaluations; 0 trains without any and waits for nobody
+    /// Gradient steps between two evaluations; 0 trains without any evaluation
     #[arg(long, value_name = "N")]
     eval_interval: Option<u64>,
     /// Episodes per evaluation

@@ -20,25 +20,25 @@ use crate::notice::Notice;
 use crate::run_dir::RunDir;
 use crate::train::TrainedPolicy;
 
-/// Nothing happens by itself here, so this only bounds how long an idle wait is.
+/// Longest wait for a message. The thread does nothing between messages, so the value does not matter.
 const IDLE: Duration = Duration::from_secs(60);
 
-/// What the thread is told.
+/// Messages to the thread.
 #[derive(Debug)]
 pub enum Event {
     /// A policy from the training thread.
     Trained(TrainedPolicy),
     /// All gradient steps are done; no snapshot will follow.
     TrainingCompleted,
-    /// The Zenoh session is there; publish with this.
+    /// The Zenoh session is open; publish with this.
     Online(Publisher<'static>),
-    /// Somebody asks for `weights/<step>`.
+    /// An evaluator asks for `weights/<step>`.
     Query(Query),
-    /// Do what was asked so far, then end.
+    /// End, after the messages sent before this one are handled.
     Stop,
 }
 
-/// What every snapshot of a run says about itself.
+/// The fields that all snapshots of a run have in common.
 #[derive(Clone, Debug)]
 pub struct Identity {
     /// The run.
@@ -57,7 +57,7 @@ pub struct SnapshotPublisher {
     hub: Inbox<hub::Event>,
     notices: UnboundedSender<Notice>,
     publisher: Option<Publisher<'static>>,
-    /// What can be asked for: every saved snapshot.
+    /// Hash of every snapshot that was published, by step.
     hashes: BTreeMap<u64, Hash>,
     /// The newest, ready to be sent; older ones are read from the disk.
     newest: Option<(u64, ZBytes)>,
@@ -104,12 +104,12 @@ impl SnapshotPublisher {
         let bytes = ZBytes::from(encode(&message)?);
         self.hashes.insert(step, hash);
         self.newest = Some((step, bytes.clone()));
-        // Its jobs first: evaluators ask for one as soon as they see the weights. The disk last: nobody waits for it.
+        // The jobs must exist first: evaluators ask for one as soon as the snapshot arrives. Saving comes last.
         self.hub.send(hub::Event::Evaluate { step, weights: hash });
         if let Some(publisher) = &self.publisher
             && let Err(error) = publisher.put(bytes).wait()
         {
-            // Whoever gets a job for it asks for it.
+            // An evaluator that gets a job for it asks for it.
             debug!(%error, step, "the snapshot could not be published");
         }
         self.metrics.evaluation.snapshots_published.inc();

@@ -43,6 +43,6 @@ pub struct Job {
     pub seeds: Vec<u64>,
     /// Actions that the policy draws in each state before it takes the best (the paper's N_a).
     pub candidates: u32,
-    /// After so many milliseconds without a word the job goes to another evaluator.
+    /// After so many milliseconds without a progress message the job goes to another evaluator.
     pub lease_milliseconds: u64,
 }

@@ -1,4 +1,4 @@
-//! The connection to the others, over Zenoh.
+//! The connection between learner and evaluators, over Zenoh.
 
 use std::thread;
 use std::time::Duration;
@@ -8,8 +8,8 @@ use tokio::sync::oneshot;
 use zenoh::config::EndPoint;
 use zenoh::{Config, Session, Wait};
 
-/// A node that is frozen, or cut off without a word, counts as gone after so long. (One that ends or is killed is
-/// noticed at once.) Half of Zenoh's default; still several missed signs of life on a machine that is busy training.
+/// A process that is frozen or disconnected counts as gone after this time. (One that ends or is killed is noticed at
+/// once.) Half of Zenoh's default; a machine that is busy training may still miss several keep-alive messages in it.
 const LEASE: Duration = Duration::from_secs(5);
 /// Largest message that is taken in, bytes: the largest snapshot that may be sent (64 MiB) and what Zenoh adds.
 const MAX_MESSAGE_SIZE: u64 = 65 << 20;
@@ -91,8 +91,8 @@ pub async fn open_session(endpoints: &Endpoints) -> Result<Session, SessionError
         SessionError::Endpoint { endpoints, reason: for_people(error) }
     };
     let config = config(endpoints).map_err(wrong)?;
-    // Zenoh's future blocks its thread until there is a connection, so it gets one of its own. Nobody joins that: who
-    // gives up waiting just drops this future, and the process may end.
+    // Zenoh's future blocks its thread until there is a connection, so it gets one of its own, which is never
+    // joined: dropping this future gives up waiting, and does not keep the process from ending.
     let (sender, opened) = oneshot::channel();
     let open = move || drop(sender.send(zenoh::open(config).wait()));
     thread::Builder::new().name("zenoh-open".to_owned()).spawn(open).map_err(|error| wrong(error.into()))?;
@@ -129,7 +129,7 @@ fn config(endpoints: &Endpoints) -> zenoh::Result<Config> {
     Ok(config)
 }
 
-/// Zenoh's words without the places in its source code (`at /…/tcp.rs:61.`) that it adds.
+/// Zenoh's message without the places in its source code (`at /…/tcp.rs:61.`) that it adds.
 fn for_people(error: zenoh::Error) -> String {
     let text = error.to_string();
     let mut words = text.split(' ').peekable();

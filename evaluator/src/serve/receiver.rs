@@ -1,4 +1,4 @@
-//! From a snapshot on the wire to a policy that may be rolled out.
+//! Receives snapshots, and makes of one the policy that a job names.
 
 use std::sync::{Arc, Mutex, PoisonError};
 
@@ -19,14 +19,14 @@ const MAX_DIFFUSION_STEPS: u32 = 1_000;
 /// Why a snapshot does not fit the job it came for.
 #[derive(Debug, thiserror::Error)]
 pub enum SnapshotError {
-    /// It is another one.
+    /// It is not the snapshot that the job names.
     #[error("the job names {field} {wanted}, the snapshot is of {found}")]
     Other {
-        /// What differs.
+        /// The field that differs.
         field: &'static str,
-        /// What the job says.
+        /// Its value in the job.
         wanted: String,
-        /// What the snapshot says.
+        /// Its value in the snapshot.
         found: String,
     },
     /// Its numbers cannot be those of a policy for the environment.

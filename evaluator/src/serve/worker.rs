@@ -1,4 +1,4 @@
-//! The evaluator's loop: whose turn it is, and what a turn consists of.
+//! The evaluator's main loop: serves the runs in turn, one job at a time.
 
 use std::collections::{BTreeMap, VecDeque};
 use std::sync::Arc;
@@ -18,9 +18,9 @@ use super::run::RunClient;
 use crate::environment::ENVIRONMENTS;
 use crate::metrics::{JobOutcome, Metrics};
 
-/// Progress is told this often, or three times a lease.
+/// Progress is reported this often, or three times in a lease if that is more often.
 const HEARTBEAT: Duration = Duration::from_secs(1);
-/// Scores are kept this long for a learner that is gone; one that comes back has restarted or was cut off.
+/// Scores are kept this long for a learner that is gone, which may be disconnected only for a while.
 const KEEP_SCORES: Duration = Duration::from_secs(600);
 
 /// Serves every run that is found, one job at a time, in turn.
@@ -30,9 +30,9 @@ pub struct Worker {
     metrics: Metrics,
     found: watch::Receiver<Runs>,
     runs: BTreeMap<RunKey, RunClient>,
-    /// Who was served longest ago comes first.
+    /// The run that was served longest ago comes first.
     turns: VecDeque<RunKey>,
-    /// When the learner of a run went whose scores are kept.
+    /// Runs whose learner is gone but whose scores are kept, and since when.
     gone: BTreeMap<RunKey, Instant>,
     snapshot_arrived: Arc<Notify>,
     /// The policy of the last job: the next one is often about the same.
@@ -77,7 +77,7 @@ impl Worker {
         !self.gone.contains_key(key)
     }
 
-    /// Attaches to runs that came, lets go of runs that went.
+    /// Attaches to runs that appeared, detaches from runs that are gone.
     async fn follow_discovery(&mut self) {
         let found = self.found.borrow_and_update().clone();
         for (key, session) in &found {
@@ -133,7 +133,7 @@ impl Worker {
         Ok(())
     }
 
-    /// One run's turn: scores that wait, else one job.
+    /// One run's turn: delivers scores if there are any, else does one job.
     async fn turn(&mut self, key: RunKey) {
         self.turns.retain(|other| *other != key);
         self.turns.push_back(key.clone());
@@ -186,7 +186,7 @@ impl Worker {
         Ok(self.policy.insert((job.weights, Arc::new(policy))).1.clone())
     }
 
-    /// Runs the episodes, and tells the learner how far they are as long as they move: a stuck simulation loses its lease.
+    /// Runs the episodes, and reports progress to the learner as long as there is any: a stuck simulation loses its lease.
     async fn roll_out(
         &self,
         job: &Job,
