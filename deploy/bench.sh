@@ -6,6 +6,7 @@
 # Criterion's own reports are in target/criterion afterwards, every figure in target/bench.json.
 set -euo pipefail
 cd "$(dirname "$0")/.."
+. deploy/common.sh
 
 deploy/setup.sh --tests
 cargo bench --locked --workspace --no-run

@@ -1,5 +1,5 @@
 #!/usr/bin/env bash
-# Where the demonstration's gain comes from: QUAD and pure behaviour cloning, each acting with one candidate and with the
+# Where the demonstration's gain comes from: behaviour cloning, DAC and QUAD, each acting with one candidate and with the
 # best of ten, over several seeds, on the demonstration's dataset. Runs what is not there yet, then prints one table.
 #
 #   deploy/compare.sh [SEEDS]     three seeds if not said otherwise; runs go to runs/compare
@@ -7,6 +7,7 @@
 # One run per core at a time, each on one thread.
 set -euo pipefail
 cd "$(dirname "$0")/.."
+. deploy/common.sh
 
 DATASET=data/hopper-demo.hdf5
 BIN=target/release
@@ -18,30 +19,25 @@ cargo build --release --locked --package quad-learner --package quad-evaluator
 
 # run GUIDANCE CANDIDATES SEED: one learner and its own evaluator.
 run() {
-  local run=runs/compare/$1-best-of-$2-seed$3 learner evaluator
+  local run=runs/compare/$1-best-of-$2-seed$3 learner endpoint evaluator
   [ ! -e "$run/report.json" ] || return 0
   rm -rf "$run"
   mkdir -p "$run"
-  $BIN/learner train --preset hopper-demo --dataset "$DATASET" --run-dir "$run" --listen tcp/127.0.0.1:0 \
-    --guidance "$1" --candidates "$2" --seed "$3" >"$run/learner.log" 2>&1 &
-  learner=$!
-  until [ -e "$run/endpoints.json" ]; do
-    kill -0 $learner 2>/dev/null || { cat "$run/learner.log" >&2; return 1; }
-    sleep 0.1
-  done
-  $BIN/evaluator serve --connect "$(grep -o 'tcp/[^"]*' "$run/endpoints.json" | head -n 1)" --metrics 127.0.0.1:0 \
-    >"$run/evaluator.log" 2>&1 &
+  start_learner "$run" --preset hopper-demo --dataset "$DATASET" --guidance "$1" --candidates "$2" --seed "$3" \
+    >"$run/learner.log" 2>&1 || { cat "$run/learner.log" >&2; return 1; }
+  $BIN/evaluator serve --connect "$endpoint" --metrics 127.0.0.1:0 >"$run/evaluator.log" 2>&1 &
   evaluator=$!
-  wait $learner || { tail -n 5 "$run/learner.log" >&2; kill $evaluator; return 1; }
+  wait "$learner" || { tail -n 5 "$run/learner.log" >&2; kill $evaluator; return 1; }
   kill $evaluator
   wait $evaluator || true
-  echo "compare: $run is done" >&2
+  say "$run is done"
 }
-export -f run
-export BIN DATASET RAYON_NUM_THREADS=1
+# xargs runs it in other shells.
+export -f run start_learner say
+export NAME BIN DATASET RAYON_NUM_THREADS=1
 
 for ((seed = 0; seed < SEEDS; seed++)); do
-  for guidance in none quad; do
+  for guidance in none dac quad; do
     for candidates in 1 10; do
       echo "$guidance $candidates $seed"
     done

@@ -53,10 +53,8 @@ link_driver() {
   fi
 }
 
-[ "${1:-}" != --help ] || { sed -n '2,9s/^# \?//p' "$0"; exit; }
 deploy/setup.sh
-SCRATCH=$(mktemp -d "$DEPS/cuda.XXXXXX")
-trap 'rm -rf "$SCRATCH"' EXIT
+make_scratch
 if nvcc=$(command -v nvcc); then
   CUDA_HOME=${CUDA_HOME:-$(dirname "$(dirname "$(readlink -f "$nvcc")")")}
 else

@@ -5,15 +5,13 @@
 # learning curve. Run again, it skips what is done. Ctrl-C stops everything.
 set -euo pipefail
 cd "$(dirname "$0")/.."
+. deploy/common.sh
 
 PRESET=hopper-demo
 DATASET=data/hopper-demo.hdf5
 RUN=runs/hopper-demo
 EVALUATORS=2
 BIN=target/release
-
-say() { echo "demo: $*" >&2; }
-die() { say "$*"; exit 1; }
 
 deploy/setup.sh
 cargo build --release --locked --package quad-learner --package quad-evaluator
@@ -55,15 +53,8 @@ trap stop EXIT
 trap 'exit 130' INT
 trap 'exit 143' TERM
 
-# Ports are chosen by the system; endpoints.json says which.
-$BIN/learner train --preset $PRESET --dataset $DATASET --run-dir "$RUN" --listen tcp/127.0.0.1:0 9>&- &
-learner=$!
-until [ -e "$RUN/endpoints.json" ]; do
-  kill -0 $learner 2>/dev/null || wait $learner
-  sleep 0.1
-done
-endpoint=$(grep -o 'tcp/[^"]*' "$RUN/endpoints.json" | head -n 1)
-
+# Without the lock's descriptor: whatever outlives this script must not keep the lock.
+start_learner "$RUN" --preset $PRESET --dataset $DATASET 9>&-
 for ((i = 1; i <= EVALUATORS; i++)); do
   $BIN/evaluator serve --name "evaluator-$i" --connect "$endpoint" --metrics 127.0.0.1:0 \
     >"$RUN/evaluator-$i.log" 2>&1 9>&- &

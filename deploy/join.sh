@@ -6,8 +6,9 @@
 # ENDPOINT is where a learner listens (`learner train --listen`) or its router. Ctrl-C leaves; nobody's scores get lost.
 set -euo pipefail
 cd "$(dirname "$0")/.."
+. deploy/common.sh
 
-[[ $# -eq 1 && $1 == */*:* ]] || { sed -n '2,6s/^# \?//p' "$0" >&2; exit 2; }
+[[ $# -eq 1 && $1 == */*:* ]] || { usage >&2; exit 2; }
 
 deploy/setup.sh
 cargo build --release --locked --package quad-evaluator

@@ -109,13 +109,10 @@ TESTS=
 case ${1:-} in
   '') ;;
   --tests) TESTS=1 ;;
-  *) sed -n '2,8s/^# \?//p' "$0" >&2; exit 2 ;;
+  *) usage >&2; exit 2 ;;
 esac
 
-mkdir -p "$DEPS"
-SCRATCH=$(mktemp -d "$DEPS/setup.XXXXXX")
-trap 'rm -rf "$SCRATCH"' EXIT
-
+make_scratch
 check_rust
 install_packages
 fetch_mujoco

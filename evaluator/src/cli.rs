@@ -34,7 +34,7 @@ enum Command {
 /// same seed makes the same data.
 #[derive(Debug, Args)]
 struct CollectArgs {
-    /// What to act in: hopper
+    /// Environment to act in: hopper
     #[arg(long, value_name = "NAME", value_parser = environment::find)]
     env: &'static EnvironmentSpec,
     /// The file to write. It appears when it is complete
@@ -57,7 +57,7 @@ struct CollectArgs {
 struct VerifyArgs {
     /// The file to replay
     file: PathBuf,
-    /// What it was recorded in: hopper
+    /// Environment that it was recorded in: hopper
     #[arg(long, value_name = "NAME", value_parser = environment::find, default_value = "hopper")]
     env: &'static EnvironmentSpec,
     /// Print one JSON object

@@ -8,7 +8,7 @@
 //! - [`rollout`]: many episodes as one batch, one policy call per step.
 //! - [`collect`]: trains behaviour from random to competent and records it as a dataset.
 //! - [`verify`]: replays a recorded dataset and measures how far the simulation is from it.
-//! - [`serve`]: finds runs on the network, measures the weights they publish; [`metrics`]: what it tells Prometheus.
+//! - [`serve`]: finds runs on the network, evaluates their snapshots; [`metrics`]: its Prometheus metrics.
 //! - [`cli`]: the command line.
 
 pub mod cli;

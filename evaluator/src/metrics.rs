@@ -1,4 +1,4 @@
-//! What an evaluator tells Prometheus; docs/metrics.md explains each.
+//! An evaluator's Prometheus metrics; docs/metrics.md explains each of them.
 
 use prometheus::{Counter, Histogram, HistogramOpts, IntCounter, IntCounterVec, IntGauge, Opts, Registry};
 
@@ -109,7 +109,7 @@ impl Metrics {
         self.jobs.with_label_values(&[outcome.label()]).inc();
     }
 
-    /// Counts a message that was not used. Reasons come from a fixed list, so that nobody can make labels up.
+    /// Counts a message that was not used. The reasons are a fixed list, because every label stays in the registry.
     pub fn rejected(&self, reason: &'static str) {
         self.rejected_messages.with_label_values(&[reason]).inc();
     }

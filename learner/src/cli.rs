@@ -6,6 +6,7 @@ use std::path::PathBuf;
 use clap::builder::{PossibleValuesParser, TypedValueParser};
 use clap::{Args, Parser, Subcommand};
 use quad_policy::Precision;
+use quad_service::parse_endpoint;
 
 use crate::agent::Guidance;
 use crate::config::{self, Overrides};
@@ -77,7 +78,7 @@ struct OverrideArgs {
     /// Gradient steps
     #[arg(long, value_name = "N", value_parser = clap::value_parser!(u64).range(1..))]
     steps: Option<u64>,
-    /// Gradient steps between two evaluations; 0 trains without any and waits for nobody
+    /// Gradient steps between two evaluations; 0 trains without any evaluation
     #[arg(long, value_name = "N")]
     eval_interval: Option<u64>,
     /// Episodes per evaluation
@@ -131,13 +132,6 @@ fn parse_preset(text: &str) -> Result<String, String> {
     }
     let known: Vec<_> = config::PRESETS.iter().map(|(name, _)| *name).collect();
     Err(format!("presets are {}; a file of your own must end in .toml", known.join(", ")))
-}
-
-fn parse_endpoint(text: &str) -> Result<String, String> {
-    match text.parse::<zenoh::config::EndPoint>() {
-        Ok(_) => Ok(text.to_owned()),
-        Err(_) => Err("write it like Zenoh does, e.g. tcp/127.0.0.1:7447".to_owned()),
-    }
 }
 
 fn guidance_parser() -> impl TypedValueParser<Value = Guidance> {

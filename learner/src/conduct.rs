@@ -1,4 +1,4 @@
-//! The main loop of a run: brings the network up beside the threads, shows what happens, decides when it is over.
+//! The main loop of a run: connects to the network while the threads work, shows events, decides when the run is over.
 
 use std::thread;
 use std::time::{Duration, Instant};
@@ -21,11 +21,11 @@ use crate::threads::Threads;
 use crate::train::Outcome;
 use crate::wire::Wire;
 
-/// Listening takes milliseconds; whoever needs longer is waiting for a router, and training does not.
+/// Listening takes milliseconds. A session that takes longer waits for a router; training starts without it.
 const SESSION_PATIENCE: Duration = Duration::from_secs(1);
-/// So long nobody is there to evaluate before a person is told what to do.
+/// When no evaluator has been connected for this long after training, the user is told what to do.
 const EVALUATOR_PATIENCE: Duration = Duration::from_secs(10);
-/// A goodbye to a network that hangs is not waited for longer.
+/// Longest time to close the session in, should the network hang.
 const CLOSE_PATIENCE: Duration = Duration::from_secs(5);
 
 /// A Zenoh session that may still wait for a router.
@@ -57,7 +57,7 @@ type Opened = Result<anyhow::Result<Session>, oneshot::error::RecvError>;
 pub enum Ending {
     /// Trained, and every score is there.
     Complete,
-    /// Somebody asked to stop.
+    /// The user asked to stop (SIGINT or SIGTERM).
     Interrupted,
     /// It could not go on.
     Failed(anyhow::Error),
@@ -77,11 +77,11 @@ pub struct Conductor {
     pub endpoints: Endpoints,
     /// Where evaluators find it; empty until the session is there.
     pub reachable_at: Vec<String>,
-    /// What its threads tell.
+    /// Messages from its threads.
     pub notices: UnboundedReceiver<Notice>,
     /// Its threads.
     pub threads: Threads,
-    /// What a person sees.
+    /// The progress display.
     pub display: Display,
 }
 
@@ -151,8 +151,8 @@ impl Conductor {
         self.reachable_at = quad_service::reachable_at(&session, &self.endpoints).await?;
         let endpoints = RunEndpoints { zenoh: self.reachable_at.clone(), metrics: self.metrics_address.clone() };
         let ready = || Ok(self.run_dir.write_endpoints(&endpoints)?);
-        let (hub, weights) = (&self.threads.hub, &self.threads.weights);
-        let wire = Wire::declare(session, &self.run, hub, weights, &self.metrics, ready).await?;
+        let (hub, publisher) = (&self.threads.hub, &self.threads.publisher);
+        let wire = Wire::declare(session, &self.run, hub, publisher, &self.metrics, ready).await?;
         let (zenoh, metrics) = (endpoints.zenoh.join(", "), &endpoints.metrics);
         self.display.say(&format!("run {} is at {zenoh}, its metrics at http://{metrics}/metrics", self.run));
         Ok(wire)
@@ -194,7 +194,7 @@ impl Conductor {
     }
 }
 
-/// How long no evaluator was there.
+/// For how long no evaluator has been connected.
 #[derive(Default)]
 struct Waiting {
     since: Option<Instant>,

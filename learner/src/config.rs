@@ -87,8 +87,8 @@ pub struct RunConfig {
 pub struct RunInfo {
     /// Name of the run: its folder's name, and its place in Zenoh's key space.
     pub name: String,
-    /// Start of the learner in milliseconds since 1970; tells two lives of a run apart.
-    pub epoch: u64,
+    /// Start of the learner in milliseconds since 1970; tells it from an earlier learner of the same run.
+    pub incarnation: u64,
     /// Preset that was asked for.
     pub preset: String,
     /// Version of the learner.

@@ -1,5 +1,5 @@
-//! The thread that owns the scoreboard: hands out jobs, takes scores in, watches who is there. One thread, so no locks;
-//! all of its messages are small, so none keeps another waiting for long.
+//! The thread that owns the scoreboard: it hands out jobs, records scores, and follows which evaluators are connected. A
+//! single thread needs no locks, and its messages are small, so none delays the next one for long.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::time::{Duration, Instant};
@@ -23,14 +23,14 @@ use crate::run_dir::{Log, RunDirError, ScoreLine};
 use crate::scoreboard::{Refusal, Scoreboard};
 use crate::seeds::episode_seeds;
 
-/// How often leases are looked at.
+/// How often expired leases are looked for.
 const TICK: Duration = Duration::from_millis(250);
-/// After so long without a word, a gone evaluator's metrics are dropped.
+/// The metrics of an evaluator that has left are dropped this long after its last progress message.
 const FORGET_AFTER: Duration = Duration::from_secs(600);
-/// Evaluators that the learner keeps apart by name; far above any pool, so only a flood of made-up names meets it.
+/// Most evaluators that the learner tracks. No real pool is this large; the limit is for floods of made-up names.
 const MOST_EVALUATORS: usize = 1024;
 
-/// What the thread is told.
+/// Messages to the thread.
 #[derive(Debug)]
 pub enum Event {
     /// A snapshot is ready to be evaluated.
@@ -42,21 +42,21 @@ pub enum Event {
     },
     /// All gradient steps are done; no further evaluation will follow.
     TrainingCompleted,
-    /// The Zenoh session is there.
+    /// The Zenoh session is open.
     Online(Session),
-    /// Somebody asks for a job.
+    /// An evaluator asks for a job.
     Claim(Query),
-    /// Somebody delivers scores.
+    /// An evaluator delivers scores.
     Report(Query),
-    /// Somebody tells how far a job is.
+    /// An evaluator reports a job's progress.
     Progress(Sample),
     /// A liveliness token of an evaluator came or went.
     Liveliness(Sample),
-    /// Do what was asked so far, then end.
+    /// End, after the messages sent before this one are handled.
     Stop,
 }
 
-/// What the evaluations of a run are made of.
+/// Which episodes each evaluation of a run has.
 #[derive(Clone, Copy, Debug)]
 pub struct EvaluationPlan {
     /// Seed of the run.
@@ -198,7 +198,7 @@ impl Hub {
         reply
     }
 
-    /// Checks, writes down, counts; the caller thanks the evaluator after that.
+    /// Checks the scores, writes the new ones to disk, counts them. Only then does the caller acknowledge the report.
     fn report(&mut self, report: &ScoreReport, completed: &mut Option<Notice>) -> Result<ScoreReply, Rejection> {
         let screened = match self.scoreboard.screen(report) {
             Ok(screened) => screened,
@@ -209,7 +209,7 @@ impl Hub {
         };
         if !screened.new.is_empty() {
             let lines: Vec<_> = screened.new.iter().map(|score| ScoreLine::new(report, score)).collect();
-            // If this fails nothing is counted, so the evaluator's next try finds the scores new again.
+            // If this fails nothing is counted, so the scores are new again when the evaluator delivers them once more.
             self.scores.append(&lines)?;
         }
         let recorded = self.scoreboard.record(report, &screened.new);
@@ -232,7 +232,7 @@ impl Hub {
         Ok(reply)
     }
 
-    /// Tells whoever watches; nobody has to.
+    /// Publishes recorded scores for observers. The system works without any, so a failure does not matter.
     fn publish(&self, report: &ScoreReport, episodes: Vec<quad_protocol::EpisodeScore>) {
         let Some(session) = &self.session else { return };
         let ScoreReport { run, step, weights, evaluator, .. } = report.clone();

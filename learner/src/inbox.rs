@@ -1,12 +1,12 @@
-//! How messages from Zenoh's threads reach the thread that owns the state. A callback that worked or waited would hold
-//! up every other key of the session, so it only puts the message here, and what does not fit is turned away.
+//! A queue from Zenoh's threads to the thread that owns the state. A callback that worked or waited would delay every
+//! other key of the session, so it only puts the message into this queue, which refuses it when it is full.
 
 use std::sync::Arc;
 use std::sync::atomic::{AtomicUsize, Ordering};
 use std::sync::mpsc::{self, Receiver, RecvTimeoutError, Sender};
 use std::time::Duration;
 
-/// Messages from the wire that may wait. Together with `MOST_BYTES` it bounds what strangers can make the learner hold.
+/// Most messages from the network that may wait. With `MOST_BYTES` it bounds the memory that they can take.
 const MOST_WAITING: usize = 256;
 /// Largest payload of a message to the learner; a score report of a job is a few hundred bytes.
 pub const MOST_BYTES: usize = 256 * 1024;
@@ -38,7 +38,7 @@ struct Envelope<T> {
     from_wire: bool,
 }
 
-/// A queue whose wire side is bounded.
+/// A queue that is bounded for messages from the network.
 pub fn inbox<T>() -> (Inbox<T>, Messages<T>) {
     let (sender, receiver) = mpsc::channel();
     let waiting = Arc::new(AtomicUsize::new(0));
@@ -46,12 +46,12 @@ pub fn inbox<T>() -> (Inbox<T>, Messages<T>) {
 }
 
 impl<T> Inbox<T> {
-    /// From inside this process: always accepted, never blocks. After the receiver's end it does nothing.
+    /// Sends a message from inside this process: always accepted, never blocks; lost if the receiver is gone.
     pub fn send(&self, message: T) {
         self.sender.send(Envelope { message, from_wire: false }).ok();
     }
 
-    /// From the wire: given back if too many wait already. Never blocks.
+    /// Sends a message from the network; gives it back if too many wait already. Never blocks.
     pub fn offer(&self, message: T) -> Result<(), T> {
         if self.waiting.fetch_add(1, Ordering::Relaxed) >= MOST_WAITING {
             self.waiting.fetch_sub(1, Ordering::Relaxed);
@@ -77,7 +77,7 @@ impl<T> Messages<T> {
     }
 }
 
-/// Nobody can send any more.
+/// Every [`Inbox`] of the queue was dropped: no message can come any more.
 #[derive(Debug, PartialEq, Eq)]
 pub struct Disconnected;
 

@@ -1,16 +1,16 @@
-//! The learner: data in, gradient steps, snapshots out, scores in. Owns the run's truth on disk.
+//! The learner: trains on a dataset, publishes snapshots, collects their scores, and keeps all of it in the run's folder.
 //!
 //! # Layout
 //! In reading order:
 //!
-//! - [`cli`] is what can be typed, [`config`] what it resolves to: a preset with flags on top, validated once.
+//! - [`cli`] is the command line; [`config`] the experiment that it describes, a preset with flags on top, validated once.
 //! - [`run`] goes from the command line to the exit; [`conduct`] is the main loop in between.
 //! - [`threads`] starts the threads that do the work: [`train`] (nothing but gradient steps, with an [`agent`] on a
-//!   [`device`]), [`weights`] (keeps and publishes snapshots) and [`hub`] (hands out jobs, takes scores in).
+//!   [`device`]), [`publisher`] (publishes and saves snapshots) and [`hub`] (hands out jobs, takes scores in).
 //! - [`scoreboard`] is the hub's state without any I/O; [`seeds`] says which episodes an evaluation has.
-//! - [`wire`] declares everything on Zenoh; its callbacks fill an [`inbox`]; [`notice`] is what threads tell the loop.
-//! - [`run_dir`] is the folder of a run, [`metrics`] what Prometheus asks, [`display`] what a person sees meanwhile.
-//! - [`report`] and [`plot`] say at the end what was achieved.
+//! - [`wire`] declares everything on Zenoh; its callbacks fill an [`inbox`]; [`notice`] is what threads tell the main loop.
+//! - [`run_dir`] is the folder of a run, [`metrics`] are for Prometheus, [`display`] shows progress on the terminal.
+//! - [`report`] and [`plot`] summarise the scores as tables and as a picture.
 
 pub mod agent;
 pub mod cli;
@@ -23,6 +23,7 @@ pub mod inbox;
 pub mod metrics;
 pub mod notice;
 pub mod plot;
+pub mod publisher;
 pub mod report;
 pub mod run;
 pub mod run_dir;
@@ -30,5 +31,4 @@ pub mod scoreboard;
 pub mod seeds;
 pub mod threads;
 pub mod train;
-pub mod weights;
 pub mod wire;

@@ -1,4 +1,4 @@
-//! What the learner's threads tell its main loop, for the display and for the decision when to end.
+//! Messages from the learner's threads to its main loop, which shows them and decides when the run is over.
 
 use quad_protocol::{EpisodeScore, Name};
 
@@ -10,11 +10,11 @@ pub enum Notice {
         /// After which gradient step.
         step: u64,
     },
-    /// An evaluator came.
+    /// An evaluator connected.
     EvaluatorJoined(Name),
-    /// An evaluator went, and with it so many unfinished jobs.
+    /// An evaluator left; this many jobs that it had not finished were taken back.
     EvaluatorLeft(Name, usize),
-    /// So many jobs went without progress for too long and were taken back.
+    /// This many jobs were taken back because their leases ran out.
     JobsExpired(usize),
     /// All episodes of an evaluation are scored.
     Evaluated {

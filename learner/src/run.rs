@@ -24,7 +24,7 @@ use crate::threads::Threads;
 
 /// Where evaluators look by default.
 const DEFAULT_ENDPOINT: &str = "tcp/127.0.0.1:7447";
-/// For a run that waits for nobody: several of them may run at a time.
+/// For a run without evaluations, which needs no known port: several of them may run at a time.
 const ANY_ENDPOINT: &str = "tcp/127.0.0.1:0";
 
 /// Does what the command line says.
@@ -129,7 +129,7 @@ fn endpoints(args: &TrainArgs, eval_interval: u64) -> Endpoints {
     Endpoints { listen, connect: Vec::from_iter(args.connect.clone()) }
 }
 
-/// Leaves a report of what there is, whatever the ending; an ending before the end is an error.
+/// Writes the report, however the run ended; a run that did not complete is an error.
 fn conclude(run_dir: &RunDir, config: &RunConfig, ending: Ending) -> anyhow::Result<()> {
     let folder = run_dir.path().display();
     let report = RunReport::read(run_dir.path())?;
@@ -175,7 +175,7 @@ fn run_config(
     Ok(RunConfig {
         run: RunInfo {
             name: name.to_string(),
-            epoch: SystemTime::now().duration_since(UNIX_EPOCH)?.as_millis() as u64,
+            incarnation: SystemTime::now().duration_since(UNIX_EPOCH)?.as_millis() as u64,
             preset: config::preset_label(&args.preset),
             version: env!("CARGO_PKG_VERSION").to_owned(),
             device: args.device,

@@ -1,10 +1,10 @@
-//! The folder of a run: the only place where a run's truth is kept.
+//! The folder of a run: everything that is kept of it.
 //!
 //! ```text
 //! config.toml                        the resolved configuration
-//! endpoints.json                     where this learner can be reached, once it can
+//! endpoints.json                     where this learner can be reached; written as soon as it listens
 //! metrics.jsonl                      training metrics, a line every hundred gradient steps
-//! scores.jsonl                       a line per scored episode, on disk before the evaluator is thanked
+//! scores.jsonl                       a line per scored episode, written before the evaluator gets its acknowledgement
 //! snapshots/step_000003000.safetensors   target actor and target critics
 //! report.json, learning_curve.svg    written at the end
 //! ```
@@ -27,14 +27,14 @@ pub enum RunDirError {
     /// Reading or writing failed.
     #[error("cannot {action} {path}")]
     Io {
-        /// What was tried.
+        /// The operation: "read", "write" …
         action: &'static str,
-        /// With which file.
+        /// The file.
         path: PathBuf,
-        /// What the system says.
+        /// The system's error.
         source: io::Error,
     },
-    /// A file of the run does not say what it should.
+    /// A file of the run has contents that no learner writes.
     #[error("{path}{} is not what a learner writes: {reason}", line.map(|n| format!(", line {n},")).unwrap_or_default())]
     Content {
         /// Which file.
@@ -47,7 +47,7 @@ pub enum RunDirError {
 }
 
 /// Where a learner can be reached: `endpoints.json`.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Serialize)]
 pub struct RunEndpoints {
     /// Zenoh endpoints that an evaluator can connect to.
     pub zenoh: Vec<String>,
@@ -97,7 +97,7 @@ pub struct RunDir {
 }
 
 impl RunDir {
-    /// Says early whether [`create`](Self::create) would find a run there.
+    /// Fails if there is a run in the folder, as [`create`](Self::create) would, but changes nothing.
     pub fn check_free(path: &Path) -> Result<(), RunDirError> {
         if path.join("config.toml").exists() { Err(RunDirError::Occupied(path.to_owned())) } else { Ok(()) }
     }
@@ -122,7 +122,7 @@ impl RunDir {
         Ok((Self { path: path.to_owned() }, config))
     }
 
-    /// Where it is.
+    /// The folder's path.
     pub fn path(&self) -> &Path {
         &self.path
     }
@@ -145,23 +145,22 @@ impl RunDir {
         replace(&path, text.as_bytes())
     }
 
-    /// File of the snapshot of a gradient step.
-    pub fn snapshot(&self, step: u64) -> PathBuf {
+    fn snapshot_path(&self, step: u64) -> PathBuf {
         self.path.join("snapshots").join(format!("step_{step:09}.safetensors"))
     }
 
     /// Saves the snapshot of a gradient step.
     pub fn write_snapshot(&self, step: u64, tensors: &[u8]) -> Result<(), RunDirError> {
-        replace(&self.snapshot(step), tensors)
+        replace(&self.snapshot_path(step), tensors)
     }
 
     /// Reads the snapshot of a gradient step.
     pub fn read_snapshot(&self, step: u64) -> Result<Vec<u8>, RunDirError> {
-        let path = self.snapshot(step);
+        let path = self.snapshot_path(step);
         fs::read(&path).map_err(io_error("read", &path))
     }
 
-    /// `scores.jsonl`, opened for appending. Each append is synchronised: what an evaluator was thanked for stays.
+    /// `scores.jsonl`, opened for appending. Each append is synchronised, so acknowledged scores survive a crash.
     pub fn score_log(&self) -> Result<Log, RunDirError> {
         Log::open(self.path.join("scores.jsonl"), true)
     }
@@ -215,7 +214,7 @@ impl Log {
             false => Ok(()),
         });
         if let Err(error) = written {
-            // Half a line would spoil the next one.
+            // Half a line would make the next one unreadable.
             self.file.set_len(self.length).ok();
             return Err(io_error("write", &self.path)(error));
         }

@@ -1,8 +1,8 @@
-//! Which episodes are to be scored, who is at it, and what is known: the state of all evaluations, without any I/O.
+//! The state of all evaluations, without any I/O: which episodes wait, which are handed out and to whom, and the scores.
 //!
 //! An evaluation is a snapshot (step and hash) with a list of episode seeds. Jobs hand out some of its episodes under a
-//! lease that progress extends; when the lease runs out or the evaluator goes, they are handed out again. Each
-//! (step, seed) is counted once, whoever delivers it first. Time comes in as an argument.
+//! lease that progress extends; when the lease runs out or the evaluator leaves, they are handed out again. For each
+//! (step, seed) the first score that is delivered counts, and no other. The current time is an argument, for tests.
 
 use std::collections::BTreeMap;
 use std::time::{Duration, Instant};
@@ -10,11 +10,11 @@ use std::time::{Duration, Instant};
 use quad_dataset::EnvironmentSpec;
 use quad_protocol::{EpisodeScore, Hash, Job, JobReply, JobRequest, Name, Progress, ScoreReport};
 
-/// What an idle evaluator is told to wait when it may be needed soon.
+/// After this time an evaluator asks again when there was no job for it.
 const ASK_AGAIN: Duration = Duration::from_millis(500);
-/// What an evaluator without the run's environment is told to wait.
+/// The same for an evaluator that does not have the run's environment.
 const NOT_FOR_YOU: Duration = Duration::from_secs(10);
-/// A score may differ from the one that follows from its return by this part of it (rounding, no more).
+/// Largest relative difference between a score and the one computed from its return; it allows for rounding only.
 const SCORE_TOLERANCE: f64 = 1e-6;
 
 /// What stays the same for all evaluations of a run.
@@ -22,8 +22,8 @@ const SCORE_TOLERANCE: f64 = 1e-6;
 pub struct Rules {
     /// The run.
     pub run: Name,
-    /// The learner's life.
-    pub epoch: u64,
+    /// Which start of the learner this is.
+    pub incarnation: u64,
     /// Where policies are evaluated.
     pub environment: &'static EnvironmentSpec,
     /// Actions sampled per state.
@@ -61,7 +61,7 @@ enum EpisodeState {
     Scored(EpisodeScore),
 }
 
-/// Kept for the whole run, so that a late or repeated report still finds what it was asked for.
+/// A job that was handed out. Kept for the whole run, so that late and repeated reports can still be checked.
 #[derive(Debug)]
 struct JobRecord {
     evaluator: Name,
@@ -71,16 +71,16 @@ struct JobRecord {
     lease_until: Option<Instant>,
 }
 
-/// A report that passed every check, split into what is news and what was known.
+/// A report that passed every check, split into new scores and scores that are recorded already.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Screened {
     /// Episodes that had no score yet.
     pub new: Vec<EpisodeScore>,
-    /// How many had one.
+    /// Number of episodes that had a score already.
     pub duplicates: u32,
 }
 
-/// What recording a report brought to an end.
+/// What a report completed.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct Recorded {
     /// The report's job has no episode left to score.
@@ -96,8 +96,8 @@ pub enum Refusal {
     #[error("it is for another run")]
     Run,
     /// From before the learner's restart.
-    #[error("it is from another life of the learner (epoch)")]
-    Epoch,
+    #[error("it is from another incarnation of the learner")]
+    Incarnation,
     /// No such job was handed out.
     #[error("no such job was handed out")]
     Job,
@@ -113,17 +113,17 @@ pub enum Refusal {
     /// An episode that the job does not contain, or the same one twice.
     #[error("seed {0} is not in the job, or twice in the report")]
     Seed(u64),
-    /// Not what an episode can look like.
+    /// An episode with values that no episode of the environment can have.
     #[error("the episode with seed {0} has an impossible length, return or score")]
     Episode(u64),
 }
 
 impl Refusal {
-    /// A word for a metric's label.
+    /// The reason as a metric's label.
     pub fn label(&self) -> &'static str {
         match self {
             Self::Run => "unknown_run",
-            Self::Epoch => "unknown_epoch",
+            Self::Incarnation => "unknown_incarnation",
             Self::Job => "unknown_job",
             Self::Evaluator => "wrong_evaluator",
             Self::Step => "unknown_step",
@@ -153,12 +153,6 @@ impl Scoreboard {
         self.evaluations.values().map(|evaluation| evaluation.episodes.iter().filter(scored).count()).sum()
     }
 
-    /// Evaluations with an episode that has no score yet.
-    pub fn pending_evaluations(&self) -> usize {
-        let open = |evaluation: &&Evaluation| evaluation.scores().is_none();
-        self.evaluations.values().filter(open).count()
-    }
-
     /// Hands out a job: waiting episodes of the oldest step that has any.
     pub fn claim(&mut self, request: &JobRequest, now: Instant) -> JobReply {
         let wait = |time: Duration| JobReply::Wait { milliseconds: time.as_millis() as u64 };
@@ -183,7 +177,7 @@ impl Scoreboard {
             return JobReply::Job(Job {
                 id,
                 run: rules.run.clone(),
-                epoch: rules.epoch,
+                incarnation: rules.incarnation,
                 step,
                 weights: evaluation.weights,
                 environment: rules.environment.name.to_owned(),
@@ -210,7 +204,7 @@ impl Scoreboard {
     /// new scores down first, then calls [`record`](Self::record).
     pub fn screen(&self, report: &ScoreReport) -> Result<Screened, Refusal> {
         require(report.run == self.rules.run, Refusal::Run)?;
-        require(report.epoch == self.rules.epoch, Refusal::Epoch)?;
+        require(report.incarnation == self.rules.incarnation, Refusal::Incarnation)?;
         let job = self.jobs.get(&report.job).ok_or(Refusal::Job)?;
         require(job.evaluator == report.evaluator, Refusal::Evaluator)?;
         require(job.step == report.step, Refusal::Step)?;

@@ -19,10 +19,10 @@ use crate::hub::{self, EvaluationPlan, Hub};
 use crate::inbox::{Inbox, inbox};
 use crate::metrics::{Metrics, TrainingMetrics};
 use crate::notice::Notice;
+use crate::publisher::{self, Identity, SnapshotPublisher};
 use crate::run_dir::{Log, RunDir};
 use crate::scoreboard::{Rules, Scoreboard};
 use crate::train::{Outcome, Outlets, Plan, Row, train};
-use crate::weights::{self, Identity, WeightKeeper};
 
 /// Episodes in one job: two evaluators share an evaluation of ten.
 const JOB_EPISODES: usize = 5;
@@ -36,8 +36,8 @@ pub type TrainingResult = anyhow::Result<Outcome>;
 
 /// The running threads.
 pub struct Threads {
-    /// Reaches the thread that keeps the snapshots.
-    pub weights: Inbox<weights::Event>,
+    /// Reaches the thread that publishes snapshots.
+    pub publisher: Inbox<publisher::Event>,
     /// Reaches the thread that owns the scoreboard.
     pub hub: Inbox<hub::Event>,
     /// Told once how training ended; fails if its thread panicked.
@@ -45,7 +45,7 @@ pub struct Threads {
     stop: Arc<AtomicBool>,
     training: JoinHandle<()>,
     rows: JoinHandle<()>,
-    weights_thread: JoinHandle<()>,
+    publisher_thread: JoinHandle<()>,
     hub_thread: JoinHandle<()>,
 }
 
@@ -63,7 +63,7 @@ impl Threads {
         let experiment = &config.experiment;
         let rules = Rules {
             run: run.clone(),
-            epoch: config.run.epoch,
+            incarnation: config.run.incarnation,
             environment,
             candidates: experiment.candidates,
             job_episodes: JOB_EPISODES,
@@ -75,10 +75,11 @@ impl Threads {
         let (hub, hub_messages) = inbox();
         let hub_thread = spawn("hub", move || state.run(&hub_messages))?;
 
-        let identity = Identity { run: run.clone(), epoch: config.run.epoch, schema: schema(experiment, environment) };
-        let state = WeightKeeper::new(identity, run_dir.clone(), metrics.clone(), hub.clone(), notices.clone());
-        let (weights, weights_messages) = inbox();
-        let weights_thread = spawn("weights", move || state.run(&weights_messages))?;
+        let identity =
+            Identity { run: run.clone(), incarnation: config.run.incarnation, schema: schema(experiment, environment) };
+        let state = SnapshotPublisher::new(identity, run_dir.clone(), metrics.clone(), hub.clone(), notices.clone());
+        let (publisher, publisher_messages) = inbox();
+        let publisher_thread = spawn("publisher", move || state.run(&publisher_messages))?;
 
         let (row_sender, row_receiver) = sync_channel(ROWS_WAITING);
         let log = run_dir.metrics_log()?;
@@ -93,14 +94,14 @@ impl Threads {
             transitions,
             metrics: metrics.training.clone(),
             rows: row_sender,
-            weights: weights.clone(),
+            publisher: publisher.clone(),
             stop: stop.clone(),
         };
         let training = spawn("training", move || {
             // Nobody listens any more if the process is ending.
             tell.send(trainer.run()).ok();
         })?;
-        Ok(Self { weights, hub, trained, stop, training, rows, weights_thread, hub_thread })
+        Ok(Self { publisher, hub, trained, stop, training, rows, publisher_thread, hub_thread })
     }
 
     /// Asks training to end after its current step.
@@ -113,8 +114,8 @@ impl Threads {
         self.stop_training();
         finish("training", self.training)?;
         finish("metrics", self.rows)?;
-        self.weights.send(weights::Event::Stop);
-        finish("weights", self.weights_thread)?;
+        self.publisher.send(publisher::Event::Stop);
+        finish("publisher", self.publisher_thread)?;
         self.hub.send(hub::Event::Stop);
         finish("hub", self.hub_thread)
     }
@@ -135,7 +136,7 @@ struct Trainer {
     transitions: Transitions,
     metrics: TrainingMetrics,
     rows: SyncSender<Row>,
-    weights: Inbox<weights::Event>,
+    publisher: Inbox<publisher::Event>,
     stop: Arc<AtomicBool>,
 }
 
@@ -148,13 +149,13 @@ impl Trainer {
         let outlets = Outlets {
             metrics: self.metrics,
             rows: self.rows,
-            snapshot: &|snapshot| self.weights.send(weights::Event::Snapshot(snapshot)),
+            snapshot: &|policy| self.publisher.send(publisher::Event::Trained(policy)),
             stop: &self.stop,
         };
         let plan = Plan { steps: *steps, eval_interval: *eval_interval };
         let outcome = train(&mut *agent, &self.transitions, &mut sampler, plan, &outlets)?;
         if outcome == Outcome::Completed {
-            self.weights.send(weights::Event::TrainingCompleted);
+            self.publisher.send(publisher::Event::TrainingCompleted);
         }
         Ok(outcome)
     }

@@ -31,15 +31,15 @@ pub struct Outlets<'a> {
     pub metrics: TrainingMetrics,
     /// Lines for `metrics.jsonl`.
     pub rows: SyncSender<Row>,
-    /// Takes a snapshot; must not block.
-    pub snapshot: &'a dyn Fn(Snapshot),
+    /// Takes a policy to be published or kept; must not block.
+    pub snapshot: &'a dyn Fn(TrainedPolicy),
     /// Set by somebody who wants training to end early.
     pub stop: &'a AtomicBool,
 }
 
-/// The target networks after a gradient step.
+/// The policy after a gradient step, as it is handed over by training.
 #[derive(Debug)]
-pub struct Snapshot {
+pub struct TrainedPolicy {
     /// After which step.
     pub step: u64,
     /// A safetensors file.
@@ -131,7 +131,7 @@ pub fn train(
         if due || last || stopped {
             debug!(step, "snapshot");
             let tensors = agent.target_safetensors().map_err(|source| TrainError::Update { step, source })?;
-            (outlets.snapshot)(Snapshot { step, tensors, evaluate: due });
+            (outlets.snapshot)(TrainedPolicy { step, tensors, evaluate: due });
         }
         if stopped {
             return Ok(Outcome::Stopped { step });

@@ -11,9 +11,9 @@ use zenoh::{Session, Wait};
 
 use crate::inbox::{Inbox, MOST_BYTES};
 use crate::metrics::Metrics;
-use crate::{hub, weights};
+use crate::{hub, publisher};
 
-/// The learner's declarations; they end with it.
+/// The learner's declarations; dropping it undeclares them.
 pub struct Wire {
     session: Session,
     _queryables: [Queryable<()>; 3],
@@ -22,23 +22,23 @@ pub struct Wire {
 }
 
 impl Wire {
-    /// Declares what evaluators ask, then what they tell, and at last that this learner is there, so that whoever sees
-    /// the token finds the rest in place. Calls `ready` just before the token.
+    /// Declares the queryables, then the subscribers, and last the learner's liveliness token, so that an evaluator that
+    /// sees the token finds everything else in place. Calls `ready` just before the token.
     pub async fn declare(
         session: Session,
         run: &Name,
         hub: &Inbox<hub::Event>,
-        weights: &Inbox<weights::Event>,
+        publisher: &Inbox<publisher::Event>,
         metrics: &Metrics,
         ready: impl FnOnce() -> anyhow::Result<()>,
     ) -> anyhow::Result<Self> {
-        // A subscriber that does not keep up loses a snapshot, which it can ask for, instead of holding up the others.
-        let publisher = session.declare_publisher(keys::weights(run)).congestion_control(CongestionControl::Drop).await;
-        weights.send(weights::Event::Online(publisher.map_err(zenoh_error)?));
+        // A slow subscriber loses a snapshot, which it can ask for later, instead of delaying the other subscribers.
+        let weights = session.declare_publisher(keys::weights(run)).congestion_control(CongestionControl::Drop).await;
+        publisher.send(publisher::Event::Online(weights.map_err(zenoh_error)?));
         hub.send(hub::Event::Online(session.clone()));
 
         let queryables = [
-            serve(&session, keys::weights_at_any_step(run), weights, weights::Event::Query, metrics).await?,
+            serve(&session, keys::weights_at_any_step(run), publisher, publisher::Event::Query, metrics).await?,
             serve(&session, keys::jobs(run), hub, hub::Event::Claim, metrics).await?,
             serve(&session, keys::scores(run), hub, hub::Event::Report, metrics).await?,
         ];
@@ -69,7 +69,7 @@ impl Wire {
         Ok(Self { session, _queryables: queryables, _subscribers: [progress, evaluators], _token: token })
     }
 
-    /// Says goodbye; what was answered before is delivered.
+    /// Closes the session; answers that were sent before are still delivered.
     pub async fn close(self) -> anyhow::Result<()> {
         self.session.close().await.map_err(zenoh_error)
     }
@@ -88,7 +88,7 @@ async fn serve<E: Send + 'static>(
             metrics.reject("oversized");
             query.reply_err("the message is too large").wait().ok();
         } else if inbox.offer(event(query)).is_err() {
-            // Dropped, and so answered with nothing: whoever asked asks again.
+            // The query is dropped, which ends it without an answer: the evaluator asks again.
             metrics.reject("busy");
         }
     };

@@ -8,10 +8,10 @@ use quad_learner::hub::{self, EvaluationPlan, Hub};
 use quad_learner::inbox::{Inbox, inbox};
 use quad_learner::metrics::Metrics;
 use quad_learner::notice::Notice;
+use quad_learner::publisher::{self, Identity, SnapshotPublisher};
 use quad_learner::run_dir::RunDir;
 use quad_learner::scoreboard::{Rules, Scoreboard};
-use quad_learner::train;
-use quad_learner::weights::{self, Identity, WeightKeeper};
+use quad_learner::train::TrainedPolicy;
 use quad_learner::wire::Wire;
 use quad_protocol::{
     EpisodeScore, Hash, Job, JobReply, JobRequest, Message, Name, Progress, RecordedScores, Schema, ScoreReply,
@@ -23,7 +23,7 @@ use zenoh::Session;
 
 const PATIENCE: Duration = Duration::from_secs(20);
 const LEASE: Duration = Duration::from_millis(800);
-const EPOCH: u64 = 5;
+const INCARNATION: u64 = 5;
 
 /// A learner without training: its threads, its declarations, its folder.
 struct Bench {
@@ -32,7 +32,7 @@ struct Bench {
     endpoint: String,
     metrics: Metrics,
     notices: UnboundedReceiver<Notice>,
-    weights: Inbox<weights::Event>,
+    publisher: Inbox<publisher::Event>,
     hub: Inbox<hub::Event>,
     _wire: Wire,
     _folder: tempfile::TempDir,
@@ -55,7 +55,14 @@ impl Bench {
         let (metrics, _) = Metrics::new(&run, 100).unwrap();
         let (notify, notices) = tokio::sync::mpsc::unbounded_channel();
         let environment = quad_dataset::environment::find("hopper").unwrap();
-        let rules = Rules { run: run.clone(), epoch: EPOCH, environment, candidates: 3, job_episodes: 2, lease: LEASE };
+        let rules = Rules {
+            run: run.clone(),
+            incarnation: INCARNATION,
+            environment,
+            candidates: 3,
+            job_episodes: 2,
+            lease: LEASE,
+        };
         let plan = EvaluationPlan { seed: 1, episodes: 4 };
         let log = run_dir.score_log().unwrap();
         let state = Hub::new(run.clone(), plan, Scoreboard::new(rules), log, metrics.clone(), notify.clone());
@@ -69,16 +76,16 @@ impl Bench {
             critics: 2,
             diffusion_steps: 2,
         };
-        let identity = Identity { run: run.clone(), epoch: EPOCH, schema };
-        let state = WeightKeeper::new(identity, run_dir.clone(), metrics.clone(), hub.clone(), notify);
-        let (weights, messages) = inbox();
+        let identity = Identity { run: run.clone(), incarnation: INCARNATION, schema };
+        let state = SnapshotPublisher::new(identity, run_dir.clone(), metrics.clone(), hub.clone(), notify);
+        let (publisher, messages) = inbox();
         std::thread::spawn(move || state.run(&messages));
 
         let port = TcpListener::bind("127.0.0.1:0").unwrap().local_addr().unwrap().port();
         let endpoint = format!("tcp/127.0.0.1:{port}");
         let session = open_session(&Endpoints { listen: vec![endpoint.clone()], connect: Vec::new() }).await.unwrap();
-        let wire = Wire::declare(session, &run, &hub, &weights, &metrics, || Ok(())).await.unwrap();
-        Self { run, run_dir, endpoint, metrics, notices, weights, hub, _wire: wire, _folder: folder }
+        let wire = Wire::declare(session, &run, &hub, &publisher, &metrics, || Ok(())).await.unwrap();
+        Self { run, run_dir, endpoint, metrics, notices, publisher, hub, _wire: wire, _folder: folder }
     }
 
     async fn client(&self) -> Session {
@@ -86,7 +93,8 @@ impl Bench {
     }
 
     async fn snapshot(&mut self, step: u64) {
-        self.weights.send(weights::Event::Snapshot(train::Snapshot { step, tensors: tensors(step), evaluate: true }));
+        let policy = TrainedPolicy { step, tensors: tensors(step), evaluate: true };
+        self.publisher.send(publisher::Event::Trained(policy));
         self.until(|notice| matches!(notice, Notice::Published { step: published } if *published == step)).await;
     }
 
@@ -115,7 +123,7 @@ fn config() -> quad_learner::config::RunConfig {
     let text = r#"
         [run]
         name = "bench"
-        epoch = 5
+        incarnation = 5
         preset = "hopper-demo"
         version = "0"
         [dataset]
@@ -170,9 +178,9 @@ fn report(job: &Job, evaluator: &str) -> ScoreReport {
     let hopper = quad_dataset::environment::find("hopper").unwrap();
     let episode =
         |&seed| EpisodeScore { seed, episode_return: 1000.0, length: 300, score: hopper.normalised_score(1000.0) };
-    let Job { run, epoch, step, weights, .. } = job.clone();
+    let Job { run, incarnation, step, weights, .. } = job.clone();
     let episodes = job.seeds.iter().map(episode).collect();
-    ScoreReport { evaluator: name(evaluator), run, epoch, job: job.id, step, weights, episodes }
+    ScoreReport { evaluator: name(evaluator), run, incarnation, job: job.id, step, weights, episodes }
 }
 
 async fn deliver(session: &Session, report: &ScoreReport) -> ScoreReply {
@@ -187,7 +195,7 @@ async fn a_job_goes_out_and_its_scores_are_on_disk_before_the_thanks() {
     bench.snapshot(10).await;
 
     let job = claim_eventually(&client, &bench.run, "a").await;
-    assert_eq!((job.step, job.epoch, job.candidates, job.seeds.len()), (10, EPOCH, 3, 2));
+    assert_eq!((job.step, job.incarnation, job.candidates, job.seeds.len()), (10, INCARNATION, 3, 2));
     assert_eq!(job.weights, Hash::of(&tensors(10)));
 
     let recorded = deliver(&client, &report(&job, "a")).await;
@@ -209,7 +217,7 @@ async fn a_job_goes_out_and_its_scores_are_on_disk_before_the_thanks() {
     };
     assert_eq!(scores.len(), 4);
     assert_eq!(bench.metrics.evaluation.step.get(), 10);
-    bench.weights.send(weights::Event::TrainingCompleted);
+    bench.publisher.send(publisher::Event::TrainingCompleted);
     bench.until(|notice| matches!(notice, Notice::Settled)).await;
 }
 
@@ -230,7 +238,7 @@ async fn weights_are_published_and_older_ones_are_answered_from_the_disk() {
     let missing = ask::<Snapshot>(&client, keys::weights_at(&bench.run, 11), None).await.unwrap();
     assert!(missing.unwrap_err().contains("no snapshot"));
 
-    let path = bench.run_dir.snapshot(10);
+    let path = bench.run_dir.path().join("snapshots/step_000000010.safetensors");
     std::fs::write(path, "something else").unwrap();
     let changed = ask::<Snapshot>(&client, keys::weights_at(&bench.run, 10), None).await.unwrap();
     assert!(changed.unwrap_err().contains("was changed"));

@@ -14,7 +14,7 @@ fn config(name: &str, seed: u64) -> RunConfig {
     RunConfig {
         run: RunInfo {
             name: name.into(),
-            epoch: 1,
+            incarnation: 1,
             preset: "hopper-demo".into(),
             version: "0.1.0".into(),
             device: Device::Cpu,

@@ -7,7 +7,7 @@ use quad_learner::scoreboard::{Recorded, Refusal, Rules, Scoreboard, Screened};
 use quad_protocol::{EpisodeScore, Hash, Job, JobReply, JobRequest, Name, Progress, ScoreReport};
 
 const LEASE: Duration = Duration::from_secs(10);
-const EPOCH: u64 = 77;
+const INCARNATION: u64 = 77;
 
 struct Bench {
     board: Scoreboard,
@@ -28,8 +28,8 @@ fn score(seed: u64, episode_return: f64) -> EpisodeScore {
 }
 
 fn report(job: &Job, evaluator: &str, episodes: Vec<EpisodeScore>) -> ScoreReport {
-    let Job { run, epoch, step, weights, .. } = job.clone();
-    ScoreReport { evaluator: name(evaluator), run, epoch, job: job.id, step, weights, episodes }
+    let Job { run, incarnation, step, weights, .. } = job.clone();
+    ScoreReport { evaluator: name(evaluator), run, incarnation, job: job.id, step, weights, episodes }
 }
 
 fn full_report(job: &Job, evaluator: &str) -> ScoreReport {
@@ -41,7 +41,7 @@ impl Bench {
     fn new() -> Self {
         let rules = Rules {
             run: name("run"),
-            epoch: EPOCH,
+            incarnation: INCARNATION,
             environment: quad_dataset::environment::find("hopper").unwrap(),
             candidates: 10,
             job_episodes: 5,
@@ -102,7 +102,7 @@ fn jobs_go_out_oldest_step_first_and_no_episode_twice() {
         [(1000, vec![1, 2, 3, 4, 5]), (1000, vec![6, 7]), (2000, vec![11, 12, 13, 14, 15]), (2000, vec![16, 17])];
     assert_eq!(handed_out, expected);
     assert_eq!((jobs[0].weights, jobs[2].weights), (hash(1000), hash(2000)));
-    assert_eq!((jobs[0].epoch, jobs[0].candidates, jobs[0].lease_milliseconds), (EPOCH, 10, 10_000));
+    assert_eq!((jobs[0].incarnation, jobs[0].candidates, jobs[0].lease_milliseconds), (INCARNATION, 10, 10_000));
     assert!(matches!(bench.claim("b", 0), JobReply::Wait { milliseconds: 1.. }));
     assert_eq!(bench.board.pending(), 14);
 }
@@ -253,7 +253,7 @@ fn a_report_that_is_not_of_this_job_is_refused() {
     let twice = ScoreReport { episodes: vec![score(1, 0.0), score(1, 0.0)], ..good.clone() };
     let cases = [
         (ScoreReport { run: name("other"), ..good.clone() }, Refusal::Run),
-        (ScoreReport { epoch: EPOCH - 1, ..good.clone() }, Refusal::Epoch),
+        (ScoreReport { incarnation: INCARNATION - 1, ..good.clone() }, Refusal::Incarnation),
         (ScoreReport { job: 99, ..good.clone() }, Refusal::Job),
         (ScoreReport { job: other.id, ..good.clone() }, Refusal::Evaluator),
         (ScoreReport { evaluator: name("b"), ..good.clone() }, Refusal::Evaluator),

@@ -29,19 +29,19 @@ const HEADER_LENGTH: usize = MAGIC.len() + size_of::<u16>() + size_of::<u8>();
 const SMALL: usize = 1 << 20;
 /// Largest frame with tensors; the paper's networks take a tenth of it.
 const LARGE: usize = 64 << 20;
-/// Most bytes that one byte of a small frame may honestly take in memory: an empty text in a list has 24 for its 8.
+/// Most bytes of memory per byte of a valid small frame: an empty text in a list takes 24 bytes, 8 of them in the frame.
 const MEMORY_PER_WIRE_BYTE: usize = 4;
 
 const FIXED: Configuration<LittleEndian, Fixint> = bincode::config::standard().with_fixed_int_encoding();
 
-/// What can be sent: a frame of a kind of its own.
+/// A message: each type has a kind of frame of its own.
 pub trait Message: Encode + Decode<()> {
     /// Identifies the message within a frame.
     const KIND: u8;
     /// Largest frame, bytes.
     const LIMIT: usize = SMALL;
 
-    /// What the encoding alone does not ensure.
+    /// Checks the rules that the encoding alone does not ensure.
     fn verify(&self) -> Result<(), CodecError> {
         Ok(())
     }
@@ -123,9 +123,9 @@ pub enum CodecError {
     /// The tensors are not those that the hash was made of.
     #[error("the tensors have the hash {found}, not {claimed} as the message says")]
     Hash {
-        /// What the message says.
+        /// The hash in the message.
         claimed: Hash,
-        /// What its tensors give.
+        /// The hash of the tensors.
         found: Hash,
     },
 }
@@ -150,7 +150,7 @@ impl CodecError {
 ///
 /// # Errors
 ///
-/// [`CodecError::Oversized`]: nobody would accept the frame.
+/// [`CodecError::Oversized`]: every receiver would refuse the frame.
 pub fn encode<M: Message>(message: &M) -> Result<Vec<u8>, CodecError> {
     let frame = bincode::encode_to_vec((MAGIC, PROTOCOL_VERSION, M::KIND, message), FIXED)
         .map_err(|error| CodecError::Malformed(error.to_string()))?;

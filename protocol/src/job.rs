@@ -27,12 +27,12 @@ pub enum JobReply {
 /// Episodes to run with one snapshot, all of them with the same weights.
 #[derive(Clone, Debug, PartialEq, Eq, Encode, Decode)]
 pub struct Job {
-    /// Number of the job within the epoch.
+    /// Number of the job, counted within the learner's incarnation.
     pub id: u64,
     /// The run.
     pub run: Name,
-    /// The life of its learner that hands the job out.
-    pub epoch: u64,
+    /// The learner's incarnation when it handed the job out.
+    pub incarnation: u64,
     /// Gradient step of the snapshot.
     pub step: u64,
     /// Hash of the snapshot's tensors.
@@ -43,6 +43,6 @@ pub struct Job {
     pub seeds: Vec<u64>,
     /// Actions that the policy draws in each state before it takes the best (the paper's N_a).
     pub candidates: u32,
-    /// After so many milliseconds without a word the job goes to another evaluator.
+    /// After so many milliseconds without a progress message the job goes to another evaluator.
     pub lease_milliseconds: u64,
 }

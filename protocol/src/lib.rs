@@ -8,8 +8,8 @@
 //! - [`keys`]: where on Zenoh each message is found.
 //! - `snapshot`: weights, from the learner to evaluators.
 //! - `job`: an evaluator asks for work and gets some.
-//! - `progress`: an evaluator tells how far it is.
-//! - `score`: an evaluator delivers, the learner acknowledges and tells everybody.
+//! - `progress`: an evaluator tells how far its job is.
+//! - `score`: an evaluator delivers scores, the learner acknowledges and publishes them.
 //! - `codec`: messages to bytes and back; the only place that knows the encoding.
 //!
 //! Nothing here knows what the weights mean or how episodes are simulated.
@@ -24,7 +24,7 @@ mod score;
 mod snapshot;
 
 pub use codec::{CodecError, Message, PROTOCOL_VERSION, decode, decode_from, encode};
-pub use hash::{Hash, InvalidHash};
+pub use hash::Hash;
 pub use job::{Job, JobReply, JobRequest};
 pub use name::{InvalidName, Name};
 pub use progress::Progress;

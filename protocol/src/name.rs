@@ -1,7 +1,6 @@
 //! What runs and evaluators may be called.
 
 use std::fmt;
-use std::str::FromStr;
 
 /// Name of a run or of an evaluator: 1 to 64 ASCII letters, digits, dots, dashes and underscores.
 ///
@@ -46,14 +45,6 @@ impl Name {
 impl fmt::Display for Name {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         f.write_str(&self.0)
-    }
-}
-
-impl FromStr for Name {
-    type Err = InvalidName;
-
-    fn from_str(text: &str) -> Result<Name, InvalidName> {
-        Name::new(text)
     }
 }
 

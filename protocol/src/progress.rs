@@ -1,4 +1,4 @@
-//! An evaluator tells how far it is.
+//! Progress of an evaluator.
 
 use crate::Name;
 use crate::codec::{Decode, Encode};
@@ -6,7 +6,7 @@ use crate::codec::{Decode, Encode};
 /// How far a job is, and what the evaluator has done so far. Extends the job's lease.
 #[derive(Clone, Debug, PartialEq, Eq, Encode, Decode)]
 pub struct Progress {
-    /// Who tells.
+    /// The evaluator.
     pub evaluator: Name,
     /// The run.
     pub run: Name,

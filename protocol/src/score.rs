@@ -1,4 +1,4 @@
-//! An evaluator delivers, the learner acknowledges and tells everybody.
+//! Scores: an evaluator delivers them, the learner acknowledges them and publishes what it has recorded.
 
 use crate::codec::{Decode, Encode};
 use crate::{Hash, Name};
@@ -23,8 +23,8 @@ pub struct ScoreReport {
     pub evaluator: Name,
     /// The run.
     pub run: Name,
-    /// The life of its learner that handed the job out.
-    pub epoch: u64,
+    /// The learner's incarnation when it handed the job out.
+    pub incarnation: u64,
     /// The job.
     pub job: u64,
     /// Gradient step of the snapshot.
@@ -45,14 +45,14 @@ pub enum ScoreReply {
         /// Episodes that were delivered before; they count once.
         duplicates: u32,
     },
-    /// They are of no use; do not send them again.
+    /// They were not accepted and never will be; do not send them again.
     Refused {
         /// Why, for people.
         reason: String,
     },
 }
 
-/// What the learner has written down, for whoever wants to watch.
+/// Scores that the learner has recorded, published for observers.
 #[derive(Clone, Debug, PartialEq, Encode, Decode)]
 pub struct RecordedScores {
     /// The run.

@@ -25,8 +25,8 @@ pub struct Schema {
 pub struct Snapshot {
     /// The run.
     pub run: Name,
-    /// The life of its learner: one that comes back has a higher epoch.
-    pub epoch: u64,
+    /// Which start of its learner published it: one that is started again has a higher number.
+    pub incarnation: u64,
     /// Gradient steps so far.
     pub step: u64,
     /// Environment and shapes.

@@ -75,7 +75,7 @@ fn claimed_lengths_are_not_believed() {
     let job = Job {
         id: 1,
         run: name(),
-        epoch: 2,
+        incarnation: 2,
         step: 3,
         weights: hash,
         environment: environment(),
@@ -83,13 +83,13 @@ fn claimed_lengths_are_not_believed() {
         candidates: 10,
         lease_milliseconds: 1000,
     };
-    claim_too_much(&Snapshot { run: name(), epoch: 1, step: 2, schema, hash, tensors });
+    claim_too_much(&Snapshot { run: name(), incarnation: 1, step: 2, schema, hash, tensors });
     claim_too_much(&JobRequest { evaluator: name(), environments: vec![environment(); 3] });
     claim_too_much(&JobReply::Job(job));
     claim_too_much(&ScoreReport {
         evaluator: name(),
         run: name(),
-        epoch: 1,
+        incarnation: 1,
         job: 2,
         step: 3,
         weights: hash,

@@ -43,7 +43,14 @@ fn snapshot() -> impl Strategy<Value = Snapshot> {
         Schema { environment, observation_dim, action_dim, hidden, critics, diffusion_steps }
     });
     (name(), any::<u64>(), any::<u64>(), schema, vec(any::<u8>(), 0..500)).prop_map(
-        |(run, epoch, step, schema, tensors)| Snapshot { run, epoch, step, schema, hash: Hash::of(&tensors), tensors },
+        |(run, incarnation, step, schema, tensors)| Snapshot {
+            run,
+            incarnation,
+            step,
+            schema,
+            hash: Hash::of(&tensors),
+            tensors,
+        },
     )
 }
 
@@ -53,8 +60,18 @@ fn job_request() -> impl Strategy<Value = JobRequest> {
 
 fn job_reply() -> impl Strategy<Value = JobReply> {
     let job = (any::<[u64; 4]>(), name(), hash(), text(), vec(any::<u64>(), 0..100), any::<u32>()).prop_map(
-        |([id, epoch, step, lease_milliseconds], run, weights, environment, seeds, candidates)| {
-            JobReply::Job(Job { id, run, epoch, step, weights, environment, seeds, candidates, lease_milliseconds })
+        |([id, incarnation, step, lease_milliseconds], run, weights, environment, seeds, candidates)| {
+            JobReply::Job(Job {
+                id,
+                run,
+                incarnation,
+                step,
+                weights,
+                environment,
+                seeds,
+                candidates,
+                lease_milliseconds,
+            })
         },
     );
     prop_oneof![job, any::<u64>().prop_map(|milliseconds| JobReply::Wait { milliseconds })]
@@ -62,10 +79,10 @@ fn job_reply() -> impl Strategy<Value = JobReply> {
 
 fn score_report() -> impl Strategy<Value = ScoreReport> {
     (name(), name(), any::<[u64; 3]>(), hash(), episodes()).prop_map(
-        |(evaluator, run, [epoch, job, step], weights, episodes)| ScoreReport {
+        |(evaluator, run, [incarnation, job, step], weights, episodes)| ScoreReport {
             evaluator,
             run,
-            epoch,
+            incarnation,
             job,
             step,
             weights,
@@ -229,7 +246,7 @@ fn what_nobody_would_accept_is_not_sent() {
         diffusion_steps: 5,
     };
     let hash = Hash::of(&tensors);
-    let message = Snapshot { run: Name::new("run").unwrap(), epoch: 1, step: 1, schema, hash, tensors };
+    let message = Snapshot { run: Name::new("run").unwrap(), incarnation: 1, step: 1, schema, hash, tensors };
     let error = encode(&message).unwrap_err();
     assert!(matches!(error, CodecError::Oversized { length, limit } if length > limit), "{error}");
 }
@@ -247,7 +264,7 @@ fn six_megabytes_take_milliseconds() {
         diffusion_steps: 5,
     };
     let hash = Hash::of(&tensors);
-    let message = Snapshot { run: Name::new("run").unwrap(), epoch: 1, step: 1, schema, hash, tensors };
+    let message = Snapshot { run: Name::new("run").unwrap(), incarnation: 1, step: 1, schema, hash, tensors };
     let fastest = |work: &dyn Fn()| {
         let times = (0..10).map(|_| {
             let begin = Instant::now();

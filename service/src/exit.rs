@@ -1,4 +1,4 @@
-//! What a person is told when it went wrong, and the exit code.
+//! How an error is shown to the user, and the exit code.
 
 use std::fmt;
 use std::io::{self, Write};

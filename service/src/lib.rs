@@ -1,14 +1,14 @@
-//! What learner and evaluator share as services.
+//! What the learner and the evaluator have in common as long-running programs.
 //!
 //! # Layout
 //!
 //! In reading order, which is the order of a process's life:
 //!
 //! - `logging`: where log lines go.
-//! - `session`: the connection to the others, over Zenoh.
+//! - `session`: the connection between learner and evaluators, over Zenoh.
 //! - `metrics_server`: `/metrics` and `/healthz`.
-//! - `shutdown`: when to leave.
-//! - `exit`: what a person is told when it went wrong, and the exit code.
+//! - `shutdown`: the signals that end a process.
+//! - `exit`: how an error is shown to the user, and the exit code.
 
 mod exit;
 mod logging;
@@ -19,5 +19,5 @@ mod shutdown;
 pub use exit::{Hint, run_main};
 pub use logging::init_logging;
 pub use metrics_server::{BindError, MetricsServer, serve_metrics};
-pub use session::{Endpoints, SessionError, open_session, reachable_at};
+pub use session::{Endpoints, SessionError, open_session, parse_endpoint, reachable_at};
 pub use shutdown::shutdown_signal;

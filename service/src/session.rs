@@ -1,14 +1,15 @@
-//! The connection to the others, over Zenoh.
+//! The connection between learner and evaluators, over Zenoh.
 
 use std::thread;
 use std::time::Duration;
 
 use serde_json::{Value, json};
 use tokio::sync::oneshot;
+use zenoh::config::EndPoint;
 use zenoh::{Config, Session, Wait};
 
-/// A node that is frozen, or cut off without a word, counts as gone after so long. (One that ends or is killed is
-/// noticed at once.) Half of Zenoh's default; still several missed signs of life on a machine that is busy training.
+/// A process that is frozen or disconnected counts as gone after this time. (One that ends or is killed is noticed at
+/// once.) Half of Zenoh's default; a machine that is busy training may still miss several keep-alive messages in it.
 const LEASE: Duration = Duration::from_secs(5);
 /// Largest message that is taken in, bytes: the largest snapshot that may be sent (64 MiB) and what Zenoh adds.
 const MAX_MESSAGE_SIZE: u64 = 65 << 20;
@@ -42,9 +43,9 @@ pub enum SessionError {
     /// Nothing to listen at and nothing to connect to.
     #[error("no endpoint to listen at or to connect to")]
     NoEndpoint,
-    /// Not an endpoint that this program can use. Zenoh would try for ever to connect to it.
-    #[error("{endpoint:?} is no endpoint like {PROTOCOL}127.0.0.1:7447")]
-    Protocol {
+    /// Not an endpoint that this program can use. Zenoh would try for ever to connect to one of another protocol.
+    #[error("{endpoint:?} is not an endpoint; write it like {PROTOCOL}127.0.0.1:7447")]
+    NotAnEndpoint {
         /// What was given.
         endpoint: String,
     },
@@ -61,6 +62,18 @@ pub enum SessionError {
     Unknown,
 }
 
+/// Checks an endpoint that a person wrote, and gives it back as it is: a `value_parser` for a command line.
+///
+/// # Errors
+///
+/// [`SessionError::NotAnEndpoint`]: it is malformed, or names another protocol than TCP.
+pub fn parse_endpoint(text: &str) -> Result<String, SessionError> {
+    if text.starts_with(PROTOCOL) && text.parse::<EndPoint>().is_ok() {
+        return Ok(text.to_owned());
+    }
+    Err(SessionError::NotAnEndpoint { endpoint: text.to_owned() })
+}
+
 /// Opens a session. Needs a multi-thread tokio runtime.
 ///
 /// A session that listens is there at once. A client is there as soon as it has a connection: it waits for a meeting
@@ -70,16 +83,16 @@ pub async fn open_session(endpoints: &Endpoints) -> Result<Session, SessionError
     if endpoints.listen.is_empty() && endpoints.connect.is_empty() {
         return Err(SessionError::NoEndpoint);
     }
-    if let Some(endpoint) = endpoints.listen.iter().chain(&endpoints.connect).find(|e| !e.starts_with(PROTOCOL)) {
-        return Err(SessionError::Protocol { endpoint: endpoint.clone() });
+    for endpoint in endpoints.listen.iter().chain(&endpoints.connect) {
+        parse_endpoint(endpoint)?;
     }
     let wrong = |error| {
         let endpoints = [&endpoints.listen[..], &endpoints.connect[..]].concat().join(", ");
         SessionError::Endpoint { endpoints, reason: for_people(error) }
     };
     let config = config(endpoints).map_err(wrong)?;
-    // Zenoh's future blocks its thread until there is a connection, so it gets one of its own. Nobody joins that: who
-    // gives up waiting just drops this future, and the process may end.
+    // Zenoh's future blocks its thread until there is a connection, so it gets one of its own, which is never
+    // joined: dropping this future gives up waiting, and does not keep the process from ending.
     let (sender, opened) = oneshot::channel();
     let open = move || drop(sender.send(zenoh::open(config).wait()));
     thread::Builder::new().name("zenoh-open".to_owned()).spawn(open).map_err(|error| wrong(error.into()))?;
@@ -116,7 +129,7 @@ fn config(endpoints: &Endpoints) -> zenoh::Result<Config> {
     Ok(config)
 }
 
-/// Zenoh's words without the places in its source code (`at /…/tcp.rs:61.`) that it adds.
+/// Zenoh's message without the places in its source code (`at /…/tcp.rs:61.`) that it adds.
 fn for_people(error: zenoh::Error) -> String {
     let text = error.to_string();
     let mut words = text.split(' ').peekable();

@@ -1,4 +1,4 @@
-//! When to leave.
+//! The signals that end a process.
 
 use std::pin::pin;
 

@@ -5,7 +5,7 @@ use std::net::{Ipv4Addr, TcpListener};
 use std::sync::atomic::{AtomicU8, Ordering};
 use std::time::{Duration, Instant};
 
-use quad_service::{Endpoints, SessionError, open_session, reachable_at};
+use quad_service::{Endpoints, SessionError, open_session, parse_endpoint, reachable_at};
 use tokio::task::JoinSet;
 use tokio::time::timeout;
 use zenoh::Session;
@@ -192,6 +192,16 @@ async fn what_cannot_work_is_an_error_at_once() {
     assert!(text.contains(&endpoint) && text.contains("in use") && !text.contains(".rs:"), "{text}");
     for wrong in ["127.0.0.1:7447", "smoke/signals:1", "tcp", ""] {
         let error = open(connecting_to(wrong)).await;
-        assert!(matches!(&error, SessionError::Protocol { endpoint } if endpoint == wrong), "{error}");
+        assert!(matches!(&error, SessionError::NotAnEndpoint { endpoint } if endpoint == wrong), "{error}");
+    }
+}
+
+#[test]
+fn endpoints_on_a_command_line() {
+    for endpoint in ["tcp/127.0.0.1:7447", "tcp/[::1]:0", "tcp/learner.example:7447", "tcp/0.0.0.0:0#iface=lo"] {
+        assert_eq!(parse_endpoint(endpoint).unwrap(), endpoint);
+    }
+    for wrong in ["127.0.0.1:7447", "udp/127.0.0.1:7447", "tcp", "tcp/", ""] {
+        assert!(parse_endpoint(wrong).unwrap_err().to_string().contains("tcp/127.0.0.1:7447"), "{wrong}");
     }
 }

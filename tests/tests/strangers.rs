@@ -37,7 +37,7 @@ async fn haunt(session: &Session) -> impl Sized {
         encode(&JobReply::Job(Job {
             id: 1,
             run,
-            epoch: 1,
+            incarnation: 1,
             step: 1,
             weights,
             environment,
@@ -64,7 +64,7 @@ async fn haunt(session: &Session) -> impl Sized {
     };
     let tensors = b"no tensors".to_vec();
     let hash = Hash::of(&tensors);
-    let snapshot = encode(&Snapshot { run: ghost.clone(), epoch: 1, step: 1, schema, hash, tensors }).unwrap();
+    let snapshot = encode(&Snapshot { run: ghost.clone(), incarnation: 1, step: 1, schema, hash, tensors }).unwrap();
     let asked = AtomicUsize::new(0);
     let jobs = keys::jobs(&ghost);
     let queryable = session.declare_queryable("quad/ghost/**").callback(move |query| {

@@ -14,7 +14,6 @@ use std::time::Instant;
 use quad_dataset::{D4rlWriter, DatasetError, EnvironmentSpec, Metadata};
 use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;
-use serde::Serialize;
 use thiserror::Error;
 
 use crate::environment::EnvironmentError;
@@ -23,7 +22,7 @@ use crate::environment::EnvironmentError;
 const RECORD_STREAM: u64 = 0;
 
 /// What was recorded.
-#[derive(Debug, Serialize)]
+#[derive(Debug)]
 pub struct Summary {
     /// Rows in the file.
     pub transitions: usize,

@@ -48,7 +48,7 @@ impl Hopper {
     }
 
     /// The compiled model, shared by all hoppers of the process.
-    pub fn model() -> Result<Arc<MjModel>, EnvironmentError> {
+    fn model() -> Result<Arc<MjModel>, EnvironmentError> {
         static MODEL: OnceLock<Arc<MjModel>> = OnceLock::new();
         if let Some(model) = MODEL.get() {
             return Ok(Arc::clone(model));

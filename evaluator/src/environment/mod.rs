@@ -6,8 +6,7 @@
 mod hopper;
 mod physics;
 
-pub use hopper::Hopper;
-
+use hopper::Hopper;
 use quad_dataset::environment::EnvironmentSpec;
 use thiserror::Error;
 
@@ -27,7 +26,7 @@ pub struct Step {
 
 /// One simulated task, with the semantics of D4RL's locomotion-v2 files (Gymnasium's "-v4").
 ///
-/// Positions `qpos`, velocities `qvel` and observations are MuJoCo's own `f64`; a policy's door rounds them to `f32`.
+/// Positions `qpos`, velocities `qvel` and observations are MuJoCo's own `f64`; they are rounded to `f32` for the policy.
 pub trait Environment: Send {
     /// Starts an episode: the initial state's noise is drawn from a stream of `seed`'s own, so an episode is a
     /// function of its seed and its actions alone.

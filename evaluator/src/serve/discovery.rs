@@ -1,4 +1,4 @@
-//! Which runs are there: every learner announces its own with a liveliness token.
+//! Finds the runs: every learner announces its run with a liveliness token.
 
 use std::collections::BTreeMap;
 use std::convert::Infallible;

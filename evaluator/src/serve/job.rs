@@ -18,15 +18,15 @@ const MAX_ROWS: usize = 65_536;
 /// Why a job is not run.
 #[derive(Debug, thiserror::Error)]
 pub enum JobError {
-    /// It is for another run than the one that was asked.
+    /// It belongs to another run than the one whose learner was asked.
     #[error("it is for run {0}")]
     Run(Name),
-    /// It is empty, or larger than anybody needs.
+    /// It is empty, or larger than this evaluator runs.
     #[error("it has {episodes} episodes with {candidates} candidates; 1 to {MAX_ROWS} in all are run")]
     Size {
-        /// How many episodes.
+        /// Its episodes.
         episodes: usize,
-        /// N_a.
+        /// Candidates per state.
         candidates: u32,
     },
     /// Its environment is not known.

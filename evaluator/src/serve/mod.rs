@@ -1,22 +1,22 @@
-//! `evaluator serve`: finds runs, measures the weights they publish, delivers the scores.
+//! `evaluator serve`: finds runs, evaluates the snapshots that they publish, delivers the scores.
 //!
 //! # Layout
 //!
 //! In reading order:
 //!
-//! - `discovery`: which runs are there.
-//! - `worker`: whose turn it is, and what a turn consists of.
-//! - `run`: one run, as its learner is spoken to; `query`: how a question is put.
-//! - `weights`: from a snapshot on the wire to a policy.
+//! - `discovery`: finds the runs, by their learners' liveliness tokens.
+//! - `worker`: the main loop, which serves the runs in turn.
+//! - `run`: everything that is exchanged with the learner of one run; `query`: a query to a learner.
+//! - `receiver`: receives snapshots and makes policies of them.
 //! - `job`: all episodes of a job, as one batch.
 //!
-//! An evaluator keeps nothing that must last: killed at any point, it costs its learner a lease.
+//! An evaluator has no state that must last. If it is killed, its job goes to another evaluator when the lease runs out.
 
 mod discovery;
 mod job;
 mod query;
+mod receiver;
 mod run;
-mod weights;
 mod worker;
 
 use std::net::SocketAddr;
@@ -26,7 +26,7 @@ use anyhow::Context;
 use clap::Args;
 use quad_policy::Precision;
 use quad_protocol::Name;
-use quad_service::Hint;
+use quad_service::{Hint, parse_endpoint};
 use rand::Rng;
 use tracing::{info, warn};
 
@@ -36,7 +36,7 @@ use worker::Worker;
 
 const AFTER_HELP: &str = "\
 Runs are found by themselves, also those that start later; several are served in turn. Stop it at any time
-(Ctrl-C or SIGTERM): what it was at is handed to another evaluator.
+(Ctrl-C or SIGTERM): the job that it had is handed to another evaluator.
 
 Examples:
   evaluator serve                                       the learner of this machine
@@ -63,7 +63,7 @@ pub struct ServeArgs {
     precision: Option<Precision>,
 }
 
-/// What a process waits for its last thread and its farewells to the network when told to stop.
+/// When it is told to stop, the process waits this long for its threads and for the session to close.
 const LEAVE: Duration = Duration::from_secs(1);
 
 /// Serves until SIGINT or SIGTERM.
@@ -105,7 +105,7 @@ async fn serve_until_stopped(args: ServeArgs) -> anyhow::Result<()> {
     let result = tokio::select! {
         biased;
         () = stop => Ok(()),
-        // Before the worker, which fails for want of runs when this has failed.
+        // Before the worker, which fails as a consequence when this has failed.
         error = discovery.failed() => Err(error),
         error = worker.run() => Err(error),
     };
@@ -123,13 +123,6 @@ fn keep_heap_small() {
     const LARGE_BLOCK: i32 = 2 << 20;
     // SAFETY: sets a parameter of the allocator, which may be done at any time.
     unsafe { libc::mallopt(libc::M_MMAP_THRESHOLD, LARGE_BLOCK) };
-}
-
-fn parse_endpoint(text: &str) -> Result<String, String> {
-    match text.parse::<zenoh::config::EndPoint>() {
-        Ok(_) => Ok(text.to_owned()),
-        Err(_) => Err("write it like Zenoh does, e.g. tcp/127.0.0.1:7447".to_owned()),
-    }
 }
 
 /// Host and process for people, a random part because containers share both.

@@ -1,4 +1,4 @@
-//! Questions to a learner.
+//! A query to a learner.
 
 use std::time::Duration;
 
@@ -17,7 +17,7 @@ pub enum AskError {
         /// The key that was asked.
         key: String,
     },
-    /// Somebody answered, but not with what the protocol says.
+    /// The answer is not the message that the protocol prescribes.
     #[error("unusable answer at {key}")]
     Unusable {
         /// The key that was asked.

@@ -1,4 +1,4 @@
-//! One run, as its learner is spoken to: claim, weights, progress, scores.
+//! Everything that is exchanged with the learner of one run: jobs, snapshots, progress, scores.
 
 use std::sync::Arc;
 use std::time::{Duration, Instant};
@@ -11,16 +11,17 @@ use zenoh::Session;
 use zenoh::liveliness::LivelinessToken;
 
 use super::query::{AskError, ask};
-use super::weights::NewestWeights;
+use super::receiver::SnapshotReceiver;
 use crate::metrics::{JobOutcome, Metrics};
 
 /// A learner answers in milliseconds; one that takes this long hangs, and other runs wait behind it.
 const ANSWER_TIMEOUT: Duration = Duration::from_secs(5);
 /// The same for a snapshot, which has megabytes to carry over whatever network there is.
 const WEIGHTS_TIMEOUT: Duration = Duration::from_secs(30);
-/// First and longest pause after a learner that is there did not answer.
+/// First and longest pause after a learner did not answer though it is connected.
 const BACK_OFF: [Duration; 2] = [Duration::from_millis(250), Duration::from_secs(5)];
-/// Bounds of the pause that a learner without work may ask for: neither a storm of questions nor a lost evaluator.
+/// Bounds of the pause that a learner without work may ask for: one too short would be a flood of questions, one too
+/// long would lose the evaluator.
 const WAIT: [Duration; 2] = [Duration::from_millis(20), Duration::from_secs(5)];
 
 /// An evaluator's side of one run.
@@ -29,7 +30,7 @@ pub struct RunClient {
     evaluator: Name,
     session: Session,
     metrics: Metrics,
-    weights: NewestWeights,
+    snapshots: SnapshotReceiver,
     /// Scores that the learner has not acknowledged. While there are some, nothing new is asked for.
     undelivered: Option<ScoreReport>,
     ready_at: Instant,
@@ -38,19 +39,19 @@ pub struct RunClient {
 }
 
 impl RunClient {
-    /// Subscribes to the run's weights and announces `evaluator` in it; `weights_arrived` is told of new weights.
+    /// Subscribes to the run's snapshots and announces `evaluator` in it; `snapshot_arrived` is told of each new one.
     pub async fn attach(
         session: Session,
         run: Name,
         evaluator: Name,
         metrics: Metrics,
-        weights_arrived: Arc<Notify>,
+        snapshot_arrived: Arc<Notify>,
     ) -> anyhow::Result<RunClient> {
         let readable = |error: zenoh::Error| anyhow::anyhow!(error);
-        let weights = NewestWeights::listen(&session, run.clone(), metrics.clone(), weights_arrived)
+        let snapshots = SnapshotReceiver::listen(&session, run.clone(), metrics.clone(), snapshot_arrived)
             .await
             .map_err(readable)
-            .with_context(|| format!("cannot listen to the weights of run {run}"))?;
+            .with_context(|| format!("cannot listen to the snapshots of run {run}"))?;
         let token = session
             .liveliness()
             .declare_token(keys::live_evaluator(&run, &evaluator))
@@ -63,7 +64,7 @@ impl RunClient {
             evaluator,
             session,
             metrics,
-            weights,
+            snapshots,
             undelivered: None,
             ready_at,
             back_off,
@@ -71,18 +72,18 @@ impl RunClient {
         })
     }
 
-    /// When the learner may be spoken to again.
+    /// When the learner may be asked again.
     pub fn ready_at(&self) -> Instant {
         self.ready_at
     }
 
-    /// The learner may be spoken to at once: something happened.
+    /// Lets the learner be asked again at once, because something has changed.
     pub fn wake(&mut self) {
         self.ready_at = Instant::now();
         self.back_off = BACK_OFF[0];
     }
 
-    /// Leaves the learner alone for a while, longer each time.
+    /// Asks the learner nothing for a while, which is longer each time.
     pub fn back_off(&mut self) {
         self.ready_at = Instant::now() + self.back_off;
         self.back_off = (2 * self.back_off).min(BACK_OFF[1]);
@@ -110,7 +111,7 @@ impl RunClient {
 
     /// The snapshot that `job` names: as it was published, or asked for where that was missed.
     pub async fn snapshot(&self, job: &Job) -> Result<Arc<Snapshot>, AskError> {
-        if let Some(snapshot) = self.weights.get(job) {
+        if let Some(snapshot) = self.snapshots.get(job) {
             return Ok(snapshot);
         }
         let key = keys::weights_at(&self.run, job.step);
@@ -119,7 +120,7 @@ impl RunClient {
         Ok(Arc::new(snapshot))
     }
 
-    /// Tells the learner how far a job is. A lost message is made good by the next one.
+    /// Reports progress to the learner. A lost message does not matter: the next one says the same and more.
     pub async fn publish(&self, progress: &Progress) {
         let key = keys::progress(&self.run, &self.evaluator);
         let sent = match encode(progress) {
@@ -160,7 +161,7 @@ impl RunClient {
         Ok(())
     }
 
-    /// Ends the service; scores that nobody acknowledged are lost.
+    /// Stops serving the run; scores that were not acknowledged are lost.
     pub fn give_up(self) {
         if let Some(report) = self.undelivered {
             warn!(run = %self.run, step = report.step, "the learner did not come back for its scores");

@@ -1,4 +1,4 @@
-//! The evaluator's loop: whose turn it is, and what a turn consists of.
+//! The evaluator's main loop: serves the runs in turn, one job at a time.
 
 use std::collections::{BTreeMap, VecDeque};
 use std::sync::Arc;
@@ -13,14 +13,14 @@ use tracing::{info, warn};
 
 use super::discovery::{RunKey, Runs};
 use super::job::{self, Running};
+use super::receiver::policy_for;
 use super::run::RunClient;
-use super::weights::policy_for;
 use crate::environment::ENVIRONMENTS;
 use crate::metrics::{JobOutcome, Metrics};
 
-/// Progress is told this often, or three times a lease.
+/// Progress is reported this often, or three times in a lease if that is more often.
 const HEARTBEAT: Duration = Duration::from_secs(1);
-/// Scores are kept this long for a learner that is gone; one that comes back has restarted or was cut off.
+/// Scores are kept this long for a learner that is gone, which may be disconnected only for a while.
 const KEEP_SCORES: Duration = Duration::from_secs(600);
 
 /// Serves every run that is found, one job at a time, in turn.
@@ -30,11 +30,11 @@ pub struct Worker {
     metrics: Metrics,
     found: watch::Receiver<Runs>,
     runs: BTreeMap<RunKey, RunClient>,
-    /// Who was served longest ago comes first.
+    /// The run that was served longest ago comes first.
     turns: VecDeque<RunKey>,
-    /// When the learner of a run went whose scores are kept.
+    /// Runs whose learner is gone but whose scores are kept, and since when.
     gone: BTreeMap<RunKey, Instant>,
-    weights_arrived: Arc<Notify>,
+    snapshot_arrived: Arc<Notify>,
     /// The policy of the last job: the next one is often about the same.
     policy: Option<(Hash, Arc<TargetPolicy>)>,
 }
@@ -50,7 +50,7 @@ impl Worker {
             runs: BTreeMap::new(),
             turns: VecDeque::new(),
             gone: BTreeMap::new(),
-            weights_arrived: Arc::new(Notify::new()),
+            snapshot_arrived: Arc::new(Notify::new()),
             policy: None,
         }
     }
@@ -77,7 +77,7 @@ impl Worker {
         !self.gone.contains_key(key)
     }
 
-    /// Attaches to runs that came, lets go of runs that went.
+    /// Attaches to runs that appeared, detaches from runs that are gone.
     async fn follow_discovery(&mut self) {
         let found = self.found.borrow_and_update().clone();
         for (key, session) in &found {
@@ -89,7 +89,7 @@ impl Worker {
             if self.runs.contains_key(key) {
                 continue;
             }
-            let (metrics, arrived) = (self.metrics.clone(), self.weights_arrived.clone());
+            let (metrics, arrived) = (self.metrics.clone(), self.snapshot_arrived.clone());
             match RunClient::attach(session.clone(), key.1.clone(), self.name.clone(), metrics, arrived).await {
                 Ok(run) => {
                     self.runs.insert(key.clone(), run);
@@ -114,7 +114,7 @@ impl Worker {
         self.metrics.runs.set(self.runs.len() as i64);
     }
 
-    /// Waits until a run is due, runs come or go, or new weights promise work.
+    /// Waits until a run is due, runs come or go, or a new snapshot promises work.
     async fn wait(&mut self) -> anyhow::Result<()> {
         let there = self.runs.iter().filter(|(key, _)| self.is_there(key)).map(|(_, run)| run.ready_at());
         let forget = self.gone.values().map(|since| *since + KEEP_SCORES);
@@ -128,12 +128,12 @@ impl Worker {
         tokio::select! {
             () = timer => {}
             changed = self.found.changed() => changed.context("nobody looks for learners any more")?,
-            () = self.weights_arrived.notified() => self.runs.values_mut().for_each(RunClient::wake),
+            () = self.snapshot_arrived.notified() => self.runs.values_mut().for_each(RunClient::wake),
         }
         Ok(())
     }
 
-    /// One run's turn: scores that wait, else one job.
+    /// One run's turn: delivers scores if there are any, else does one job.
     async fn turn(&mut self, key: RunKey) {
         self.turns.retain(|other| *other != key);
         self.turns.push_back(key.clone());
@@ -158,8 +158,8 @@ impl Worker {
                 return Err(error.context(format!("job {} of step {} failed", job.id, job.step)));
             }
         };
-        let Job { id, run: of, epoch, step, weights, .. } = job;
-        run.keep(ScoreReport { evaluator: self.name.clone(), run: of, epoch, job: id, step, weights, episodes });
+        let Job { id, run: of, incarnation, step, weights, .. } = job;
+        run.keep(ScoreReport { evaluator: self.name.clone(), run: of, incarnation, job: id, step, weights, episodes });
         run.deliver().await
     }
 
@@ -186,7 +186,7 @@ impl Worker {
         Ok(self.policy.insert((job.weights, Arc::new(policy))).1.clone())
     }
 
-    /// Runs the episodes, and tells the learner how far they are as long as they move: a stuck simulation loses its lease.
+    /// Runs the episodes, and reports progress to the learner as long as there is any: a stuck simulation loses its lease.
     async fn roll_out(
         &self,
         job: &Job,

@@ -1,11 +1,11 @@
-//! The thread that keeps the snapshots: takes them from the training thread, publishes them, saves them, asks for their
-//! evaluation, and answers evaluators that missed one.
+//! The thread that publishes snapshots: takes policies from the training thread, publishes and saves them as snapshots,
+//! asks for their evaluation, and answers evaluators that missed one.
 
 use std::collections::BTreeMap;
 use std::time::Duration;
 
 use anyhow::Context;
-use quad_protocol::{Hash, Name, Schema, encode, keys};
+use quad_protocol::{Hash, Name, Schema, Snapshot, encode, keys};
 use tokio::sync::mpsc::UnboundedSender;
 use tracing::debug;
 use zenoh::Wait;
@@ -18,52 +18,52 @@ use crate::inbox::{Inbox, Messages};
 use crate::metrics::Metrics;
 use crate::notice::Notice;
 use crate::run_dir::RunDir;
-use crate::train;
+use crate::train::TrainedPolicy;
 
-/// Nothing happens by itself here, so this only bounds how long an idle wait is.
+/// Longest wait for a message. The thread does nothing between messages, so the value does not matter.
 const IDLE: Duration = Duration::from_secs(60);
 
-/// What the thread is told.
+/// Messages to the thread.
 #[derive(Debug)]
 pub enum Event {
-    /// A new snapshot, from the training thread.
-    Snapshot(train::Snapshot),
+    /// A policy from the training thread.
+    Trained(TrainedPolicy),
     /// All gradient steps are done; no snapshot will follow.
     TrainingCompleted,
-    /// The Zenoh session is there; publish with this.
+    /// The Zenoh session is open; publish with this.
     Online(Publisher<'static>),
-    /// Somebody asks for `weights/<step>`.
+    /// An evaluator asks for `weights/<step>`.
     Query(Query),
-    /// Do what was asked so far, then end.
+    /// End, after the messages sent before this one are handled.
     Stop,
 }
 
-/// What every snapshot of a run says about itself.
+/// The fields that all snapshots of a run have in common.
 #[derive(Clone, Debug)]
 pub struct Identity {
     /// The run.
     pub run: Name,
-    /// The learner's life.
-    pub epoch: u64,
+    /// Which start of the learner this is.
+    pub incarnation: u64,
     /// Environment and shapes.
     pub schema: Schema,
 }
 
 /// State of the thread.
-pub struct WeightKeeper {
+pub struct SnapshotPublisher {
     identity: Identity,
     run_dir: RunDir,
     metrics: Metrics,
     hub: Inbox<hub::Event>,
     notices: UnboundedSender<Notice>,
     publisher: Option<Publisher<'static>>,
-    /// What can be asked for: every saved snapshot.
+    /// Hash of every snapshot that was published, by step.
     hashes: BTreeMap<u64, Hash>,
     /// The newest, ready to be sent; older ones are read from the disk.
     newest: Option<(u64, ZBytes)>,
 }
 
-impl WeightKeeper {
+impl SnapshotPublisher {
     /// State before the first snapshot.
     pub fn new(
         identity: Identity,
@@ -80,8 +80,8 @@ impl WeightKeeper {
         while let Ok(event) = messages.next(IDLE) {
             match event {
                 None => {}
-                Some(Event::Snapshot(snapshot)) => {
-                    if let Err(error) = self.keep(snapshot) {
+                Some(Event::Trained(policy)) => {
+                    if let Err(error) = self.publish(policy) {
                         self.notices.send(Notice::Failed(error)).ok();
                     }
                 }
@@ -93,8 +93,8 @@ impl WeightKeeper {
         }
     }
 
-    fn keep(&mut self, snapshot: train::Snapshot) -> anyhow::Result<()> {
-        let train::Snapshot { step, tensors, evaluate } = snapshot;
+    fn publish(&mut self, policy: TrainedPolicy) -> anyhow::Result<()> {
+        let TrainedPolicy { step, tensors, evaluate } = policy;
         let hash = Hash::of(&tensors);
         self.metrics.evaluation.snapshot_bytes.set(tensors.len() as i64);
         if !evaluate {
@@ -104,12 +104,12 @@ impl WeightKeeper {
         let bytes = ZBytes::from(encode(&message)?);
         self.hashes.insert(step, hash);
         self.newest = Some((step, bytes.clone()));
-        // Its jobs first: evaluators ask for one as soon as they see the weights. The disk last: nobody waits for it.
+        // The jobs must exist first: evaluators ask for one as soon as the snapshot arrives. Saving comes last.
         self.hub.send(hub::Event::Evaluate { step, weights: hash });
         if let Some(publisher) = &self.publisher
             && let Err(error) = publisher.put(bytes).wait()
         {
-            // Whoever gets a job for it asks for it.
+            // An evaluator that gets a job for it asks for it.
             debug!(%error, step, "the snapshot could not be published");
         }
         self.metrics.evaluation.snapshots_published.inc();
@@ -118,9 +118,9 @@ impl WeightKeeper {
         Ok(())
     }
 
-    fn message(&self, step: u64, hash: Hash, tensors: Vec<u8>) -> quad_protocol::Snapshot {
-        let Identity { run, epoch, schema } = self.identity.clone();
-        quad_protocol::Snapshot { run, epoch, step, schema, hash, tensors }
+    fn message(&self, step: u64, hash: Hash, tensors: Vec<u8>) -> Snapshot {
+        let Identity { run, incarnation, schema } = self.identity.clone();
+        Snapshot { run, incarnation, step, schema, hash, tensors }
     }
 
     fn answer(&self, query: &Query) {

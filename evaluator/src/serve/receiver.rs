@@ -1,4 +1,4 @@
-//! From a snapshot on the wire to a policy that may be rolled out.
+//! Receives snapshots, and makes of one the policy that a job names.
 
 use std::sync::{Arc, Mutex, PoisonError};
 
@@ -18,15 +18,15 @@ const MAX_DIFFUSION_STEPS: u32 = 1_000;
 
 /// Why a snapshot does not fit the job it came for.
 #[derive(Debug, thiserror::Error)]
-pub enum WeightsError {
-    /// It is another one.
+pub enum SnapshotError {
+    /// It is not the snapshot that the job names.
     #[error("the job names {field} {wanted}, the snapshot is of {found}")]
     Other {
-        /// What differs.
+        /// The field that differs.
         field: &'static str,
-        /// What the job says.
+        /// Its value in the job.
         wanted: String,
-        /// What the snapshot says.
+        /// Its value in the snapshot.
         found: String,
     },
     /// Its numbers cannot be those of a policy for the environment.
@@ -47,48 +47,48 @@ pub enum WeightsError {
     Policy(#[from] PolicyError),
 }
 
-impl WeightsError {
+impl SnapshotError {
     /// The reason as a metric's label.
     pub fn label(&self) -> &'static str {
         match self {
-            WeightsError::Other { .. } => "other_snapshot",
-            WeightsError::Schema { .. } | WeightsError::Environment(_) => "schema",
-            WeightsError::Policy(_) => "tensors",
+            SnapshotError::Other { .. } => "other_snapshot",
+            SnapshotError::Schema { .. } | SnapshotError::Environment(_) => "schema",
+            SnapshotError::Policy(_) => "tensors",
         }
     }
 }
 
 /// Builds the policy of `snapshot` if it is exactly the one that `job` names. Its hash was verified by the codec.
-pub fn policy_for(job: &Job, snapshot: &Snapshot, precision: Precision) -> Result<TargetPolicy, WeightsError> {
+pub fn policy_for(job: &Job, snapshot: &Snapshot, precision: Precision) -> Result<TargetPolicy, SnapshotError> {
     same("run", &job.run, &snapshot.run)?;
-    same("epoch", &job.epoch, &snapshot.epoch)?;
+    same("incarnation", &job.incarnation, &snapshot.incarnation)?;
     same("step", &job.step, &snapshot.step)?;
     same("hash", &job.weights, &snapshot.hash)?;
     same("environment", &job.environment, &snapshot.schema.environment)?;
     Ok(TargetPolicy::from_safetensors(architecture(&snapshot.schema)?, &snapshot.tensors, precision)?)
 }
 
-fn same<T: PartialEq + ToString>(field: &'static str, wanted: &T, found: &T) -> Result<(), WeightsError> {
+fn same<T: PartialEq + ToString>(field: &'static str, wanted: &T, found: &T) -> Result<(), SnapshotError> {
     if wanted == found {
         return Ok(());
     }
-    Err(WeightsError::Other { field, wanted: wanted.to_string(), found: found.to_string() })
+    Err(SnapshotError::Other { field, wanted: wanted.to_string(), found: found.to_string() })
 }
 
 /// The shapes that `schema` promises, if they suit its environment.
-fn architecture(schema: &Schema) -> Result<Architecture, WeightsError> {
+fn architecture(schema: &Schema) -> Result<Architecture, SnapshotError> {
     let spec =
-        environment::find(&schema.environment).map_err(|_| WeightsError::Environment(schema.environment.clone()))?;
+        environment::find(&schema.environment).map_err(|_| SnapshotError::Environment(schema.environment.clone()))?;
     let exactly = |field, found: u32, wanted: usize| {
         let fits = found as usize == wanted;
-        if fits { Ok(wanted) } else { Err(WeightsError::Schema { field, found, wanted: wanted.to_string() }) }
+        if fits { Ok(wanted) } else { Err(SnapshotError::Schema { field, found, wanted: wanted.to_string() }) }
     };
     let at_most = |field, found: u32, most: u32| {
         let fits = (1..=most).contains(&found);
         if fits {
             Ok(found as usize)
         } else {
-            Err(WeightsError::Schema { field, found, wanted: format!("1..={most}") })
+            Err(SnapshotError::Schema { field, found, wanted: format!("1..={most}") })
         }
     };
     Ok(Architecture {
@@ -102,20 +102,20 @@ fn architecture(schema: &Schema) -> Result<Architecture, WeightsError> {
 }
 
 /// The newest good snapshot that one run's learner published while this evaluator listened.
-pub struct NewestWeights {
+pub struct SnapshotReceiver {
     newest: Arc<Mutex<Option<Arc<Snapshot>>>>,
     // Aborted with the cache; owns the subscriber.
     _listener: JoinSet<()>,
 }
 
-impl NewestWeights {
+impl SnapshotReceiver {
     /// Listens to `quad/<run>/weights`; `arrived` is told of each good snapshot.
     pub async fn listen(
         session: &Session,
         run: Name,
         metrics: Metrics,
         arrived: Arc<Notify>,
-    ) -> zenoh::Result<NewestWeights> {
+    ) -> zenoh::Result<SnapshotReceiver> {
         // Newest wins: a queue would hold snapshots nobody wants, and a full one stops the whole session.
         let subscriber = session.declare_subscriber(keys::weights(&run)).with(RingChannel::new(1)).await?;
         let newest = Arc::new(Mutex::new(None));
@@ -143,13 +143,13 @@ impl NewestWeights {
                 }
             }
         });
-        Ok(NewestWeights { newest, _listener: listener })
+        Ok(SnapshotReceiver { newest, _listener: listener })
     }
 
-    /// The snapshot that `job` names, if it is the newest. Of another life of the learner it is another one.
+    /// The snapshot that `job` names, if it is the newest. The same step of another incarnation does not count.
     pub fn get(&self, job: &Job) -> Option<Arc<Snapshot>> {
         let named = |snapshot: &&Arc<Snapshot>| {
-            (snapshot.epoch, snapshot.step, snapshot.hash) == (job.epoch, job.step, job.weights)
+            (snapshot.incarnation, snapshot.step, snapshot.hash) == (job.incarnation, job.step, job.weights)
         };
         self.newest.lock().unwrap_or_else(PoisonError::into_inner).as_ref().filter(named).cloned()
     }
@@ -179,7 +179,7 @@ mod tests {
         let job = Job {
             id: 1,
             run: run.clone(),
-            epoch: 3,
+            incarnation: 3,
             step: 100,
             weights,
             environment: "hopper".to_owned(),
@@ -187,7 +187,7 @@ mod tests {
             candidates: 1,
             lease_milliseconds: 1000,
         };
-        (job, Snapshot { run, epoch: 3, step: 100, schema, hash: weights, tensors })
+        (job, Snapshot { run, incarnation: 3, step: 100, schema, hash: weights, tensors })
     }
 
     fn label(change: impl Fn(&mut Job, &mut Snapshot)) -> &'static str {
@@ -201,7 +201,7 @@ mod tests {
         let (job, snapshot) = job_and_snapshot();
         assert!(policy_for(&job, &snapshot, Precision::F32).is_ok());
         assert_eq!(label(|job, _| job.run = Name::new("other").unwrap()), "other_snapshot");
-        assert_eq!(label(|job, _| job.epoch += 1), "other_snapshot");
+        assert_eq!(label(|job, _| job.incarnation += 1), "other_snapshot");
         assert_eq!(label(|job, _| job.step += 1), "other_snapshot");
         assert_eq!(label(|job, _| job.weights = Hash::of(b"others")), "other_snapshot");
         assert_eq!(label(|job, _| job.environment = "walker2d".to_owned()), "other_snapshot");
