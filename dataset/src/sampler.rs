@@ -32,9 +32,14 @@ impl Batch {
     }
 }
 
-/// Draws batches such that every transition comes once a pass, in an order that depends on the seed alone.
-/// A batch that reaches the end of a pass goes on with the next one.
+/// Keeps these draws apart from other uses of the run's seed.
+const PURPOSE: u64 = u64::from_be_bytes(*b"batches ");
+
+/// Draws batches such that every transition comes once a pass, in an order that is a function of the seed and the pass
+/// alone. A batch that reaches the end of a pass goes on with the next one.
 pub struct BatchSampler {
+    seed: u64,
+    pass: u64,
     /// A permutation; the part before `position` is drawn already.
     order: Vec<u32>,
     position: usize,
@@ -43,18 +48,26 @@ pub struct BatchSampler {
 }
 
 impl BatchSampler {
-    /// A sampler of `batch_size` out of `len` transitions.
+    /// A sampler of `batch_size` out of `len` transitions that has drawn `batches` already.
     ///
     /// # Panics
     /// If `len` is 0.
-    pub fn new(len: usize, batch_size: usize, seed: u64) -> Self {
+    pub fn new(len: usize, batch_size: usize, seed: u64, batches: u64) -> Self {
         assert!(len > 0, "there is nothing to sample from");
-        Self {
+        let drawn = u128::from(batches) * batch_size as u128;
+        let mut sampler = Self {
+            seed,
+            pass: (drawn / len as u128) as u64,
             order: (0..len as u32).collect(),
             position: 0,
             indices: vec![0; batch_size],
-            generator: ChaCha8Rng::seed_from_u64(seed),
+            generator: ChaCha8Rng::seed_from_u64(seed ^ PURPOSE),
+        };
+        sampler.start_pass();
+        for _ in 0..drawn % len as u128 {
+            sampler.draw();
         }
+        sampler
     }
 
     /// Fills `batch` with the next `batch_size` transitions.
@@ -68,10 +81,18 @@ impl BatchSampler {
         transitions.gather(&self.indices, batch);
     }
 
+    fn start_pass(&mut self) {
+        self.generator = ChaCha8Rng::seed_from_u64(self.seed ^ PURPOSE);
+        self.generator.set_stream(self.pass);
+        self.order.iter_mut().zip(0..).for_each(|(place, i)| *place = i);
+        self.position = 0;
+    }
+
     /// One step of a Fisher–Yates shuffle, so that no step pays for a whole pass.
     fn draw(&mut self) -> u32 {
         if self.position == self.order.len() {
-            self.position = 0;
+            self.pass += 1;
+            self.start_pass();
         }
         let chosen = self.generator.random_range(self.position..self.order.len());
         self.order.swap(self.position, chosen);
@@ -85,7 +106,7 @@ mod tests {
     use super::*;
 
     fn passes(len: usize, seed: u64, draws: usize) -> Vec<u32> {
-        let mut sampler = BatchSampler::new(len, 1, seed);
+        let mut sampler = BatchSampler::new(len, 1, seed, 0);
         (0..draws).map(|_| sampler.draw()).collect()
     }
 
@@ -107,6 +128,16 @@ mod tests {
     fn the_seed_alone_decides_the_order() {
         assert_eq!(passes(50, 7, 120), passes(50, 7, 120));
         assert_ne!(passes(50, 7, 120), passes(50, 8, 120));
+    }
+
+    #[test]
+    fn a_sampler_goes_on_where_another_one_was() {
+        let all = passes(50, 7, 240);
+        for batches in [0, 1, 7, 10, 16, 20, 33] {
+            let mut sampler = BatchSampler::new(50, 5, 7, batches);
+            let rest: Vec<u32> = (0..25).map(|_| sampler.draw()).collect();
+            assert_eq!(rest, all[5 * batches as usize..][..25], "after {batches} batches");
+        }
     }
 
     #[test]

@@ -3,12 +3,10 @@
 use std::net::SocketAddr;
 use std::path::PathBuf;
 
-use clap::builder::{PossibleValuesParser, TypedValueParser};
 use clap::{Args, Parser, Subcommand};
 use quad_policy::Precision;
 use quad_service::parse_endpoint;
 
-use crate::agent::Guidance;
 use crate::config::{self, Overrides};
 use crate::device::Device;
 
@@ -89,11 +87,11 @@ struct OverrideArgs {
     seed: Option<u64>,
     /// What pulls the policy away from the data: quad (Q-gradients weighted by the critics' agreement),
     /// dac (Q-gradients as they are) or none (behaviour cloning)
-    #[arg(long, value_name = "quad|dac|none", value_parser = guidance_parser(), hide_possible_values = true)]
-    guidance: Option<Guidance>,
+    #[arg(long, value_name = "quad|dac|none")]
+    guidance: Option<String>,
     /// Actions sampled per next state for the critics' target
-    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u64).range(1..))]
-    samples: Option<u64>,
+    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(1..))]
+    samples: Option<u32>,
     /// Actions that an evaluated policy samples per state; the critics choose the best
     #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(1..))]
     candidates: Option<u32>,
@@ -105,9 +103,8 @@ struct OverrideArgs {
 impl TrainArgs {
     /// The flags that were given in place of the preset's values.
     pub fn overrides(&self) -> Overrides {
-        let OverrideArgs { steps, eval_interval, episodes, seed, guidance, samples, candidates, precision } =
-            self.overrides;
-        let samples = samples.map(|n| n as usize);
+        let OverrideArgs { steps, eval_interval, episodes, seed, samples, candidates, precision, .. } = self.overrides;
+        let guidance = self.overrides.guidance.clone();
         Overrides { steps, eval_interval, episodes, seed, guidance, samples, candidates, precision }
     }
 }
@@ -134,11 +131,6 @@ fn parse_preset(text: &str) -> Result<String, String> {
     Err(format!("presets are {}; a file of your own must end in .toml", known.join(", ")))
 }
 
-fn guidance_parser() -> impl TypedValueParser<Value = Guidance> {
-    PossibleValuesParser::new(config::GUIDANCE.map(|(name, _)| name))
-        .try_map(|name| config::guidance_named(&name).ok_or("unknown guidance"))
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -162,15 +154,14 @@ mod tests {
         let Command::Train(train) = parse(&flags).unwrap().command else { panic!("not train") };
         let overrides = train.overrides();
         assert_eq!((overrides.steps, overrides.eval_interval, overrides.samples), (Some(7), Some(0), Some(3)));
-        assert_eq!((overrides.guidance, overrides.candidates, overrides.seed), (Some(Guidance::Dac), Some(4), None));
+        assert_eq!((overrides.guidance, overrides.candidates, overrides.seed), (Some("dac".to_owned()), Some(4), None));
     }
 
     #[test]
     fn wrong_command_lines_exit_with_2() {
-        let wrong: [&[&str]; 8] = [
+        let wrong: [&[&str]; 7] = [
             &["--steps", "0"],
             &["--candidates", "0"],
-            &["--guidance", "sac"],
             &["--listen", "127.0.0.1:7447"],
             &["--listen", "tcp/127.0.0.1:1", "--connect", "tcp/127.0.0.1:2"],
             &["--metrics", "9090"],

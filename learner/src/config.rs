@@ -6,32 +6,21 @@ use quad_dataset::RewardRule;
 use quad_policy::Precision;
 use serde::{Deserialize, Serialize};
 
-use crate::agent::{self, AgentConfig, Guidance};
+use crate::algorithms::{self, ALGORITHMS, AgentError, Definition, Hyperparameters};
 use crate::device::Device;
 
 /// The presets that the binary carries: name and TOML.
-pub const PRESETS: [(&str, &str); 2] = [
+pub const PRESETS: [(&str, &str); 3] = [
     ("hopper-demo", include_str!("../../presets/hopper-demo.toml")),
+    ("hopper-demo-iql", include_str!("../../presets/hopper-demo-iql.toml")),
     ("hopper-medium-replay-v2", include_str!("../../presets/hopper-medium-replay-v2.toml")),
 ];
-
-/// The kinds of guidance and what they are called on the command line and in files.
-pub const GUIDANCE: [(&str, Guidance); 3] =
-    [("quad", Guidance::Quad), ("dac", Guidance::Dac), ("none", Guidance::None)];
-
-/// The kind of guidance of that name.
-pub fn guidance_named(name: &str) -> Option<Guidance> {
-    GUIDANCE.iter().find(|(known, _)| *known == name).map(|(_, guidance)| *guidance)
-}
-
-/// What a kind of guidance is called.
-pub fn guidance_name(guidance: Guidance) -> &'static str {
-    GUIDANCE.iter().find(|(_, known)| *known == guidance).map_or("?", |(name, _)| name)
-}
 
 /// Most episodes in one evaluation, and most candidates per state: far above any use, low enough for evaluators' memory.
 const MOST_EPISODES: u32 = 10_000;
 const MOST_CANDIDATES: u32 = 1_000;
+/// Most transitions in a batch: far above any use, too.
+const MOST_BATCH: u32 = 1 << 20;
 
 /// Everything that decides the outcome of a run, apart from the dataset: the contents of a preset.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
@@ -51,20 +40,27 @@ pub struct Experiment {
     pub candidates: u32,
     /// Seed of initial weights, batches, noise and the evaluations' episodes.
     pub seed: u64,
-    /// Hyper-parameters of the update.
-    pub agent: AgentConfig,
+    /// Transitions per gradient step, B.
+    pub batch_size: u32,
+    /// Arithmetic of what no gradient is taken of.
+    #[serde(default)]
+    pub precision: Precision,
+    /// Name of the learning algorithm.
+    pub algorithm: String,
+    /// Its hyper-parameters.
+    pub agent: toml::Table,
 }
 
 /// Values from the command line that take the place of a preset's.
 #[derive(Clone, Debug, Default)]
-#[allow(missing_docs)] // the fields of `Experiment` and `AgentConfig` of the same names
+#[allow(missing_docs)] // the fields of `Experiment` and of its `agent` of the same names
 pub struct Overrides {
     pub steps: Option<u64>,
     pub eval_interval: Option<u64>,
     pub episodes: Option<u32>,
     pub seed: Option<u64>,
-    pub guidance: Option<Guidance>,
-    pub samples: Option<usize>,
+    pub guidance: Option<String>,
+    pub samples: Option<u32>,
     pub precision: Option<Precision>,
     pub candidates: Option<u32>,
 }
@@ -140,9 +136,20 @@ pub enum ConfigError {
         /// What is wrong, with the line.
         source: Box<toml::de::Error>,
     },
-    /// A hyper-parameter outside its range.
-    #[error(transparent)]
-    Agent(#[from] agent::ConfigError),
+    /// An algorithm that nobody knows.
+    #[error("there is no algorithm named {0:?}; there are {known}", known = ALGORITHMS.map(|known| known.name).join(", "))]
+    Algorithm(String),
+    /// A hyper-parameter that the algorithm does not have, or one outside its range.
+    #[error("algorithm {algorithm}: {source}")]
+    Agent {
+        /// Which algorithm.
+        algorithm: String,
+        /// What is wrong.
+        source: AgentError,
+    },
+    /// Candidates for a policy that samples none.
+    #[error("candidates is {0}, but the policy of this algorithm does not sample any, so it must be 1")]
+    Candidates(u32),
     /// Another value outside its range.
     #[error("{field} is {value}, but must be from {least} to {most}")]
     Range {
@@ -186,6 +193,9 @@ fn parse(preset: &str, text: &str, overrides: &Overrides) -> Result<Experiment, 
         parsed.map_err(|source| ConfigError::Parse { preset: preset.to_owned(), source: Box::new(source) })?;
     experiment.apply(overrides);
     experiment.validate()?;
+    if !experiment.hyperparameters()?.samples_candidates() && experiment.candidates != 1 {
+        return Err(ConfigError::Candidates(experiment.candidates));
+    }
     Ok(experiment)
 }
 
@@ -199,24 +209,42 @@ impl Experiment {
         set(&mut self.episodes, overrides.episodes);
         set(&mut self.seed, overrides.seed);
         set(&mut self.candidates, overrides.candidates);
-        set(&mut self.agent.guidance, overrides.guidance);
-        set(&mut self.agent.samples, overrides.samples);
-        set(&mut self.agent.precision, overrides.precision);
+        set(&mut self.precision, overrides.precision);
+        // An algorithm without such a hyper-parameter refuses it when it reads the table.
+        let guidance = overrides.guidance.clone().map(|guidance| ("guidance", guidance.into()));
+        let samples = overrides.samples.map(|samples| ("samples", samples.into()));
+        self.agent.extend([guidance, samples].into_iter().flatten().map(|(key, value)| (key.to_owned(), value)));
+    }
+
+    /// The algorithm.
+    ///
+    /// # Errors
+    /// There is none of that name.
+    pub fn definition(&self) -> Result<Definition, ConfigError> {
+        algorithms::named(&self.algorithm).ok_or_else(|| ConfigError::Algorithm(self.algorithm.clone()))
+    }
+
+    /// The algorithm's hyper-parameters.
+    ///
+    /// # Errors
+    /// They are not usable, which is found when a preset is resolved.
+    pub fn hyperparameters(&self) -> Result<Box<dyn Hyperparameters>, ConfigError> {
+        let described = |source| ConfigError::Agent { algorithm: self.algorithm.clone(), source };
+        (self.definition()?.read)(&self.agent).map_err(described)
     }
 
     /// The figures that tell runs apart, in one line.
-    pub fn summary(&self) -> String {
-        let Self { steps, eval_interval, episodes, candidates, seed, agent, .. } = self;
-        let AgentConfig { hidden, critics, batch_size, samples, .. } = agent;
-        let guidance = guidance_name(agent.guidance);
+    ///
+    /// # Errors
+    /// As [`Self::hyperparameters`].
+    pub fn summary(&self) -> Result<String, ConfigError> {
+        let Self { steps, eval_interval, episodes, candidates, seed, batch_size, .. } = self;
         let evaluations = match eval_interval {
             0 => "no evaluations".to_owned(),
             _ => format!("{episodes} episodes with {candidates} candidates every {eval_interval}"),
         };
-        format!(
-            "guidance {guidance}, seed {seed}, {steps} steps of batch {batch_size}, {samples} samples, {critics} critics, \
-             {hidden} wide; {evaluations}"
-        )
+        let agent = self.hyperparameters()?.summary();
+        Ok(format!("{agent}; seed {seed}, {steps} steps of batch {batch_size}; {evaluations}"))
     }
 
     fn validate(&self) -> Result<(), ConfigError> {
@@ -233,7 +261,7 @@ impl Experiment {
         range("seed", self.seed, 0, MOST)?;
         range("episodes", self.episodes.into(), 1, MOST_EPISODES.into())?;
         range("candidates", self.candidates.into(), 1, MOST_CANDIDATES.into())?;
-        Ok(self.agent.validate()?)
+        range("batch_size", self.batch_size.into(), 1, MOST_BATCH.into())
     }
 }
 
@@ -257,10 +285,10 @@ mod tests {
     #[test]
     fn the_papers_preset_holds_the_papers_numbers() {
         let paper = resolve("hopper-medium-replay-v2", &Overrides::default()).unwrap();
-        let agent = &paper.agent;
-        assert_eq!((agent.diffusion_steps, agent.critics, agent.batch_size, agent.hidden), (5, 10, 256, 256));
-        assert_eq!((agent.rho, agent.tau, agent.eta.threshold), (1.5, 0.1, Some(1.0)));
-        assert_eq!((agent.actor_learning_rate, agent.critic_learning_rate, agent.ema_rate), (3e-4, 3e-4, 5e-3));
+        let number = |key: &str| paper.agent[key].as_float().unwrap_or_else(|| paper.agent[key].as_integer().unwrap() as f64);
+        let keys = ["diffusion_steps", "critics", "hidden", "rho", "tau", "actor_learning_rate", "critic_learning_rate"];
+        assert_eq!(keys.map(number), [5.0, 10.0, 256.0, 1.5, 0.1, 3e-4, 3e-4]);
+        assert_eq!((number("ema_rate"), paper.agent["eta"]["threshold"].as_float(), paper.batch_size), (5e-3, Some(1.0), 256));
         assert_eq!((paper.steps, paper.eval_interval, paper.episodes, paper.candidates), (2_000_000, 20_000, 10, 10));
     }
 
@@ -269,14 +297,14 @@ mod tests {
         let overrides = Overrides {
             steps: Some(5),
             eval_interval: Some(0),
-            guidance: Some(Guidance::None),
+            guidance: Some("none".to_owned()),
             samples: Some(7),
             ..Overrides::default()
         };
         let preset = resolve("hopper-demo", &Overrides::default()).unwrap();
         let resolved = resolve("hopper-demo", &overrides).unwrap();
         assert_eq!((resolved.steps, resolved.eval_interval, resolved.seed), (5, 0, preset.seed));
-        assert_eq!((resolved.agent.guidance, resolved.agent.samples), (Guidance::None, 7));
+        assert_eq!((resolved.agent["guidance"].as_str(), resolved.agent["samples"].as_integer()), (Some("none"), Some(7)));
     }
 
     #[test]
@@ -296,7 +324,16 @@ mod tests {
         let huge = Overrides { seed: Some(u64::MAX), ..Overrides::default() };
         assert!(matches!(resolve("hopper-demo", &huge), Err(ConfigError::Range { field: "seed", .. })));
         let samples = Overrides { samples: Some(0), ..Overrides::default() };
-        assert!(matches!(resolve("hopper-demo", &samples), Err(ConfigError::Agent(_))));
+        assert!(matches!(resolve("hopper-demo", &samples), Err(ConfigError::Agent { .. })));
+        let guidance = Overrides { guidance: Some("sac".to_owned()), ..Overrides::default() };
+        let error = resolve("hopper-demo", &guidance).unwrap_err().to_string();
+        assert!(error.contains("sac") && error.contains("dac"), "the names that there are are offered: {error}");
+        let error = resolve("hopper-demo-iql", &samples).unwrap_err().to_string();
+        assert!(error.contains("iql") && error.contains("samples"), "{error}");
+        let many = Overrides { candidates: Some(10), ..Overrides::default() };
+        assert!(matches!(resolve("hopper-demo-iql", &many), Err(ConfigError::Candidates(10))));
+        let unknown = demo_with(|text| text.replace("algorithm = \"quad\"", "algorithm = \"sac\"")).unwrap_err();
+        assert!(unknown.to_string().contains("quad, iql"), "{unknown}");
     }
 
     #[test]

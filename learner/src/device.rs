@@ -1,11 +1,9 @@
 //! Where training runs.
 
 use anyhow::{Context, anyhow};
-use quad_policy::{Architecture, Precision};
+use quad_policy::Precision;
 use quad_service::Hint;
 use serde::{Deserialize, Serialize};
-
-use crate::agent::{Agent, AgentConfig, TensorAgent, Trainee};
 
 /// Where training runs, as it is called on the command line and in files.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize, clap::ValueEnum)]
@@ -19,7 +17,10 @@ pub enum Device {
 }
 
 impl Device {
-    /// Whether it is there, and computes as asked.
+    /// That the device is there and can compute with this precision.
+    ///
+    /// # Errors
+    /// It is not, or it cannot.
     pub fn check(self, precision: Precision) -> anyhow::Result<()> {
         match (self, precision) {
             (Self::Cpu, _) => Ok(()),
@@ -28,18 +29,15 @@ impl Device {
         }
     }
 
-    /// A new agent there, to be used by the thread that asks for it; its learning rates reach 0 at `steps`.
-    pub fn agent(
-        self,
-        architecture: Architecture,
-        config: &AgentConfig,
-        steps: u64,
-        seed: u64,
-    ) -> anyhow::Result<Box<dyn Trainee>> {
-        Ok(match self {
-            Self::Cpu => Box::new(Agent::new(architecture, config, steps, seed)?),
-            Self::Cuda => Box::new(TensorAgent::new(architecture, config, steps, seed, gpu()?)?),
-        })
+    /// The device, as candle knows it.
+    ///
+    /// # Errors
+    /// There is no such device here.
+    pub fn open(self) -> anyhow::Result<candle_core::Device> {
+        match self {
+            Self::Cpu => Ok(candle_core::Device::Cpu),
+            Self::Cuda => gpu(),
+        }
     }
 }
 

@@ -106,10 +106,8 @@ impl Display {
                 parts.push(format!("{} left", HumanDuration(left)));
             }
         }
-        parts.push(format!("η {:.3}", training.eta.get()));
-        parts.push(format!("λ {:.3}", training.lambda_mean.get()));
-        parts.push(format!("critic loss {:.3}", training.critic_loss.get()));
-        parts.push(format!("BC loss {:.3}", training.bc_loss.get()));
+        let shown = training.algorithm.iter().filter(|(metric, _)| !metric.label.is_empty());
+        parts.extend(shown.map(|(metric, gauge)| format!("{} {:.3}", metric.label, gauge.get())));
         parts.join(", ")
     }
 

@@ -5,14 +5,17 @@
 //!
 //! - [`cli`] is the command line; [`config`] the experiment that it describes, a preset with flags on top, validated once.
 //! - [`run`] goes from the command line to the exit; [`conduct`] is the main loop in between.
-//! - [`threads`] starts the threads that do the work: [`train`] (nothing but gradient steps, with an [`agent`] on a
+//! - [`threads`] starts the threads that do the work: [`train`] (nothing but gradient steps, by an [`agent`] on a
 //!   [`device`]), [`publisher`] (publishes and saves snapshots) and [`hub`] (hands out jobs, takes scores in).
+//! - [`agent`] runs one of the [`algorithms`], each a file to be read beside its paper, with an [`optimiser`] and the
+//!   [`random`] numbers of its seed.
 //! - [`scoreboard`] is the hub's state without any I/O; [`seeds`] says which episodes an evaluation has.
 //! - [`wire`] declares everything on Zenoh; its callbacks fill an [`inbox`]; [`notice`] is what threads tell the main loop.
 //! - [`run_dir`] is the folder of a run, [`metrics`] are for Prometheus, [`display`] shows progress on the terminal.
 //! - [`report`] and [`plot`] summarise the scores as tables and as a picture.
 
 pub mod agent;
+pub mod algorithms;
 pub mod cli;
 pub mod conduct;
 pub mod config;
@@ -22,8 +25,10 @@ pub mod hub;
 pub mod inbox;
 pub mod metrics;
 pub mod notice;
+pub mod optimiser;
 pub mod plot;
 pub mod publisher;
+pub mod random;
 pub mod report;
 pub mod run;
 pub mod run_dir;

@@ -11,7 +11,7 @@ use prometheus::{
 };
 use quad_protocol::{Name, Progress};
 
-use crate::agent::StepMetrics;
+use crate::algorithms::Metric;
 
 /// Shortest gradient step that the histogram tells apart, and how many doublings follow it: 1 ms to 2 s.
 const SHORTEST_STEP: f64 = 1e-3;
@@ -37,16 +37,8 @@ pub struct TrainingMetrics {
     pub gradient_steps: IntCounter,
     pub gradient_steps_target: IntGauge,
     pub step_duration: Histogram,
-    pub critic_loss: Gauge,
-    pub bc_loss: Gauge,
-    pub actor_loss: Gauge,
-    pub eta: Gauge,
-    pub lambda_mean: Gauge,
-    pub q_mean: Gauge,
-    pub nu_squared: Gauge,
-    pub critic_gradient_norm: Gauge,
-    pub actor_gradient_norm: Gauge,
-    pub learning_rate: Gauge,
+    /// What the algorithm measures, in its order.
+    pub algorithm: Vec<(&'static Metric, Gauge)>,
 }
 
 /// Snapshots, jobs and scores.
@@ -106,7 +98,11 @@ fn full(name: &str) -> String {
 
 impl Metrics {
     /// Makes them all, in a registry that labels each with the run.
-    pub fn new(run: &Name, target_steps: u64) -> prometheus::Result<(Self, Registry)> {
+    pub fn new(
+        run: &Name,
+        target_steps: u64,
+        measured: &'static [Metric],
+    ) -> prometheus::Result<(Self, Registry)> {
         let labels = HashMap::from([("run".to_owned(), run.to_string())]);
         let registry = Registry::new_custom(None, Some(labels))?;
         registry.register(Box::new(ProcessCollector::for_self()))?;
@@ -118,19 +114,10 @@ impl Metrics {
             gradient_steps: make.counter("gradient_steps_total", "Gradient steps done")?,
             gradient_steps_target: make.count("gradient_steps_target", "Gradient steps that this run will do")?,
             step_duration: make.add(Histogram::with_opts(duration))?,
-            critic_loss: make.gauge("critic_loss", "Critic loss of the last step (Eq. 20)")?,
-            bc_loss: make.gauge("bc_loss", "Behaviour-cloning loss of the last step (first term of Eq. 19)")?,
-            actor_loss: make.gauge("actor_loss", "Actor loss of the last step (Eq. 19)")?,
-            eta: make.gauge("eta", "Behaviour-cloning strength eta after the last step (Eq. 19)")?,
-            lambda_mean: make.gauge("lambda_mean", "Mean uncertainty weight lambda over the last batch (Eq. 24)")?,
-            q_mean: make.gauge("q_mean", "Mean critic target y of the last batch (Eq. 20)")?,
-            nu_squared: make
-                .gauge("nu_squared", "Moving average of the variance of the mean alignment over a batch (Eq. 23)")?,
-            critic_gradient_norm: make
-                .gauge("critic_gradient_norm", "Norm of the critics' gradient before clipping, last step")?,
-            actor_gradient_norm: make
-                .gauge("actor_gradient_norm", "Norm of the actor's gradient before clipping, last step")?,
-            learning_rate: make.gauge("learning_rate", "Learning rate of the actor at the last step")?,
+            algorithm: measured
+                .iter()
+                .map(|metric| Ok((metric, make.gauge(metric.name, metric.help)?)))
+                .collect::<prometheus::Result<_>>()?,
         };
         training.gradient_steps_target.set(i64::try_from(target_steps).unwrap_or(i64::MAX));
         let outcomes = Opts::new(full("jobs_total"), "Evaluation jobs by what became of them");
@@ -178,24 +165,12 @@ impl Metrics {
 }
 
 impl TrainingMetrics {
-    /// Takes in one gradient step.
-    pub fn observe(&self, step: &StepMetrics, duration: Duration) {
+    /// Takes in one gradient step: what it measured, in the algorithm's order.
+    pub fn observe(&self, values: &[f32], duration: Duration) {
         self.gradient_steps.inc();
         self.step_duration.observe(duration.as_secs_f64());
-        let pairs = [
-            (&self.critic_loss, step.critic_loss),
-            (&self.bc_loss, step.bc_loss),
-            (&self.actor_loss, step.actor_loss),
-            (&self.eta, step.eta),
-            (&self.lambda_mean, step.lambda_mean),
-            (&self.q_mean, step.q_mean),
-            (&self.nu_squared, step.nu_squared),
-            (&self.critic_gradient_norm, step.critic_gradient_norm),
-            (&self.actor_gradient_norm, step.actor_gradient_norm),
-            (&self.learning_rate, step.learning_rate),
-        ];
-        for (gauge, value) in pairs {
-            gauge.set(value.into());
+        for ((_, gauge), value) in self.algorithm.iter().zip(values) {
+            gauge.set(f64::from(*value));
         }
     }
 }

@@ -3,7 +3,7 @@
 use candle_core::backprop::GradStore;
 use candle_core::{DType, Result, Tensor};
 use quad_kernels::optimiser::{BETA1, BETA2, EPSILON, decay_moments, descend, ema, norm};
-use quad_policy::{PolicyError, Tensors, Weights, modify, read};
+use quad_policy::{PolicyError, Tensors, Weights, has_fast_body, modify, read};
 
 /// Adam (Kingma and Ba 2015), with β = (0.9, 0.999) and ε = 1e-8, for the weights of one network.
 pub struct Adam {
@@ -32,7 +32,7 @@ impl Adam {
     /// Moves the weights down the loss that `gradients` are of. Gives the gradient's norm before clipping, `[]`.
     pub fn step(&mut self, weights: &mut Weights, gradients: &GradStore, step: AdamStep) -> Result<Tensor> {
         let gradient = weights.gradient(gradients)?;
-        match gradient.device().is_cpu() {
+        match has_fast_body(gradient.device()) {
             true => self.fused_step(weights, &gradient, step),
             false => self.plain_step(weights, &gradient, step),
         }
@@ -94,7 +94,7 @@ impl Adam {
 /// `target = (1 - rate)·target + rate·online`: a target network follows its online network.
 pub fn follow(target: &mut Weights, online: &Weights, rate: f32) -> Result<()> {
     let online = online.values();
-    if online.device().is_cpu() {
+    if has_fast_body(online.device()) {
         return read(online, |online: &[f32]| {
             target.change(|target| modify(target, |target| ema(target, online, rate)))
         })?;

@@ -73,7 +73,7 @@ fn draw(path: &Path, runs: &[RunReport]) -> Result<(), Box<dyn std::error::Error
             let band: Vec<_> = upper.chain(run.evaluations.iter().rev().map(edge(-1.0))).collect();
             chart.draw_series([Polygon::new(band, colour.mix(0.15))])?;
         }
-        let label = format!("{} (guidance {}, {} candidates)", run.run, run.guidance, run.candidates);
+        let label = format!("{} ({}, {} candidates)", run.run, run.variant, run.candidates);
         let legend = move |(x, y)| PathElement::new([(x, y), (x + 20, y)], colour.stroke_width(2));
         chart.draw_series(LineSeries::new(points.clone(), colour.stroke_width(2)))?.label(label).legend(legend);
         chart.draw_series(points.into_iter().map(|point| Circle::new(point, 3, colour.filled())))?;

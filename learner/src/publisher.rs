@@ -5,6 +5,7 @@ use std::collections::BTreeMap;
 use std::time::Duration;
 
 use anyhow::Context;
+use quad_dataset::EnvironmentSpec;
 use quad_protocol::{Hash, Name, Schema, Snapshot, encode, keys};
 use tokio::sync::mpsc::UnboundedSender;
 use tracing::debug;
@@ -18,6 +19,7 @@ use crate::inbox::{Inbox, Messages};
 use crate::metrics::Metrics;
 use crate::notice::Notice;
 use crate::run_dir::RunDir;
+use crate::agent::PolicyFile;
 use crate::train::TrainedPolicy;
 
 /// Longest wait for a message. The thread does nothing between messages, so the value does not matter.
@@ -45,8 +47,8 @@ pub struct Identity {
     pub run: Name,
     /// Which start of the learner this is.
     pub incarnation: u64,
-    /// Environment and shapes.
-    pub schema: Schema,
+    /// Environment that the policy acts in.
+    pub environment: &'static EnvironmentSpec,
 }
 
 /// State of the thread.
@@ -61,6 +63,8 @@ pub struct SnapshotPublisher {
     hashes: BTreeMap<u64, Hash>,
     /// The newest, ready to be sent; older ones are read from the disk.
     newest: Option<(u64, ZBytes)>,
+    /// The kind of the run's policies, as the first one says.
+    kind: &'static str,
 }
 
 impl SnapshotPublisher {
@@ -72,7 +76,8 @@ impl SnapshotPublisher {
         hub: Inbox<hub::Event>,
         notices: UnboundedSender<Notice>,
     ) -> Self {
-        Self { identity, run_dir, metrics, hub, notices, publisher: None, hashes: BTreeMap::new(), newest: None }
+        let (hashes, kind) = (BTreeMap::new(), "");
+        Self { identity, run_dir, metrics, hub, notices, publisher: None, hashes, newest: None, kind }
     }
 
     /// The thread's work, until it is told to stop.
@@ -94,12 +99,13 @@ impl SnapshotPublisher {
     }
 
     fn publish(&mut self, policy: TrainedPolicy) -> anyhow::Result<()> {
-        let TrainedPolicy { step, tensors, evaluate } = policy;
+        let TrainedPolicy { step, policy: PolicyFile { kind, bytes: tensors }, evaluate } = policy;
         let hash = Hash::of(&tensors);
         self.metrics.evaluation.snapshot_bytes.set(tensors.len() as i64);
         if !evaluate {
             return Ok(self.run_dir.write_snapshot(step, &tensors)?);
         }
+        self.kind = kind;
         let message = self.message(step, hash, tensors);
         let bytes = ZBytes::from(encode(&message)?);
         self.hashes.insert(step, hash);
@@ -119,7 +125,13 @@ impl SnapshotPublisher {
     }
 
     fn message(&self, step: u64, hash: Hash, tensors: Vec<u8>) -> Snapshot {
-        let Identity { run, incarnation, schema } = self.identity.clone();
+        let Identity { run, incarnation, environment } = self.identity.clone();
+        let schema = Schema {
+            environment: environment.name.to_owned(),
+            observation_dim: environment.observation_dim as u32,
+            action_dim: environment.action_dim as u32,
+            policy: self.kind.to_owned(),
+        };
         Snapshot { run, incarnation, step, schema, hash, tensors }
     }
 

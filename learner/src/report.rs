@@ -6,7 +6,9 @@ use std::path::{Path, PathBuf};
 
 use serde::Serialize;
 
-use crate::config::{RunConfig, guidance_name};
+use crate::algorithms::Hyperparameters;
+use crate::config::{DatasetInfo, Experiment, RunConfig};
+use crate::device::Device;
 use crate::run_dir::{RunDir, RunDirError, ScoreLine};
 
 /// Mean and sample standard deviation (n - 1).
@@ -58,10 +60,10 @@ pub struct RunReport {
     pub run: String,
     /// The preset it started from.
     pub preset: String,
-    /// `quad`, `dac` or `none`.
-    pub guidance: &'static str,
-    /// Actions sampled per next state in the critics' target.
-    pub samples: usize,
+    /// The variant of the algorithm: `quad`, `dac` or `none` for QUAD's kinds of guidance, or another algorithm's name.
+    pub variant: String,
+    /// The hyper-parameters that matter most.
+    pub agent: String,
     /// Actions sampled per state in an evaluation.
     pub candidates: u32,
     /// Seed.
@@ -76,17 +78,29 @@ pub struct RunReport {
     pub mean_last_3: Option<f64>,
     /// The same of the last 5.
     pub mean_last_5: Option<f64>,
+    #[serde(skip)]
+    alike: Alike,
 }
 
-/// Runs that differ in their seed alone.
+/// What runs must have in common to be averaged over their seeds.
+#[derive(Clone, Debug, PartialEq)]
+struct Alike {
+    preset: String,
+    device: Device,
+    dataset: DatasetInfo,
+    /// With its seed left out.
+    experiment: Experiment,
+}
+
+/// Runs that differ in their seed alone: in preset, dataset, device and every hyper-parameter they agree.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct GroupReport {
     /// The preset.
     pub preset: String,
-    /// `quad`, `dac` or `none`.
-    pub guidance: &'static str,
-    /// Actions sampled per next state in the critics' target.
-    pub samples: usize,
+    /// The variant of the algorithm: `quad`, `dac` or `none` for QUAD's kinds of guidance, or another algorithm's name.
+    pub variant: String,
+    /// The hyper-parameters that matter most.
+    pub agent: String,
     /// Actions sampled per state in an evaluation.
     pub candidates: u32,
     /// Gradient steps.
@@ -112,10 +126,16 @@ impl RunReport {
     /// Reads a run folder.
     pub fn read(path: &Path) -> Result<Self, RunDirError> {
         let (dir, config) = RunDir::open(path)?;
-        Ok(Self::new(path, &config, &dir.read_scores()?))
+        let unusable = |error: crate::config::ConfigError| RunDirError::Content {
+            path: path.join("config.toml"),
+            line: None,
+            reason: error.to_string(),
+        };
+        let agent = config.experiment.hyperparameters().map_err(unusable)?;
+        Ok(Self::new(path, config, &*agent, &dir.read_scores()?))
     }
 
-    fn new(path: &Path, config: &RunConfig, lines: &[ScoreLine]) -> Self {
+    fn new(path: &Path, config: RunConfig, agent: &dyn Hyperparameters, lines: &[ScoreLine]) -> Self {
         let experiment = &config.experiment;
         let mut by_step: BTreeMap<u64, BTreeMap<u64, &ScoreLine>> = BTreeMap::new();
         for line in lines {
@@ -134,8 +154,8 @@ impl RunReport {
             dir: path.to_owned(),
             run: config.run.name.clone(),
             preset: config.run.preset.clone(),
-            guidance: guidance_name(experiment.agent.guidance),
-            samples: experiment.agent.samples,
+            variant: agent.variant(),
+            agent: agent.summary(),
             candidates: experiment.candidates,
             seed: experiment.seed,
             steps: experiment.steps,
@@ -143,14 +163,20 @@ impl RunReport {
             evaluations,
             mean_last_3,
             mean_last_5,
+            alike: Alike {
+                preset: config.run.preset,
+                device: config.run.device,
+                dataset: config.dataset,
+                experiment: Experiment { seed: 0, ..config.experiment },
+            },
         }
     }
 
     /// The evaluations as a table for people.
     pub fn table(&self) -> String {
         let mut text = format!(
-            "{}: preset {}, guidance {}, {} samples, {} candidates, {} steps, seed {}\n\n",
-            self.run, self.preset, self.guidance, self.samples, self.candidates, self.steps, self.seed
+            "{}: preset {}, {}, {} candidates, {} steps, seed {}\n\n",
+            self.run, self.preset, self.agent, self.candidates, self.steps, self.seed
         );
         let mut line = |arguments: std::fmt::Arguments<'_>| {
             // Writing to a string cannot fail.
@@ -216,25 +242,16 @@ impl Report {
     fn summary(&self) -> String {
         let mut text = String::from("Over seeds (mean ± standard deviation of the runs):\n\n");
         let header =
-            ["preset", "guidance", "samples", "candidates", "steps", "runs", "last 3", "last 5"].map(str::to_owned);
+            ["preset", "algorithm", "candidates", "steps", "runs", "last 3", "last 5"].map(str::to_owned);
         let cell = |value: Option<Spread>| value.map_or_else(|| "-".to_owned(), spread);
         let rows = self.groups.iter().map(|g| {
-            let (samples, candidates, steps) = (g.samples.to_string(), g.candidates.to_string(), g.steps.to_string());
+            let (candidates, steps, runs) = (g.candidates.to_string(), g.steps.to_string(), g.seeds.len().to_string());
             let (last_3, last_5) = (cell(g.mean_last_3), cell(g.mean_last_5));
-            [
-                g.preset.clone(),
-                g.guidance.to_owned(),
-                samples,
-                candidates,
-                steps,
-                g.seeds.len().to_string(),
-                last_3,
-                last_5,
-            ]
+            [g.preset.clone(), g.agent.clone(), candidates, steps, runs, last_3, last_5]
         });
         let rows: Vec<_> = std::iter::once(header).chain(rows).collect();
         let width = |column: usize| rows.iter().map(|row| row[column].chars().count()).max().unwrap_or(0);
-        let widths: [usize; 8] = std::array::from_fn(width);
+        let widths: [usize; 7] = std::array::from_fn(width);
         for row in &rows {
             let cells = row.iter().zip(widths).map(|(cell, width)| format!("{cell:>width$}"));
             text.push_str(&cells.collect::<Vec<_>>().join("  "));
@@ -245,22 +262,24 @@ impl Report {
 }
 
 fn groups(runs: &[RunReport]) -> Vec<GroupReport> {
-    let mut members: BTreeMap<_, Vec<&RunReport>> = BTreeMap::new();
+    let mut members: Vec<Vec<&RunReport>> = Vec::new();
     for run in runs {
-        let key = (&run.preset, run.guidance, run.samples, run.candidates, run.steps);
-        members.entry(key).or_default().push(run);
+        match members.iter_mut().find(|group| group[0].alike == run.alike) {
+            Some(group) => group.push(run),
+            None => members.push(vec![run]),
+        }
     }
-    let group = |((preset, guidance, samples, candidates, steps), runs): ((&String, _, _, _, _), Vec<&RunReport>)| {
+    let group = |runs: Vec<&RunReport>| {
         let scored = || runs.iter().filter(|run| run.mean_last_3.is_some());
         let over = |value: fn(&RunReport) -> Option<f64>| {
             Spread::of(&scored().filter_map(|run| value(run)).collect::<Vec<_>>())
         };
         GroupReport {
-            preset: preset.clone(),
-            guidance,
-            samples,
-            candidates,
-            steps,
+            preset: runs[0].preset.clone(),
+            variant: runs[0].variant.clone(),
+            agent: runs[0].agent.clone(),
+            candidates: runs[0].candidates,
+            steps: runs[0].steps,
             seeds: scored().map(|run| run.seed).collect(),
             mean_last_3: over(|run| run.mean_last_3),
             mean_last_5: over(|run| run.mean_last_5),

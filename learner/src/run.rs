@@ -58,11 +58,14 @@ fn print(text: &str) -> std::io::Result<()> {
 
 fn train(args: &TrainArgs) -> anyhow::Result<()> {
     let experiment = config::resolve(&args.preset, &args.overrides())?;
-    let path = args.run_dir.clone().unwrap_or_else(|| default_run_dir(&args.preset, &experiment));
+    let path = match &args.run_dir {
+        Some(path) => path.clone(),
+        None => default_run_dir(&args.preset, &experiment)?,
+    };
     let name = run_name(&path)?;
     RunDir::check_free(&path).hint("choose another --run-dir, or remove the folder if you do not need it")?;
 
-    args.device.check(experiment.agent.precision)?;
+    args.device.check(experiment.precision)?;
 
     let environment = quad_dataset::environment::find(&experiment.environment)?;
     let options = ReadOptions { environment, reward: experiment.reward };
@@ -72,8 +75,8 @@ fn train(args: &TrainArgs) -> anyhow::Result<()> {
     let config = run_config(args, &name, experiment, &transitions)?;
     let DatasetInfo { transitions: count, episodes, mean_score, .. } = &config.dataset;
     info!("{count} transitions of {episodes} episodes, mean score {mean_score:.2}");
-    info!("{}", config.experiment.summary());
-    if !config.experiment.agent.precision.is_available() {
+    info!("{}", config.experiment.summary()?);
+    if !config.experiment.precision.is_available() {
         warn!("{}", Precision::UNAVAILABLE);
     }
     debug!("{config:?}");
@@ -93,7 +96,7 @@ async fn conduct(
     transitions: Transitions,
 ) -> anyhow::Result<(RunDir, Ending)> {
     let steps = config.experiment.steps;
-    let (metrics, registry) = Metrics::new(&run, steps)?;
+    let (metrics, registry) = Metrics::new(&run, steps, config.experiment.definition()?.metrics)?;
     let server = quad_service::serve_metrics(args.metrics, registry).await?;
     let endpoints = endpoints(args, config.experiment.eval_interval);
     let opening = open_network(&endpoints).await.hint(
@@ -152,9 +155,9 @@ fn conclude(run_dir: &RunDir, config: &RunConfig, ending: Ending) -> anyhow::Res
     }
 }
 
-fn default_run_dir(preset: &str, experiment: &Experiment) -> PathBuf {
-    let guidance = config::guidance_name(experiment.agent.guidance);
-    Path::new("runs").join(format!("{}-{guidance}-seed{}", config::preset_label(preset), experiment.seed))
+fn default_run_dir(preset: &str, experiment: &Experiment) -> anyhow::Result<PathBuf> {
+    let variant = experiment.hyperparameters()?.variant();
+    Ok(Path::new("runs").join(format!("{}-{variant}-seed{}", config::preset_label(preset), experiment.seed)))
 }
 
 /// The folder's name, which is also the run's place in Zenoh's key space.

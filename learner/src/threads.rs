@@ -8,11 +8,13 @@ use std::time::Duration;
 
 use anyhow::anyhow;
 use quad_dataset::{BatchSampler, EnvironmentSpec, Transitions};
-use quad_protocol::{Name, Schema};
+use quad_protocol::Name;
 use tokio::sync::mpsc::UnboundedSender;
 use tokio::sync::oneshot;
 use tracing::warn;
 
+use crate::agent::Agent;
+use crate::algorithms::Setting;
 use crate::config::{Experiment, RunConfig};
 use crate::device::Device;
 use crate::hub::{self, EvaluationPlan, Hub};
@@ -76,7 +78,7 @@ impl Threads {
         let hub_thread = spawn("hub", move || state.run(&hub_messages))?;
 
         let identity =
-            Identity { run: run.clone(), incarnation: config.run.incarnation, schema: schema(experiment, environment) };
+            Identity { run: run.clone(), incarnation: config.run.incarnation, environment };
         let state = SnapshotPublisher::new(identity, run_dir.clone(), metrics.clone(), hub.clone(), notices.clone());
         let (publisher, publisher_messages) = inbox();
         let publisher_thread = spawn("publisher", move || state.run(&publisher_messages))?;
@@ -142,34 +144,32 @@ struct Trainer {
 
 impl Trainer {
     fn run(self) -> TrainingResult {
-        let Experiment { steps, eval_interval, seed, agent: config, .. } = &self.experiment;
-        let architecture = config.architecture(self.environment.observation_dim, self.environment.action_dim);
-        let mut agent = self.device.agent(architecture, config, *steps, *seed)?;
-        let mut sampler = BatchSampler::new(self.transitions.len(), config.batch_size, *seed);
+        let experiment = &self.experiment;
+        let setting = Setting {
+            observation_dim: self.environment.observation_dim,
+            action_dim: self.environment.action_dim,
+            batch_size: experiment.batch_size as usize,
+            total_steps: experiment.steps,
+            seed: experiment.seed,
+            precision: experiment.precision,
+            device: self.device.open()?,
+        };
+        let algorithm = experiment.hyperparameters()?.start(&setting)?;
+        let mut agent = Agent::new(experiment.definition()?, algorithm, setting.device.clone());
+        let mut sampler =
+            BatchSampler::new(self.transitions.len(), setting.batch_size, experiment.seed, agent.step());
         let outlets = Outlets {
             metrics: self.metrics,
             rows: self.rows,
             snapshot: &|policy| self.publisher.send(publisher::Event::Trained(policy)),
             stop: &self.stop,
         };
-        let plan = Plan { steps: *steps, eval_interval: *eval_interval };
-        let outcome = train(&mut *agent, &self.transitions, &mut sampler, plan, &outlets)?;
+        let plan = Plan { steps: experiment.steps, eval_interval: experiment.eval_interval };
+        let outcome = train(&mut agent, &self.transitions, &mut sampler, plan, &outlets)?;
         if outcome == Outcome::Completed {
             self.publisher.send(publisher::Event::TrainingCompleted);
         }
         Ok(outcome)
-    }
-}
-
-fn schema(experiment: &Experiment, environment: &EnvironmentSpec) -> Schema {
-    let agent = &experiment.agent;
-    Schema {
-        environment: environment.name.to_owned(),
-        observation_dim: environment.observation_dim as u32,
-        action_dim: environment.action_dim as u32,
-        hidden: agent.hidden as u32,
-        critics: agent.critics as u32,
-        diffusion_steps: agent.diffusion_steps as u32,
     }
 }
 

@@ -7,10 +7,12 @@ use std::sync::mpsc::SyncSender;
 use std::time::Instant;
 
 use quad_dataset::{Batch, BatchSampler, Transitions};
-use serde::Serialize;
+use serde::ser::SerializeMap;
+use serde::{Serialize, Serializer};
 use tracing::debug;
 
-use crate::agent::{AgentError, StepMetrics, Trainee};
+use crate::agent::{Agent, PolicyFile};
+use crate::algorithms::{AlgorithmError, Metric};
 use crate::metrics::TrainingMetrics;
 
 /// Gradient steps that a line of `metrics.jsonl` averages over.
@@ -42,29 +44,35 @@ pub struct Outlets<'a> {
 pub struct TrainedPolicy {
     /// After which step.
     pub step: u64,
-    /// A safetensors file.
-    pub tensors: Vec<u8>,
+    /// What it is, and its weights.
+    pub policy: PolicyFile,
     /// Whether it is to be evaluated, or only kept.
     pub evaluate: bool,
 }
 
 /// A line of `metrics.jsonl`: means over the gradient steps since the line before.
-#[derive(Clone, Debug, PartialEq, Serialize)]
-#[allow(missing_docs)] // the fields of `StepMetrics`, see docs/metrics.md
+#[derive(Clone, Debug)]
 pub struct Row {
+    /// Gradient steps done.
     pub step: u64,
     /// Since training began.
     pub seconds: f64,
-    pub critic_loss: f32,
-    pub bc_loss: f32,
-    pub actor_loss: f32,
-    pub eta: f32,
-    pub lambda_mean: f32,
-    pub q_mean: f32,
-    pub nu_squared: f32,
-    pub critic_gradient_norm: f32,
-    pub actor_gradient_norm: f32,
-    pub learning_rate: f32,
+    /// What was measured.
+    pub metrics: &'static [Metric],
+    /// The means, in the order of `metrics`.
+    pub values: Vec<f32>,
+}
+
+impl Serialize for Row {
+    fn serialize<S: Serializer>(&self, serializer: S) -> Result<S::Ok, S::Error> {
+        let mut map = serializer.serialize_map(Some(2 + self.values.len()))?;
+        map.serialize_entry("step", &self.step)?;
+        map.serialize_entry("seconds", &self.seconds)?;
+        for (metric, value) in self.metrics.iter().zip(&self.values) {
+            map.serialize_entry(metric.name, value)?;
+        }
+        map.end()
+    }
 }
 
 /// How training ended well.
@@ -82,14 +90,14 @@ pub enum Outcome {
 /// Why training cannot go on.
 #[derive(Debug, thiserror::Error)]
 pub enum TrainError {
-    /// A loss is not a number any more.
-    #[error("training diverged: at gradient step {step} the {what} is {value}")]
+    /// Something is not a number any more.
+    #[error("training diverged: at gradient step {step} {what} is {value}")]
     Diverged {
         /// The step.
         step: u64,
-        /// Which loss.
+        /// The metric.
         what: &'static str,
-        /// What it is.
+        /// Its value.
         value: f32,
     },
     /// The update failed.
@@ -98,13 +106,13 @@ pub enum TrainError {
         /// The step.
         step: u64,
         /// Why.
-        source: AgentError,
+        source: AlgorithmError,
     },
 }
 
-/// Trains until all steps are done or somebody asks to stop; at the end the last snapshot is handed over in any case.
+/// Trains until all steps are done or somebody asks to stop; at the end the last policy is handed over in any case.
 pub fn train(
-    agent: &mut dyn Trainee,
+    agent: &mut Agent,
     transitions: &Transitions,
     sampler: &mut BatchSampler,
     plan: Plan,
@@ -112,26 +120,27 @@ pub fn train(
 ) -> Result<Outcome, TrainError> {
     let start = Instant::now();
     let mut batch = Batch::default();
-    let mut mean = RowMean::default();
-    for step in 1..=plan.steps {
+    let mut mean = RowMean::new(agent.metrics());
+    while agent.step() < plan.steps {
         let begin = Instant::now();
+        let step = agent.step() + 1;
         sampler.next(transitions, &mut batch);
-        let metrics = agent.update(&batch).map_err(|source| TrainError::Update { step, source })?;
-        check_finite(step, &metrics)?;
-        outlets.metrics.observe(&metrics, begin.elapsed());
-        mean.add(&metrics);
+        let values = agent.update(&batch).map_err(|source| TrainError::Update { step, source })?;
+        check_finite(step, agent.metrics(), &values)?;
+        outlets.metrics.observe(&values, begin.elapsed());
+        mean.add(&values);
 
         let last = step == plan.steps;
         let stopped = !last && outlets.stop.load(Ordering::Relaxed);
-        if step % STEPS_PER_ROW == 0 || last || stopped {
+        if step.is_multiple_of(STEPS_PER_ROW) || last || stopped {
             // A full queue means that the disk is slow; the row is for people, training is not to wait for it.
             outlets.rows.try_send(mean.take(step, start.elapsed().as_secs_f64())).ok();
         }
-        let due = plan.eval_interval > 0 && (last || step % plan.eval_interval == 0);
+        let due = plan.eval_interval > 0 && (last || step.is_multiple_of(plan.eval_interval));
         if due || last || stopped {
             debug!(step, "snapshot");
-            let tensors = agent.target_safetensors().map_err(|source| TrainError::Update { step, source })?;
-            (outlets.snapshot)(TrainedPolicy { step, tensors, evaluate: due });
+            let policy = agent.policy().map_err(|source| TrainError::Update { step, source })?;
+            (outlets.snapshot)(TrainedPolicy { step, policy, evaluate: due });
         }
         if stopped {
             return Ok(Outcome::Stopped { step });
@@ -140,70 +149,34 @@ pub fn train(
     Ok(Outcome::Completed)
 }
 
-fn check_finite(step: u64, metrics: &StepMetrics) -> Result<(), TrainError> {
-    let losses = [
-        ("critic loss", metrics.critic_loss),
-        ("behaviour-cloning loss", metrics.bc_loss),
-        ("actor loss", metrics.actor_loss),
-    ];
-    match losses.into_iter().find(|(_, value)| !value.is_finite()) {
-        Some((what, value)) => Err(TrainError::Diverged { step, what, value }),
+fn check_finite(step: u64, metrics: &[Metric], values: &[f32]) -> Result<(), TrainError> {
+    match metrics.iter().zip(values).find(|(_, value)| !value.is_finite()) {
+        Some((metric, value)) => Err(TrainError::Diverged { step, what: metric.name, value: *value }),
         None => Ok(()),
     }
 }
 
-/// Sums in f64, in the order of `Row`'s fields.
-#[derive(Default)]
+/// Sums in f64.
 struct RowMean {
-    sums: [f64; 10],
+    metrics: &'static [Metric],
+    sums: Vec<f64>,
     count: u64,
 }
 
 impl RowMean {
-    fn add(&mut self, metrics: &StepMetrics) {
-        let values = [
-            metrics.critic_loss,
-            metrics.bc_loss,
-            metrics.actor_loss,
-            metrics.eta,
-            metrics.lambda_mean,
-            metrics.q_mean,
-            metrics.nu_squared,
-            metrics.critic_gradient_norm,
-            metrics.actor_gradient_norm,
-            metrics.learning_rate,
-        ];
+    fn new(metrics: &'static [Metric]) -> Self {
+        Self { metrics, sums: vec![0.0; metrics.len()], count: 0 }
+    }
+
+    fn add(&mut self, values: &[f32]) {
         self.count += 1;
-        self.sums.iter_mut().zip(values).for_each(|(sum, value)| *sum += f64::from(value));
+        self.sums.iter_mut().zip(values).for_each(|(sum, value)| *sum += f64::from(*value));
     }
 
     fn take(&mut self, step: u64, seconds: f64) -> Row {
-        let Self { sums, count } = std::mem::take(self);
-        let [
-            critic_loss,
-            bc_loss,
-            actor_loss,
-            eta,
-            lambda_mean,
-            q_mean,
-            nu_squared,
-            critic_gradient_norm,
-            actor_gradient_norm,
-            learning_rate,
-        ] = sums.map(|sum| (sum / count.max(1) as f64) as f32);
-        Row {
-            step,
-            seconds,
-            critic_loss,
-            bc_loss,
-            actor_loss,
-            eta,
-            lambda_mean,
-            q_mean,
-            nu_squared,
-            critic_gradient_norm,
-            actor_gradient_norm,
-            learning_rate,
-        }
+        let metrics = self.metrics;
+        let Self { sums, count, .. } = std::mem::replace(self, Self::new(metrics));
+        let values = sums.iter().map(|sum| (sum / count.max(1) as f64) as f32).collect();
+        Row { step, seconds, metrics, values }
     }
 }

@@ -78,13 +78,9 @@ pub struct DiffusionPolicy {
     critics: Ensemble,
 }
 
-/// Candidates of some states and what the critics say of them.
-struct Candidates {
-    /// `states × candidates × action_dim`.
-    actions: Vec<f32>,
-    /// Ensemble-mean value of each, `states × candidates`.
-    values: Vec<f32>,
-}
+/// Of some states: the chosen actions, `states × action_dim`; which candidates they are; and the ensemble-mean values of
+/// all candidates, `states × candidates`.
+type Choice = (Vec<f32>, Vec<usize>, Vec<f32>);
 
 impl DiffusionPolicy {
     /// What it is called on the wire.
@@ -108,23 +104,29 @@ impl DiffusionPolicy {
         Ok(Self { shape, actor, critics })
     }
 
-    /// Draws and values candidates; `noise` is `T × states × candidates × action_dim`.
-    fn candidates(&self, observations: &[f32], candidates: usize, noise: Vec<f32>) -> candle_core::Result<Candidates> {
+    /// Draws candidates, with noise `T × states × candidates × action_dim`, and chooses the best. With one candidate the
+    /// critics are not asked.
+    pub(crate) fn choose(&self, observations: &[f32], candidates: usize, noise: Vec<f32>) -> Result<Choice, PolicyError> {
         let DiffusionShape { observation_dim, action_dim, critics, diffusion_steps, .. } = self.shape;
         let states = observations.len() / observation_dim;
         let rows = states * candidates;
         let observations = Tensor::from_slice(observations, (states, observation_dim), &Device::Cpu)?;
         let noise = Tensor::from_vec(noise, (diffusion_steps, rows, action_dim), &Device::Cpu)?;
-        let actions = self.actor.sample(&observations, &noise)?;
+        let drawn = self.actor.sample(&observations, &noise)?;
         let mut values = vec![0.0; rows];
         if candidates > 1 {
-            read(&self.critics.values(&observations, &actions)?, |each: &[f32]| {
+            read(&self.critics.values(&observations, &drawn)?, |each: &[f32]| {
                 for critic in each.chunks_exact(rows) {
                     values.iter_mut().zip(critic).for_each(|(mean, q)| *mean += q / critics as f32);
                 }
             })?;
         }
-        Ok(Candidates { actions: read(&actions, <[f32]>::to_vec)?, values })
+        let chosen = values.chunks_exact(candidates).map(best).collect::<Result<Vec<_>, _>>()?;
+        let actions = read(&drawn, |drawn: &[f32]| {
+            let row = |(i, chosen): (usize, &usize)| &drawn[(i * candidates + chosen) * action_dim..][..action_dim];
+            chosen.iter().enumerate().flat_map(row).copied().collect::<Vec<f32>>()
+        })?;
+        Ok((actions, chosen, values))
     }
 }
 
@@ -141,7 +143,6 @@ impl Policy for DiffusionPolicy {
         self.shape.action_dim
     }
 
-    /// With one candidate the critics are not asked.
     fn act(
         &self,
         observations: &[f32],
@@ -149,23 +150,19 @@ impl Policy for DiffusionPolicy {
         noise: &mut [ActionNoise],
         actions: &mut [f32],
     ) -> Result<(), PolicyError> {
-        let (n, a, steps) = (noise.len(), self.shape.action_dim, self.shape.diffusion_steps);
-        let row = candidates * a;
+        let (n, steps) = (noise.len(), self.shape.diffusion_steps);
+        let row = candidates * self.shape.action_dim;
         let mut draws = vec![0.0; steps * n * row];
         for (i, stream) in noise.iter_mut().enumerate() {
             for step in 0..steps {
                 stream.fill(&mut draws[(step * n + i) * row..][..row]);
             }
         }
-        let drawn = self.candidates(observations, candidates, draws)?;
-        let choices = drawn.actions.chunks_exact(row).zip(drawn.values.chunks_exact(candidates));
-        for (action, (drawn, values)) in actions.chunks_exact_mut(a).zip(choices) {
-            action.copy_from_slice(&drawn[best(values)? * a..][..a]);
-            if action.iter().any(|x| x.is_nan()) {
-                return Err(PolicyError::NotANumber("sampled action"));
-            }
+        actions.copy_from_slice(&self.choose(observations, candidates, draws)?.0);
+        match actions.iter().any(|x| x.is_nan()) {
+            true => Err(PolicyError::NotANumber("sampled action")),
+            false => Ok(()),
         }
-        Ok(())
     }
 }
 

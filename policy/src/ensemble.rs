@@ -8,7 +8,7 @@ use crate::network::{Input, Network, TILE, part, with_workspace};
 use crate::plain;
 use crate::record::{Lent, Records, concatenate};
 use crate::rounded::RoundedOnce;
-use crate::slices::{read, slice};
+use crate::slices::{has_fast_body, read, slice};
 use crate::weights::{KeptGradient, Layout, Weights};
 use crate::Precision;
 use candle_core::{CpuStorage, CustomOp3, Result, Shape, Tensor, bail};
@@ -85,7 +85,7 @@ impl Ensemble {
         self.check(observations.dims(), actions.dims())?;
         let weights = self.weights.values();
         let gradients = (weights.track_op(), actions.track_op());
-        if !weights.device().is_cpu() || observations.track_op() || gradients == (true, true) {
+        if !has_fast_body(weights.device()) || observations.track_op() || gradients == (true, true) {
             return self.plain_outputs(observations, actions);
         }
         let own_actions = actions.rank() == 3;

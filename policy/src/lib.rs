@@ -23,6 +23,9 @@ mod diffusion;
 mod ensemble;
 mod error;
 mod gaussian;
+#[cfg(test)]
+#[allow(clippy::unwrap_used)]
+mod golden;
 mod kind;
 mod layers;
 mod network;
@@ -43,5 +46,5 @@ pub use kind::{Description, Policy, load_policy, read_tensors};
 pub use noise_predictor::{NoisePredictor, NoiseShape};
 pub use precision::Precision;
 pub use schedule::Schedule;
-pub use slices::{modify, read};
+pub use slices::{has_fast_body, modify, read};
 pub use weights::{Layout, Part, Tensors, Weights, check_finite};

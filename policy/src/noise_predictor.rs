@@ -8,7 +8,7 @@ use crate::network::{Input, Network, TILE, Workspace, part, with_workspace};
 use crate::plain;
 use crate::record::{Lent, Records, concatenate};
 use crate::rounded::RoundedOnce;
-use crate::slices::{read, slice};
+use crate::slices::{has_fast_body, read, slice};
 use crate::weights::{KeptGradient, Layout, Tensors, Weights};
 use crate::{Precision, Schedule};
 use candle_core::{CpuStorage, CustomOp3, D, DType, Result, Shape, Tensor, bail};
@@ -129,7 +129,7 @@ impl NoisePredictor {
     /// weights.
     pub fn predict(&self, observations: &Tensor, actions: &Tensor, t: &Tensor) -> Result<Tensor> {
         let weights = self.weights.values();
-        if !weights.device().is_cpu() || observations.track_op() || actions.track_op() {
+        if !has_fast_body(weights.device()) || observations.track_op() || actions.track_op() {
             return self.plain_predict(observations, actions, t);
         }
         let gradient = match (weights.track_op(), self.weights.kept_gradient()) {
@@ -153,7 +153,7 @@ impl NoisePredictor {
     /// gradient flows.
     pub fn sample(&self, observations: &Tensor, noise: &Tensor) -> Result<Tensor> {
         let weights = self.weights.values().detach();
-        if !weights.device().is_cpu() {
+        if !has_fast_body(weights.device()) {
             return self.plain_sample(observations, noise);
         }
         let rounded = match self.precision {

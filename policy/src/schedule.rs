@@ -53,14 +53,19 @@ impl Schedule {
         Ok((column(|step| step.signal)?, column(|step| step.deviation)?))
     }
 
+    /// x_0 as a predicted noise ε has it, (x_t - sqrt(1 - ᾱ_t)·ε)/sqrt(ᾱ_t), clipped to [-1, 1]; all `[rows, a]`.
+    pub fn clean(&self, t: usize, x: &Tensor, epsilon: &Tensor) -> Result<Tensor> {
+        let Step { signal, deviation, .. } = self.steps[t - 1];
+        ((x - (epsilon * f64::from(deviation))?)? * f64::from(1.0 / signal))?.clamp(-1f32, 1f32)
+    }
+
     /// x_t → x_{t-1}: the posterior's mean with x_0 clipped to [-1, 1], plus its noise for t > 1. All `[rows, a]`.
     ///
     /// `epsilon` is the predicted noise, `z` standard normal.
     pub fn reverse(&self, t: usize, x: &Tensor, epsilon: &Tensor, z: Option<&Tensor>) -> Result<Tensor> {
-        let Step { signal, deviation, from_clean, from_noisy, noise } = self.steps[t - 1];
+        let Step { from_clean, from_noisy, noise, .. } = self.steps[t - 1];
         let scale = |x: &Tensor, by: f32| x * f64::from(by);
-        let clean = scale(&(x - scale(epsilon, deviation)?)?, 1.0 / signal)?.clamp(-1f32, 1f32)?;
-        let mean = (scale(&clean, from_clean)? + scale(x, from_noisy)?)?;
+        let mean = (scale(&self.clean(t, x, epsilon)?, from_clean)? + scale(x, from_noisy)?)?;
         match z {
             Some(z) if t > 1 => mean + scale(z, noise)?,
             _ => Ok(mean),

@@ -1,6 +1,11 @@
 //! Candle's CPU tensors as slices.
 
-use candle_core::{CpuStorage, Error, InplaceOp1, Layout, Result, Storage, Tensor};
+use candle_core::{CpuStorage, Device, Error, InplaceOp1, Layout, Result, Storage, Tensor};
+
+/// Whether operations on this device run in their fast bodies: on the CPU, unless the feature `plain` says otherwise.
+pub fn has_fast_body(device: &Device) -> bool {
+    device.is_cpu() && !cfg!(feature = "plain")
+}
 
 /// The numbers behind a contiguous layout.
 pub(crate) fn slice<'a, T: candle_core::WithDType>(storage: &'a CpuStorage, layout: &Layout) -> Result<&'a [T]> {

@@ -1,7 +1,7 @@
 //! The weights of a network: one flat vector, with named tensors in it.
 
 use crate::PolicyError;
-use crate::slices::modify;
+use crate::slices::{has_fast_body, modify};
 use candle_core::backprop::GradStore;
 use candle_core::{DType, Device, Result, Tensor, Var};
 use rand::Rng;
@@ -94,7 +94,7 @@ impl Weights {
     /// Weights that gradients are taken of: a variable of candle's.
     pub fn trainable(layout: Layout, values: &Tensor) -> Result<Self> {
         let values = Var::from_tensor(values)?.into_inner();
-        let kept = if values.device().is_cpu() { Some(Arc::new(KeptGradient::new(&values)?)) } else { None };
+        let kept = if has_fast_body(values.device()) { Some(Arc::new(KeptGradient::new(&values)?)) } else { None };
         Ok(Self { layout, values, kept, changes: 0 })
     }
 

@@ -3,6 +3,7 @@
 //! that paper's; the networks are QUAD's (docs/deviations.md).
 
 #[cfg(test)]
+#[allow(clippy::unwrap_used)]
 mod golden;
 
 use super::*;

@@ -207,4 +207,5 @@ fn numbers(x: &[&Tensor]) -> Result<Vec<f32>> {
 }
 
 #[cfg(test)]
+#[allow(clippy::unwrap_used)]
 mod tests;

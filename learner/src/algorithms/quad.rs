@@ -3,6 +3,7 @@
 
 mod config;
 #[cfg(test)]
+#[allow(clippy::unwrap_used)]
 mod golden;
 
 use super::{Algorithm, AlgorithmError, Definition, Metric, Minibatch, Setting, numbers};

@@ -1,0 +1,86 @@
+//! Tests: the update against an independent implementation (docs/golden.md).
+
+use super::super::tests::{Golden, check_update, devices, golden_batch, golden_setting, golden_table, goldens};
+use super::*;
+
+fn start(golden: &Golden, device: &Device) -> Quad {
+    let config: Config = super::super::read(&golden_table(golden)).unwrap();
+    let mut quad = Quad::new(config, golden_setting(golden, device)).unwrap();
+    let mut state = golden.state.clone();
+    // Below 0: not set yet.
+    if state["nu_squared"].to_vec1::<f32>().unwrap()[0] < 0.0 {
+        state.remove("nu_squared");
+    }
+    quad.load(&mut state).unwrap();
+    assert!(state.is_empty(), "tensors that nobody reads: {:?}", state.keys());
+    quad
+}
+
+fn noise(golden: &Golden, device: &Device) -> Noise {
+    let next = golden.input("next_noise", device);
+    let (steps, b, samples, a) = next.dims4().unwrap();
+    let t: Vec<i64> = golden.inputs["t"].to_vec1().unwrap();
+    Noise {
+        next: next.reshape((steps, b * samples, a)).unwrap(),
+        t: t.into_iter().map(|t| t as u32).collect(),
+        epsilon: golden.input("epsilon", device),
+    }
+}
+
+#[test]
+fn golden_update() {
+    for golden in goldens("quad") {
+        for device in devices() {
+            let mut quad = start(&golden, &device);
+            let (batch, noise) = (golden_batch(&golden, &device), noise(&golden, &device));
+            let eta: f32 = quad.eta.to_scalar().unwrap();
+            let values = quad.step(golden.count("/step") as u64, &batch, &noise).unwrap();
+            check_update(&golden, METRICS, &values, quad.state().unwrap());
+            let value = |name: &str| values[METRICS.iter().position(|metric| metric.name == name).unwrap()];
+            let guidance_loss = value("actor_loss") - eta * value("bc_loss");
+            // A difference of two larger numbers, so relative to these.
+            let expected = golden.expected["guidance_loss"].to_vec1::<f32>().unwrap()[0];
+            let size = value("actor_loss").abs().max(eta * value("bc_loss"));
+            assert!((guidance_loss - expected).abs() < 1e-4 * size, "{guidance_loss} for {expected}");
+        }
+    }
+}
+
+#[test]
+fn golden_parts() {
+    for golden in goldens("quad") {
+        let device = Device::Cpu;
+        let mut quad = start(&golden, &device);
+        let (batch, noise) = (golden_batch(&golden, &device), noise(&golden, &device));
+        let next = quad.target_actor.sample(&batch.next_observations, &noise.next).unwrap();
+        golden.close("next_actions", &next);
+        golden.close("targets", &quad.targets(&batch, &noise).unwrap());
+        if quad.config.guidance == Guidance::None {
+            continue;
+        }
+        // Guidance comes from the target critics as the update has just moved them.
+        quad.target_critics.weights_mut().load(&mut golden.expected.clone(), "target_critic.").unwrap();
+        let (signal, deviation) = quad.actor.schedule().noising(&noise.t, &device).unwrap();
+        let noisy = (batch.actions.broadcast_mul(&signal).unwrap() + noise.epsilon.broadcast_mul(&deviation).unwrap()).unwrap();
+        golden.close("noisy_actions", &noisy);
+        let t = Tensor::new(noise.t.as_slice(), &device).unwrap();
+        let predicted = quad.actor.predict(&batch.observations, &noisy, &t).unwrap().detach();
+        let advice = quad.advice(&batch, &noisy, &predicted).unwrap();
+        golden.close("critic_action_gradients", &advice.gradients.broadcast_mul(&golden.expected["q_scale"]).unwrap());
+        golden.close("sigma_squared", &advice.variance);
+        golden.close("nu_squared", &advice.nu_squared);
+        golden.close("lambda", &advice.lambda);
+    }
+}
+
+#[test]
+fn an_infinite_temperature_is_dac() {
+    let golden = goldens("quad").into_iter().find(|golden| golden.config["agent"]["guidance"] == "quad").unwrap();
+    let [quad, dac] = [Guidance::Quad, Guidance::Dac].map(|guidance| {
+        let mut quad = start(&golden, &Device::Cpu);
+        (quad.config.guidance, quad.config.tau, quad.config.delta) = (guidance, f32::INFINITY, 1e-30);
+        let (batch, noise) = (golden_batch(&golden, &Device::Cpu), noise(&golden, &Device::Cpu));
+        quad.step(0, &batch, &noise).unwrap()
+    });
+    assert_eq!(quad, dac);
+}
