@@ -35,7 +35,7 @@ AGENT = {
     "value_learning_rate": 0.004,
     "ema_rate": 0.05,
 }
-# The spread widens the values that networks begin with, so that there are large advantages, and weights that are clipped.
+# The spread widens the values that networks begin with: there must be large advantages, and weights that are clipped.
 SIZES = {
     "narrow": {"hidden": 5, "batch_size": 23, "select": 3, "spread": 2.0},
     "small": {"hidden": 11, "batch_size": 24, "select": 6, "spread": 2.5},

@@ -1,12 +1,12 @@
 """One update of QUAD. Equation numbers are its paper's; where that is silent, the rules are DAC's (docs/golden.md)."""
 
-import math
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
+from diffusion import TIME_EMBEDDING, TIME_FEATURES, denoise, fast_noise, predict_noise, sample, schedule
 from networks import (
     ADAM,
     adam_step,
@@ -22,8 +22,6 @@ from networks import (
     single,
     values,
 )
-
-TIME_FEATURES, TIME_EMBEDDING = 16, 32
 
 # Large rates, so that a mistake in an optimiser or an average is far larger than float32's rounding.
 AGENT = {
@@ -100,51 +98,6 @@ def make_config(variant, size):
     }
 
 
-# The noise predictor and the diffusion. Arrays over t have T + 1 entries, so that index t is step t; ᾱ_0 = 1.
-
-
-def predict_noise(actor, states, noisy_actions, t):
-    """ε_θ(s, a^t, t), shapes [..., o], [..., a], [...]."""
-    frequencies = jnp.exp(-jnp.arange(8) * math.log(10_000) / 7)
-    angles = t[..., None] * frequencies
-    features = jnp.concatenate([jnp.cos(angles), jnp.sin(angles)], -1)
-    time = mlp(actor, "time.", 2, features)
-    return mlp(actor, "trunk.", 4, jnp.concatenate([states, noisy_actions, time], -1))
-
-
-fast_noise, fast_values = compiled(predict_noise), compiled(values)
-
-
-def schedule(steps):
-    t = np.arange(1, steps + 1)
-    beta = np.concatenate([[0.0], 1 - np.exp(-0.1 / steps - 0.5 * (10 - 0.1) * (2 * t - 1) / steps**2)])
-    return beta, np.cumprod(1 - beta)
-
-
-def denoise(actor, states, noisy_actions, t, steps):
-    """x0 and the mean of one reverse step at the whole number t, without its noise."""
-    beta, alpha_bar = schedule(steps)
-    epsilon = fast_noise(actor, states, noisy_actions, np.full(states.shape[:-1], t))
-    x0 = (noisy_actions - math.sqrt(1 - alpha_bar[t]) * epsilon) / math.sqrt(alpha_bar[t])
-    x0 = np.clip(x0, -1, 1)
-    of_x0 = math.sqrt(alpha_bar[t - 1]) * float(beta[t])
-    of_noisy = math.sqrt(1 - beta[t]) * float(1 - alpha_bar[t - 1])
-    return x0, (of_x0 * x0 + of_noisy * noisy_actions) / float(1 - alpha_bar[t])
-
-
-def sample(actor, states, noise):
-    """Actions for states [n, o] with noise [T, n, samples, a]; also the states, once for each action."""
-    steps = len(noise)
-    beta, _ = schedule(steps)
-    states = np.broadcast_to(states[:, None], noise.shape[1:-1] + states.shape[-1:])
-    actions = noise[0]
-    for t in range(steps, 0, -1):
-        _, actions = denoise(actor, states, actions, t, steps)
-        if t > 1:
-            actions = actions + math.sqrt(beta[t]) * noise[steps - t + 1]
-    return actions, states
-
-
 # Losses and their gradients.
 
 
@@ -170,6 +123,7 @@ def action_gradients(critics, states, actions):
     return jax.vmap(jax.grad(total, 1), (0, None))(critics, actions)
 
 
+fast_values = compiled(values)
 critic_gradient = compiled(jax.value_and_grad(critic_loss))
 actor_gradient = compiled(jax.value_and_grad(actor_loss, has_aux=True))
 
@@ -188,11 +142,11 @@ def target_values(config, state, inputs):
 
 
 def guide(config, state, inputs, noisy, target_critic):
-    """Eq. 10 and 21-24: λ [B], ḡ [B, a], and what else of them is compared or of interest."""
+    """Eq. 10 and 21-24: λ [B], ḡ [B, a], the tensors to compare, and δ's share of each row's denominator [B]."""
     agent, s, a = config["agent"], inputs["observations"], inputs["actions"]
     if agent["guidance"] == "none":
         nothing = {"nu_squared": state["nu_squared"], "lambda_mean": 0.0, "delta_share": 0.0}
-        return np.zeros(len(s)), np.zeros_like(a), nothing, np.ones(len(s))
+        return np.zeros(len(s)), np.zeros_like(a), nothing, np.zeros(len(s))
     gradients = action_gradients(target_critic, s, noisy)
     q_scale = np.abs(fast_values(target_critic, s, a)).mean() + 1e-6
     g = gradients / q_scale
