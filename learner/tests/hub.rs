@@ -8,13 +8,14 @@ use quad_learner::hub::{self, EvaluationPlan, Hub};
 use quad_learner::inbox::{Inbox, inbox};
 use quad_learner::metrics::Metrics;
 use quad_learner::notice::Notice;
+use quad_learner::agent::PolicyFile;
 use quad_learner::publisher::{self, Identity, SnapshotPublisher};
 use quad_learner::run_dir::RunDir;
 use quad_learner::scoreboard::{Rules, Scoreboard};
 use quad_learner::train::TrainedPolicy;
 use quad_learner::wire::Wire;
 use quad_protocol::{
-    EpisodeScore, Hash, Job, JobReply, JobRequest, Message, Name, Progress, RecordedScores, Schema, ScoreReply,
+    EpisodeScore, Hash, Job, JobReply, JobRequest, Message, Name, Progress, RecordedScores, ScoreReply,
     ScoreReport, Snapshot, decode, encode, keys,
 };
 use quad_service::{Endpoints, open_session};
@@ -52,7 +53,7 @@ impl Bench {
         let folder = tempfile::tempdir().unwrap();
         let run = name("bench");
         let run_dir = RunDir::create(&folder.path().join("bench"), &config()).unwrap();
-        let (metrics, _) = Metrics::new(&run, 100).unwrap();
+        let (metrics, _) = Metrics::new(&run, 100, &[]).unwrap();
         let (notify, notices) = tokio::sync::mpsc::unbounded_channel();
         let environment = quad_dataset::environment::find("hopper").unwrap();
         let rules = Rules {
@@ -68,15 +69,7 @@ impl Bench {
         let state = Hub::new(run.clone(), plan, Scoreboard::new(rules), log, metrics.clone(), notify.clone());
         let (hub, messages) = inbox();
         std::thread::spawn(move || state.run(&messages));
-        let schema = Schema {
-            environment: "hopper".into(),
-            observation_dim: 11,
-            action_dim: 3,
-            hidden: 8,
-            critics: 2,
-            diffusion_steps: 2,
-        };
-        let identity = Identity { run: run.clone(), incarnation: INCARNATION, schema };
+        let identity = Identity { run: run.clone(), incarnation: INCARNATION, environment };
         let state = SnapshotPublisher::new(identity, run_dir.clone(), metrics.clone(), hub.clone(), notify);
         let (publisher, messages) = inbox();
         std::thread::spawn(move || state.run(&messages));
@@ -93,7 +86,7 @@ impl Bench {
     }
 
     async fn snapshot(&mut self, step: u64) {
-        let policy = TrainedPolicy { step, tensors: tensors(step), evaluate: true };
+        let policy = TrainedPolicy { step, policy: PolicyFile { kind: "diffusion", bytes: tensors(step) }, evaluate: true };
         self.publisher.send(publisher::Event::Trained(policy));
         self.until(|notice| matches!(notice, Notice::Published { step: published } if *published == step)).await;
     }

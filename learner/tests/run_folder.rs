@@ -62,7 +62,7 @@ fn a_report_summarises_complete_evaluations() {
     let path = folder.path().join("a");
     write_run(&path, 3, 0.0);
     let report = RunReport::read(&path).unwrap();
-    assert_eq!((report.seed, report.guidance, report.candidates, report.dataset_score), (3, "quad", 10, 10.7));
+    assert_eq!((report.seed, &*report.variant, report.candidates, report.dataset_score), (3, "quad", 10, 10.7));
     let last = report.evaluations.last().unwrap();
     assert_eq!((last.step, last.episodes, last.complete, last.score.std), (6000, 1, false, None));
     let fifth = &report.evaluations[4];
@@ -108,7 +108,7 @@ fn a_picture_shows_the_curve_and_the_reference() {
     for text in ["<svg", "gradient steps", "dataset mean 10.7", "<polygon"] {
         assert!(one.contains(text), "{text} is missing");
     }
-    assert!(both.contains("b (guidance quad, 10 candidates)"));
+    assert!(both.contains("b (quad, 10 candidates)"));
     assert!(both.matches("<circle").count() > one.matches("<circle").count());
 }
 

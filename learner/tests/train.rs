@@ -6,10 +6,13 @@ use std::sync::atomic::AtomicBool;
 use std::sync::mpsc::{Receiver, sync_channel};
 
 use quad_dataset::{BatchSampler, D4rlWriter, Metadata, ReadOptions, RewardRule, Row, Transitions, environment};
-use quad_learner::agent::{Agent, AgentConfig};
+use candle_core::Device;
+use quad_learner::agent::Agent;
+use quad_learner::algorithms::{Setting, named};
 use quad_learner::config::{Overrides, resolve};
 use quad_learner::metrics::Metrics;
 use quad_learner::train::{self, Outcome, Outlets, Plan, TrainError, train};
+use quad_policy::Precision;
 use quad_protocol::Name;
 
 struct Result {
@@ -43,16 +46,29 @@ fn transitions() -> Transitions {
     Transitions::read(&path, &ReadOptions { environment: hopper, reward: RewardRule::Locomotion }).unwrap()
 }
 
-fn small() -> AgentConfig {
-    let demo = resolve("hopper-demo", &Overrides::default()).unwrap().agent;
-    AgentConfig { hidden: 8, critics: 2, diffusion_steps: 2, batch_size: 4, ..demo }
+/// Hyper-parameters of a preset with small networks.
+fn small(preset: &str) -> toml::Table {
+    let mut table = resolve(preset, &Overrides::default()).unwrap().agent;
+    table.insert("hidden".to_owned(), 8.into());
+    table
 }
 
-fn run(plan: Plan, config: &AgentConfig, stop: bool) -> Result {
+fn run(plan: Plan, algorithm: &str, table: &toml::Table, stop: bool) -> Result {
     let transitions = transitions();
-    let mut agent = Agent::new(config.architecture(11, 3), config, plan.steps, 0).unwrap();
-    let mut sampler = BatchSampler::new(transitions.len(), config.batch_size, 0);
-    let (metrics, _) = Metrics::new(&Name::new("run").unwrap(), plan.steps).unwrap();
+    let setting = Setting {
+        observation_dim: 11,
+        action_dim: 3,
+        batch_size: 4,
+        total_steps: plan.steps,
+        seed: 0,
+        precision: Precision::F32,
+        device: Device::Cpu,
+    };
+    let definition = named(algorithm).unwrap();
+    let start = (definition.read)(table).unwrap().start(&setting).unwrap();
+    let mut agent = Agent::new(definition, start, Device::Cpu);
+    let mut sampler = BatchSampler::new(transitions.len(), setting.batch_size, 0, 0);
+    let (metrics, _) = Metrics::new(&Name::new("run").unwrap(), plan.steps, definition.metrics).unwrap();
     // Nobody takes the rows, as with a disk that hangs: training must end all the same.
     let (sender, rows) = sync_channel(2);
     let snapshots = RefCell::new(Vec::new());
@@ -69,7 +85,7 @@ fn run(plan: Plan, config: &AgentConfig, stop: bool) -> Result {
 
 #[test]
 fn snapshots_come_at_every_interval_and_at_the_end() {
-    let result = run(Plan { steps: 25, eval_interval: 10 }, &small(), false);
+    let result = run(Plan { steps: 25, eval_interval: 10 }, "quad", &small("hopper-demo"), false);
     assert_eq!(result.outcome.unwrap(), Outcome::Completed);
     assert_eq!(result.snapshots, [(10, true), (20, true), (25, true)]);
     assert_eq!(result.metrics.training.gradient_steps.get(), 25);
@@ -78,31 +94,39 @@ fn snapshots_come_at_every_interval_and_at_the_end() {
 
 #[test]
 fn without_evaluations_the_last_snapshot_is_kept_all_the_same() {
-    let result = run(Plan { steps: 25, eval_interval: 0 }, &small(), false);
+    let result = run(Plan { steps: 25, eval_interval: 0 }, "quad", &small("hopper-demo"), false);
     assert_eq!(result.snapshots, [(25, false)]);
 }
 
 #[test]
 fn rows_average_a_hundred_steps_and_those_that_nobody_takes_are_dropped() {
-    let result = run(Plan { steps: 450, eval_interval: 0 }, &small(), false);
+    let result = run(Plan { steps: 450, eval_interval: 0 }, "quad", &small("hopper-demo"), false);
     assert_eq!(result.outcome.unwrap(), Outcome::Completed);
     let rows: Vec<_> = result.rows.try_iter().collect();
     assert_eq!(rows.iter().map(|row| row.step).collect::<Vec<_>>(), [100, 200]);
-    assert!(rows.iter().all(|row| row.eta == 1.0 && (0.0..=1.0).contains(&row.lambda_mean) && row.bc_loss > 0.0));
+    for row in rows {
+        let json = serde_json::to_value(&row).unwrap();
+        let value = |name: &str| json[name].as_f64().unwrap();
+        assert!(value("eta") == 1.0 && (0.0..=1.0).contains(&value("lambda_mean")) && value("bc_loss") > 0.0, "{json}");
+        assert_eq!(json.as_object().unwrap().len(), 2 + row.metrics.len(), "{json}");
+    }
 }
 
 #[test]
 fn a_stop_ends_after_the_step_and_keeps_what_there_is() {
-    let result = run(Plan { steps: 25, eval_interval: 10 }, &small(), true);
+    let result = run(Plan { steps: 25, eval_interval: 10 }, "quad", &small("hopper-demo"), true);
     assert_eq!(result.outcome.unwrap(), Outcome::Stopped { step: 1 });
     assert_eq!(result.snapshots, [(1, false)]);
 }
 
 #[test]
 fn divergence_is_an_error_that_says_where_and_what() {
-    let config = AgentConfig { critic_learning_rate: 1e30, gradient_clip: 1e30, ..small() };
-    let result = run(Plan { steps: 25, eval_interval: 10 }, &config, false);
-    let error = result.outcome.unwrap_err();
-    assert!(matches!(error, TrainError::Diverged { step: 1..10, .. }), "{error}");
-    assert!(result.snapshots.is_empty(), "nothing broken is handed to evaluation");
+    for (algorithm, preset) in [("quad", "hopper-demo"), ("iql", "hopper-demo-iql")] {
+        let mut table = small(preset);
+        table.insert("critic_learning_rate".to_owned(), 1e30.into());
+        let result = run(Plan { steps: 25, eval_interval: 10 }, algorithm, &table, false);
+        let error = result.outcome.unwrap_err();
+        assert!(matches!(error, TrainError::Diverged { step: 1..10, .. }), "{error}");
+        assert!(result.snapshots.is_empty(), "nothing broken is handed to evaluation");
+    }
 }

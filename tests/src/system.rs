@@ -53,12 +53,13 @@ eval_interval = {eval_interval}
 episodes = {episodes}
 candidates = {candidates}
 seed = {seed}
+batch_size = 16
+algorithm = "quad"
 
 [agent]
 hidden = {hidden}
 critics = 2
 diffusion_steps = 2
-batch_size = 16
 gamma = 0.99
 rho = 1.0
 guidance = "quad"

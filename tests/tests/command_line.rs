@@ -38,7 +38,7 @@ fn a_wrong_command_line_exits_with_2() {
         ("learner", &[][..]),
         ("learner", &["train"]),
         ("learner", &["train", "--preset", "nobody-has-this", "--dataset", "x"]),
-        ("learner", &["train", "--preset", "hopper-demo", "--dataset", "x", "--guidance", "sac"]),
+        ("learner", &["train", "--preset", "hopper-demo", "--dataset", "x", "--samples", "0"]),
         ("evaluator", &[]),
         ("evaluator", &["serve", "--name", "not a name"]),
         ("evaluator", &["serve", "--metrics", "everywhere"]),
@@ -64,6 +64,20 @@ fn a_missing_dataset_fails_with_a_hint() {
         let text = String::from_utf8_lossy(&output.stderr);
         assert_eq!(output.status.code(), Some(1), "{program} {arguments:?}: {text}");
         assert!(text.contains(dataset) && text.contains("hint:"), "{program} {arguments:?}: {text}");
+    }
+}
+
+#[test]
+fn an_algorithm_that_lacks_a_hyper_parameter_says_what_it_has() {
+    for (preset, flags, words) in [
+        ("hopper-demo", ["--guidance", "sac"], ["sac", "`dac`"]),
+        ("hopper-demo-iql", ["--guidance", "dac"], ["guidance", "`expectile`"]),
+        ("hopper-demo-iql", ["--candidates", "10"], ["candidates", "must be 1"]),
+    ] {
+        let output = run("learner", &[&["train", "--preset", preset, "--dataset", "x"][..], &flags].concat());
+        let text = String::from_utf8_lossy(&output.stderr);
+        assert_eq!(output.status.code(), Some(1), "{preset} {flags:?}: {text}");
+        assert!(words.iter().all(|word| text.contains(word)), "{preset} {flags:?}: {text}");
     }
 }
 

@@ -122,7 +122,7 @@ fn a_sampler_fills_batches_with_each_transition_once_a_pass() {
 
     let transitions = read(&path, RewardRule::AsIs);
     assert_eq!((transitions.len(), transitions.observation_dim(), transitions.action_dim()), (7, 11, 3));
-    let mut sampler = BatchSampler::new(transitions.len(), 3, 5);
+    let mut sampler = BatchSampler::new(transitions.len(), 3, 5, 0);
     let mut batch = Batch::default();
     let mut drawn = Vec::new();
     for _ in 0..7 {
