@@ -45,7 +45,7 @@ pub struct Identity {
     pub run: Name,
     /// Which start of the learner this is.
     pub incarnation: u64,
-    /// Environment and shapes.
+    /// Environment and kind of policy.
     pub schema: Schema,
 }
 

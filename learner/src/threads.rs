@@ -75,8 +75,7 @@ impl Threads {
         let (hub, hub_messages) = inbox();
         let hub_thread = spawn("hub", move || state.run(&hub_messages))?;
 
-        let identity =
-            Identity { run: run.clone(), incarnation: config.run.incarnation, schema: schema(experiment, environment) };
+        let identity = Identity { run: run.clone(), incarnation: config.run.incarnation, schema: schema(environment) };
         let state = SnapshotPublisher::new(identity, run_dir.clone(), metrics.clone(), hub.clone(), notices.clone());
         let (publisher, publisher_messages) = inbox();
         let publisher_thread = spawn("publisher", move || state.run(&publisher_messages))?;
@@ -161,15 +160,12 @@ impl Trainer {
     }
 }
 
-fn schema(experiment: &Experiment, environment: &EnvironmentSpec) -> Schema {
-    let agent = &experiment.agent;
+fn schema(environment: &EnvironmentSpec) -> Schema {
     Schema {
         environment: environment.name.to_owned(),
         observation_dim: environment.observation_dim as u32,
         action_dim: environment.action_dim as u32,
-        hidden: agent.hidden as u32,
-        critics: agent.critics as u32,
-        diffusion_steps: agent.diffusion_steps as u32,
+        policy: "diffusion".to_owned(),
     }
 }
 

@@ -68,14 +68,8 @@ impl Bench {
         let state = Hub::new(run.clone(), plan, Scoreboard::new(rules), log, metrics.clone(), notify.clone());
         let (hub, messages) = inbox();
         std::thread::spawn(move || state.run(&messages));
-        let schema = Schema {
-            environment: "hopper".into(),
-            observation_dim: 11,
-            action_dim: 3,
-            hidden: 8,
-            critics: 2,
-            diffusion_steps: 2,
-        };
+        let schema =
+            Schema { environment: "hopper".into(), observation_dim: 11, action_dim: 3, policy: "diffusion".into() };
         let identity = Identity { run: run.clone(), incarnation: INCARNATION, schema };
         let state = SnapshotPublisher::new(identity, run_dir.clone(), metrics.clone(), hub.clone(), notify);
         let (publisher, messages) = inbox();
