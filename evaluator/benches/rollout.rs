@@ -6,7 +6,7 @@ use criterion::{BatchSize, Criterion, criterion_group, criterion_main};
 use quad_dataset::environment::find;
 use quad_evaluator::environment::make;
 use quad_evaluator::rollout::Rollout;
-use quad_policy::{ActionNoise, Architecture, Parameters, Precision, TargetPolicy};
+use quad_policy::{ActionNoise, Architecture, Parameters, Policy, Precision, TargetPolicy};
 use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 use std::hint::black_box;
@@ -35,9 +35,10 @@ fn steps(criterion: &mut Criterion) {
                 |rollout| {
                     rayon::scope(|_| {
                         for _ in 0..STEPS {
-                            rollout.step(|observations, noise, actions| {
-                                policy.select(observations, CANDIDATES, noise, actions);
-                            });
+                            let act = |observations: &[f32], noise: &mut [ActionNoise], actions: &mut [f32]| {
+                                policy.act(observations, CANDIDATES, noise, actions)
+                            };
+                            rollout.step(act).expect("the policy's numbers are finite");
                         }
                     });
                     assert_eq!(rollout.environment_steps(), (EPISODES * STEPS) as u64, "an episode has ended");
@@ -60,7 +61,7 @@ fn select(criterion: &mut Criterion) {
     for (name, precision) in [("f32", Precision::F32), ("bf16", Precision::Bf16)] {
         let policy = policy(precision);
         group.bench_function(name, |bencher| {
-            bencher.iter(|| rayon::scope(|_| policy.select(&observations, CANDIDATES, &mut noise, &mut actions)));
+            bencher.iter(|| rayon::scope(|_| policy.act(&observations, CANDIDATES, &mut noise, &mut actions)));
             black_box(&actions);
         });
     }

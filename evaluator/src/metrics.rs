@@ -9,7 +9,7 @@ pub enum JobOutcome {
     Scored,
     /// It was given up: this evaluator is leaving, or the learner refused the scores or never came back.
     Abandoned,
-    /// Its weights or its environment could not be used.
+    /// Its weights or its environment could not be used, or its policy could not act.
     Failed,
 }
 

@@ -81,9 +81,13 @@ impl<N> Rollout<N> {
     ///
     /// `select` is called once, with n × observation_dim observations, the noise of the same n episodes, and the
     /// n × action_dim actions it is to fill in.
-    pub fn step(&mut self, select: impl FnOnce(&[f32], &mut [N], &mut [f32])) {
+    ///
+    /// # Errors
+    ///
+    /// That of `select`; no episode has advanced then.
+    pub fn step<E>(&mut self, select: impl FnOnce(&[f32], &mut [N], &mut [f32]) -> Result<(), E>) -> Result<(), E> {
         if self.live.is_empty() {
-            return;
+            return Ok(());
         }
         let start = Instant::now();
         self.observations.clear();
@@ -91,7 +95,7 @@ impl<N> Rollout<N> {
             self.observations.extend(episode.environment.observation().iter().map(|&value| value as f32));
         }
         self.actions.resize(self.live.len() * self.spec.action_dim, 0.0);
-        select(&self.observations, &mut self.noise, &mut self.actions);
+        select(&self.observations, &mut self.noise, &mut self.actions)?;
         let selected = Instant::now();
         self.select_time += selected - start;
 
@@ -105,6 +109,7 @@ impl<N> Rollout<N> {
         self.environment_steps += self.live.len() as u64;
         self.collect_ended();
         self.physics_time += selected.elapsed();
+        Ok(())
     }
 
     fn collect_ended(&mut self) {

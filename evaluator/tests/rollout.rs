@@ -1,6 +1,8 @@
 //! Episodes do not depend on the batch they run in, and are what stepping an environment by hand gives.
 #![allow(clippy::unwrap_used)]
 
+use std::convert::Infallible;
+
 use quad_dataset::environment::find;
 use quad_evaluator::environment::make;
 use quad_evaluator::rollout::{EpisodeOutcome, Rollout};
@@ -14,19 +16,20 @@ fn act(observation: &[f32], noise: &mut ChaCha8Rng, action: &mut [f32]) {
     }
 }
 
-fn select(observations: &[f32], noise: &mut [ChaCha8Rng], actions: &mut [f32]) {
+fn select(observations: &[f32], noise: &mut [ChaCha8Rng], actions: &mut [f32]) -> Result<(), Infallible> {
     assert_eq!(observations.len(), 11 * noise.len());
     assert_eq!(actions.len(), 3 * noise.len());
     for ((observation, noise), action) in observations.chunks(11).zip(noise).zip(actions.chunks_mut(3)) {
         act(observation, noise, action);
     }
+    Ok(())
 }
 
 fn run(seeds: &[u64]) -> Vec<EpisodeOutcome> {
     let mut rollout = Rollout::new(find("hopper").unwrap(), seeds, ChaCha8Rng::seed_from_u64).unwrap();
     let mut steps = 0;
     while !rollout.is_done() {
-        rollout.step(select);
+        rollout.step(select).unwrap();
         steps += 1;
         assert!(steps <= 1000, "an episode outlived the time limit");
     }
@@ -77,4 +80,14 @@ fn an_outcome_is_what_stepping_by_hand_gives() {
 #[test]
 fn no_seeds_are_done_at_once() {
     assert!(run(&[]).is_empty());
+}
+
+#[test]
+fn a_policy_that_fails_stops_the_batch_where_it_is() {
+    let mut rollout = Rollout::new(find("hopper").unwrap(), &[1, 2], ChaCha8Rng::seed_from_u64).unwrap();
+    rollout.step(select).unwrap();
+    assert_eq!(rollout.step(|_, _, _| Err("no action")), Err("no action"));
+    assert_eq!((rollout.environment_steps(), rollout.episodes_done()), (2, 0));
+    rollout.step(select).unwrap();
+    assert_eq!(rollout.environment_steps(), 4);
 }

@@ -47,8 +47,13 @@ pub struct Identity {
     pub run: Name,
     /// Which start of the learner this is.
     pub incarnation: u64,
+<<<<<<< HEAD
     /// Environment that the policy acts in.
     pub environment: &'static EnvironmentSpec,
+=======
+    /// Environment and kind of policy.
+    pub schema: Schema,
+>>>>>>> service
 }
 
 /// State of the thread.

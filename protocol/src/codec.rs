@@ -17,10 +17,10 @@ use bincode::error::{DecodeError, EncodeError};
 
 pub(crate) use bincode::{Decode, Encode};
 
-use crate::{Hash, JobReply, JobRequest, Name, Progress, RecordedScores, ScoreReply, ScoreReport, Snapshot};
+use crate::{Hash, JobReply, JobRequest, Name, Progress, RecordedScores, Schema, ScoreReply, ScoreReport, Snapshot};
 
 /// Version of keys, messages and encoding. Frames of another version are refused.
-pub const PROTOCOL_VERSION: u16 = 1;
+pub const PROTOCOL_VERSION: u16 = 2;
 
 const MAGIC: &[u8; 4] = b"QUAD";
 const HEADER_LENGTH: usize = MAGIC.len() + size_of::<u16>() + size_of::<u8>();
@@ -52,6 +52,14 @@ impl Message for Snapshot {
     const LIMIT: usize = LARGE;
 
     fn verify(&self) -> Result<(), CodecError> {
+        for (field, text) in [("environment", &self.schema.environment), ("policy", &self.schema.policy)] {
+            let (length, most) = (text.len(), Schema::MAX_NAME_LENGTH);
+            if length > most {
+                return Err(CodecError::Malformed(format!(
+                    "the {field} has {length} bytes, at most {most} are allowed"
+                )));
+            }
+        }
         let found = Hash::of(&self.tensors);
         if found == self.hash { Ok(()) } else { Err(CodecError::Hash { claimed: self.hash, found }) }
     }

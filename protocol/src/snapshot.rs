@@ -3,7 +3,7 @@
 use crate::codec::{Decode, Encode};
 use crate::{Hash, Name};
 
-/// What is needed beside the tensors to act with them: environment and shapes of the networks.
+/// What a snapshot says of its policy beside the tensors. The shapes of the networks are in the tensors' own file.
 #[derive(Clone, Debug, PartialEq, Eq, Encode, Decode)]
 pub struct Schema {
     /// Environment that the policy acts in.
@@ -12,15 +12,17 @@ pub struct Schema {
     pub observation_dim: u32,
     /// Numbers in an action.
     pub action_dim: u32,
-    /// Units of each hidden layer.
-    pub hidden: u32,
-    /// Critics in the ensemble (the paper's K).
-    pub critics: u32,
-    /// Denoising steps of the actor (the paper's T).
-    pub diffusion_steps: u32,
+    /// Kind of policy that the tensors are, which decides how they are acted with: e.g. `diffusion`, a diffusion policy
+    /// with critics that choose the best of several candidates, or `gaussian`.
+    pub policy: String,
 }
 
-/// Target actor and target critics of one run after one gradient step.
+impl Schema {
+    /// Most bytes in the name of an environment or of a kind of policy. Decoding refuses longer ones.
+    pub const MAX_NAME_LENGTH: usize = 64;
+}
+
+/// The policy of one run after one gradient step.
 #[derive(Clone, Debug, PartialEq, Eq, Encode, Decode)]
 pub struct Snapshot {
     /// The run.
@@ -29,10 +31,10 @@ pub struct Snapshot {
     pub incarnation: u64,
     /// Gradient steps so far.
     pub step: u64,
-    /// Environment and shapes.
+    /// Environment and kind of policy.
     pub schema: Schema,
     /// BLAKE3 hash of exactly the bytes in `tensors`. Decoding verifies it.
     pub hash: Hash,
-    /// A whole safetensors file. It is not looked into here.
+    /// A whole safetensors file with the shapes of its networks in its metadata. It is not looked into here.
     pub tensors: Vec<u8>,
 }

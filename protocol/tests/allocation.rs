@@ -63,14 +63,8 @@ fn claimed_lengths_are_not_believed() {
     let environment = || "hopper".to_owned();
     let tensors = vec![7; 100];
     let hash = Hash::of(&tensors);
-    let schema = Schema {
-        environment: environment(),
-        observation_dim: 11,
-        action_dim: 3,
-        hidden: 256,
-        critics: 10,
-        diffusion_steps: 5,
-    };
+    let schema =
+        Schema { environment: environment(), observation_dim: 11, action_dim: 3, policy: "diffusion".to_owned() };
     let episodes = vec![EpisodeScore { seed: 1, episode_return: 2.0, length: 3, score: 4.0 }; 3];
     let job = Job {
         id: 1,

@@ -20,6 +20,11 @@ fn text() -> impl Strategy<Value = String> {
     vec(any::<char>(), 0..20).prop_map(String::from_iter)
 }
 
+/// At most as long as the name of an environment or of a kind of policy may be: a character has up to four bytes.
+fn short_text() -> impl Strategy<Value = String> {
+    vec(any::<char>(), 0..=Schema::MAX_NAME_LENGTH / 4).prop_map(String::from_iter)
+}
+
 fn hash() -> impl Strategy<Value = Hash> {
     any::<[u8; 8]>().prop_map(|bytes| Hash::of(&bytes))
 }
@@ -38,10 +43,14 @@ fn episodes() -> impl Strategy<Value = Vec<EpisodeScore>> {
 }
 
 fn snapshot() -> impl Strategy<Value = Snapshot> {
-    let schema = (text(), any::<[u32; 5]>()).prop_map(|(environment, numbers)| {
-        let [observation_dim, action_dim, hidden, critics, diffusion_steps] = numbers;
-        Schema { environment, observation_dim, action_dim, hidden, critics, diffusion_steps }
-    });
+    let schema = (short_text(), any::<[u32; 2]>(), short_text()).prop_map(
+        |(environment, [observation_dim, action_dim], policy)| Schema {
+            environment,
+            observation_dim,
+            action_dim,
+            policy,
+        },
+    );
     (name(), any::<u64>(), any::<u64>(), schema, vec(any::<u8>(), 0..500)).prop_map(
         |(run, incarnation, step, schema, tensors)| Snapshot {
             run,
@@ -234,17 +243,30 @@ fn a_name_that_is_not_allowed_is_malformed() {
     assert_eq!(error.label(), "malformed");
 }
 
+fn hopper() -> Schema {
+    Schema { environment: "hopper".to_owned(), observation_dim: 11, action_dim: 3, policy: "diffusion".to_owned() }
+}
+
+#[test]
+fn a_schema_has_no_long_names() {
+    let decoded = |environment: usize, policy: usize| {
+        let schema = Schema { environment: "e".repeat(environment), policy: "p".repeat(policy), ..hopper() };
+        let tensors = vec![1, 2, 3];
+        let hash = Hash::of(&tensors);
+        let message = Snapshot { run: Name::new("run").unwrap(), incarnation: 1, step: 1, schema, hash, tensors };
+        decode::<Snapshot>(&encode(&message).unwrap())
+    };
+    assert!(decoded(64, 64).is_ok());
+    for (environment, policy, field) in [(65, 1, "environment"), (1, 65, "policy"), (1, 1 << 20, "policy")] {
+        let error = decoded(environment, policy).unwrap_err();
+        assert!(matches!(&error, CodecError::Malformed(text) if text.contains(field)), "{error}");
+    }
+}
+
 #[test]
 fn what_nobody_would_accept_is_not_sent() {
     let tensors = vec![0; Snapshot::LIMIT];
-    let schema = Schema {
-        environment: "hopper".to_owned(),
-        observation_dim: 11,
-        action_dim: 3,
-        hidden: 256,
-        critics: 10,
-        diffusion_steps: 5,
-    };
+    let schema = hopper();
     let hash = Hash::of(&tensors);
     let message = Snapshot { run: Name::new("run").unwrap(), incarnation: 1, step: 1, schema, hash, tensors };
     let error = encode(&message).unwrap_err();
@@ -255,14 +277,7 @@ fn what_nobody_would_accept_is_not_sent() {
 #[test]
 fn six_megabytes_take_milliseconds() {
     let tensors: Vec<u8> = (0..6_000_000u32).map(|i| i.wrapping_mul(2_654_435_761).to_le_bytes()[3]).collect();
-    let schema = Schema {
-        environment: "hopper".to_owned(),
-        observation_dim: 11,
-        action_dim: 3,
-        hidden: 256,
-        critics: 10,
-        diffusion_steps: 5,
-    };
+    let schema = hopper();
     let hash = Hash::of(&tensors);
     let message = Snapshot { run: Name::new("run").unwrap(), incarnation: 1, step: 1, schema, hash, tensors };
     let fastest = |work: &dyn Fn()| {

@@ -54,14 +54,8 @@ async fn haunt(session: &Session) -> impl Sized {
         job(&ghost, 1, "moon"),
         job(&Name::new("another").unwrap(), 1, "hopper"),
     ];
-    let schema = Schema {
-        environment: "hopper".to_owned(),
-        observation_dim: 11,
-        action_dim: 3,
-        hidden: 16,
-        critics: 2,
-        diffusion_steps: 2,
-    };
+    let schema =
+        Schema { environment: "hopper".to_owned(), observation_dim: 11, action_dim: 3, policy: "diffusion".to_owned() };
     let tensors = b"no tensors".to_vec();
     let hash = Hash::of(&tensors);
     let snapshot = encode(&Snapshot { run: ghost.clone(), incarnation: 1, step: 1, schema, hash, tensors }).unwrap();

@@ -4,11 +4,11 @@ use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, AtomicU32, Ordering::Relaxed};
 use std::time::{Duration, Instant};
 
+use anyhow::Context;
 use quad_dataset::environment::{self, EnvironmentSpec, UnknownEnvironment};
-use quad_policy::{ActionNoise, TargetPolicy};
+use quad_policy::{ActionNoise, Policy};
 use quad_protocol::{EpisodeScore, Job, Name};
 
-use crate::environment::EnvironmentError;
 use crate::metrics::{JobOutcome, Metrics};
 use crate::rollout::{EpisodeOutcome, Rollout};
 
@@ -69,18 +69,18 @@ pub struct Running {
     shared: Arc<Shared>,
     metrics: Metrics,
     started: Instant,
-    thread: Option<tokio::task::JoinHandle<Result<Option<Vec<EpisodeOutcome>>, EnvironmentError>>>,
+    thread: Option<tokio::task::JoinHandle<anyhow::Result<Option<Vec<EpisodeOutcome>>>>>,
 }
 
 impl Running {
     /// Starts the episodes of a checked job.
-    pub fn start(job: &Job, spec: &'static EnvironmentSpec, policy: Arc<TargetPolicy>, metrics: Metrics) -> Running {
+    pub fn start(job: &Job, spec: &'static EnvironmentSpec, policy: Arc<dyn Policy>, metrics: Metrics) -> Running {
         let shared = Arc::new(Shared::default());
         let thread = tokio::task::spawn_blocking({
             let (shared, metrics, seeds, candidates) =
                 (shared.clone(), metrics.clone(), job.seeds.clone(), job.candidates as usize);
             // On a thread of the pool: else each parallel part of each step would wake one up and wait for it.
-            move || rayon::scope(|_| roll_out(spec, &seeds, candidates, &policy, &shared, &metrics))
+            move || rayon::scope(|_| roll_out(spec, &seeds, candidates, policy.as_ref(), &shared, &metrics))
         });
         Running { shared, metrics, started: Instant::now(), thread: Some(thread) }
     }
@@ -101,7 +101,7 @@ impl Running {
                 Ok(outcomes.iter().map(episode_score).collect())
             }
             Ok(Ok(None)) => Err(anyhow::anyhow!("it was cancelled")),
-            Ok(Err(error)) => Err(error.into()),
+            Ok(Err(error)) => Err(error),
             Err(error) => Err(error.into()),
         })
     }
@@ -116,15 +116,15 @@ impl Drop for Running {
     }
 }
 
-/// Runs all episodes to their end, or gives `None` when cancelled.
+/// Runs all episodes to their end, or gives `None` when cancelled. Fails if the policy cannot act.
 fn roll_out(
     spec: &'static EnvironmentSpec,
     seeds: &[u64],
     candidates: usize,
-    policy: &TargetPolicy,
+    policy: &dyn Policy,
     shared: &Shared,
     metrics: &Metrics,
-) -> Result<Option<Vec<EpisodeOutcome>>, EnvironmentError> {
+) -> anyhow::Result<Option<Vec<EpisodeOutcome>>> {
     let mut rollout = Rollout::new(spec, seeds, ActionNoise::new)?;
     while !rollout.is_done() {
         if shared.cancelled.load(Relaxed) {
@@ -133,9 +133,9 @@ fn roll_out(
         let steps = rollout.environment_steps();
         let times = [rollout.select_time(), rollout.physics_time()];
         let done = rollout.episodes_done();
-        rollout.step(|observations, noise, actions| {
-            policy.select(observations, candidates, noise, actions);
-        });
+        rollout
+            .step(|observations, noise, actions| policy.act(observations, candidates, noise, actions))
+            .context("the policy cannot act")?;
         metrics.environment_steps.inc_by(rollout.environment_steps() - steps);
         metrics.select_seconds.inc_by((rollout.select_time() - times[0]).as_secs_f64());
         metrics.physics_seconds.inc_by((rollout.physics_time() - times[1]).as_secs_f64());

@@ -3,7 +3,7 @@
 use std::sync::{Arc, Mutex, PoisonError};
 
 use quad_dataset::environment;
-use quad_policy::{Architecture, PolicyError, Precision, TargetPolicy};
+use quad_policy::{Policy, PolicyError, Precision, load_policy};
 use quad_protocol::{Job, Name, Schema, Snapshot, decode_from, keys};
 use tokio::sync::Notify;
 use tokio::task::JoinSet;
@@ -12,9 +12,6 @@ use zenoh::Session;
 use zenoh::handlers::RingChannel;
 
 use crate::metrics::Metrics;
-
-/// Most denoising steps that are believed; the tensors' shapes do not bound them.
-const MAX_DIFFUSION_STEPS: u32 = 1_000;
 
 /// Why a snapshot does not fit the job it came for.
 #[derive(Debug, thiserror::Error)]
@@ -29,20 +26,30 @@ pub enum SnapshotError {
         /// Its value in the snapshot.
         found: String,
     },
-    /// Its numbers cannot be those of a policy for the environment.
-    #[error("the snapshot's {field} is {found}, but must be {wanted}")]
+    /// Its schema is not that of a policy for the environment.
+    #[error("the snapshot's {field} is {found}, but the environment's is {wanted}")]
     Schema {
         /// Name within the schema.
         field: &'static str,
-        /// What it is.
+        /// Its value.
         found: u32,
-        /// What it may be.
-        wanted: String,
+        /// The environment's.
+        wanted: usize,
     },
     /// This evaluator does not know the environment.
     #[error("no environment {0} here")]
     Environment(String),
-    /// Its tensors are not the schema's.
+    /// Its tensors are another policy than its schema says.
+    #[error("the snapshot says {field} {claimed}, but its tensors say {found}")]
+    Tensors {
+        /// Name within the schema.
+        field: &'static str,
+        /// Its value.
+        claimed: String,
+        /// What the tensors say.
+        found: String,
+    },
+    /// Its tensors are no policy.
     #[error(transparent)]
     Policy(#[from] PolicyError),
 }
@@ -53,19 +60,22 @@ impl SnapshotError {
         match self {
             SnapshotError::Other { .. } => "other_snapshot",
             SnapshotError::Schema { .. } | SnapshotError::Environment(_) => "schema",
-            SnapshotError::Policy(_) => "tensors",
+            SnapshotError::Tensors { .. } | SnapshotError::Policy(_) => "tensors",
         }
     }
 }
 
-/// Builds the policy of `snapshot` if it is exactly the one that `job` names. Its hash was verified by the codec.
-pub fn policy_for(job: &Job, snapshot: &Snapshot, precision: Precision) -> Result<TargetPolicy, SnapshotError> {
+/// Loads the policy of `snapshot` if it is exactly the one that `job` names. Its hash was verified by the codec.
+pub fn policy_for(job: &Job, snapshot: &Snapshot, precision: Precision) -> Result<Box<dyn Policy>, SnapshotError> {
     same("run", &job.run, &snapshot.run)?;
     same("incarnation", &job.incarnation, &snapshot.incarnation)?;
     same("step", &job.step, &snapshot.step)?;
     same("hash", &job.weights, &snapshot.hash)?;
     same("environment", &job.environment, &snapshot.schema.environment)?;
-    Ok(TargetPolicy::from_safetensors(architecture(&snapshot.schema)?, &snapshot.tensors, precision)?)
+    suits_environment(&snapshot.schema)?;
+    let policy = load_policy(&snapshot.tensors, precision)?;
+    is_as_claimed(&snapshot.schema, policy.as_ref())?;
+    Ok(policy)
 }
 
 fn same<T: PartialEq + ToString>(field: &'static str, wanted: &T, found: &T) -> Result<(), SnapshotError> {
@@ -75,30 +85,34 @@ fn same<T: PartialEq + ToString>(field: &'static str, wanted: &T, found: &T) -> 
     Err(SnapshotError::Other { field, wanted: wanted.to_string(), found: found.to_string() })
 }
 
-/// The shapes that `schema` promises, if they suit its environment.
-fn architecture(schema: &Schema) -> Result<Architecture, SnapshotError> {
+/// Checks the schema's sizes against its environment.
+fn suits_environment(schema: &Schema) -> Result<(), SnapshotError> {
     let spec =
         environment::find(&schema.environment).map_err(|_| SnapshotError::Environment(schema.environment.clone()))?;
-    let exactly = |field, found: u32, wanted: usize| {
-        let fits = found as usize == wanted;
-        if fits { Ok(wanted) } else { Err(SnapshotError::Schema { field, found, wanted: wanted.to_string() }) }
-    };
-    let at_most = |field, found: u32, most: u32| {
-        let fits = (1..=most).contains(&found);
-        if fits {
-            Ok(found as usize)
-        } else {
-            Err(SnapshotError::Schema { field, found, wanted: format!("1..={most}") })
+    for (field, found, wanted) in [
+        ("observation_dim", schema.observation_dim, spec.observation_dim),
+        ("action_dim", schema.action_dim, spec.action_dim),
+    ] {
+        if found as usize != wanted {
+            return Err(SnapshotError::Schema { field, found, wanted });
         }
-    };
-    Ok(Architecture {
-        observation_dim: exactly("observation_dim", schema.observation_dim, spec.observation_dim)?,
-        action_dim: exactly("action_dim", schema.action_dim, spec.action_dim)?,
-        // The two below are bounded by the tensors themselves: their shapes must match.
-        hidden: at_most("hidden", schema.hidden, u16::MAX.into())?,
-        critics: at_most("critics", schema.critics, u16::MAX.into())?,
-        diffusion_steps: at_most("diffusion_steps", schema.diffusion_steps, MAX_DIFFUSION_STEPS)?,
-    })
+    }
+    Ok(())
+}
+
+/// Checks the policy that the tensors gave against what the schema says of them.
+fn is_as_claimed(schema: &Schema, policy: &dyn Policy) -> Result<(), SnapshotError> {
+    let claims = [
+        ("policy", schema.policy.clone(), policy.kind().to_owned()),
+        ("observation_dim", schema.observation_dim.to_string(), policy.observation_dim().to_string()),
+        ("action_dim", schema.action_dim.to_string(), policy.action_dim().to_string()),
+    ];
+    for (field, claimed, found) in claims {
+        if claimed != found {
+            return Err(SnapshotError::Tensors { field, claimed, found });
+        }
+    }
+    Ok(())
 }
 
 /// The newest good snapshot that one run's learner published while this evaluator listened.
@@ -157,24 +171,26 @@ impl SnapshotReceiver {
 
 #[cfg(test)]
 mod tests {
-    use quad_policy::Parameters;
+    use quad_policy::{Architecture, Parameters};
     use quad_protocol::Hash;
 
     use super::*;
 
+    /// The tensors of a diffusion policy.
+    fn tensors(observation_dim: usize, action_dim: usize) -> Vec<u8> {
+        let architecture = Architecture { observation_dim, action_dim, hidden: 8, critics: 2, diffusion_steps: 5 };
+        Parameters::zeros(&architecture).to_safetensors().unwrap()
+    }
+
     fn job_and_snapshot() -> (Job, Snapshot) {
         let run = Name::new("run").unwrap();
-        let architecture =
-            Architecture { observation_dim: 11, action_dim: 3, hidden: 8, critics: 2, diffusion_steps: 5 };
-        let tensors = Parameters::zeros(&architecture).to_safetensors().unwrap();
+        let tensors = tensors(11, 3);
         let weights = Hash::of(&tensors);
         let schema = Schema {
             environment: "hopper".to_owned(),
             observation_dim: 11,
             action_dim: 3,
-            hidden: 8,
-            critics: 2,
-            diffusion_steps: 5,
+            policy: "diffusion".to_owned(),
         };
         let job = Job {
             id: 1,
@@ -211,9 +227,6 @@ mod tests {
     fn a_schema_that_does_not_suit_the_environment_is_refused() {
         assert_eq!(label(|_, snapshot| snapshot.schema.observation_dim = 17), "schema");
         assert_eq!(label(|_, snapshot| snapshot.schema.action_dim = 6), "schema");
-        assert_eq!(label(|_, snapshot| snapshot.schema.hidden = 0), "schema");
-        assert_eq!(label(|_, snapshot| snapshot.schema.critics = u32::MAX), "schema");
-        assert_eq!(label(|_, snapshot| snapshot.schema.diffusion_steps = u32::MAX), "schema");
         let moon = |job: &mut Job, snapshot: &mut Snapshot| {
             job.environment = "moon".to_owned();
             snapshot.schema.environment = "moon".to_owned();
@@ -222,12 +235,10 @@ mod tests {
     }
 
     #[test]
-    fn a_schema_larger_than_its_tensors_costs_no_memory() {
-        let petabytes = |_: &mut Job, snapshot: &mut Snapshot| {
-            snapshot.schema.hidden = u16::MAX.into();
-            snapshot.schema.critics = u16::MAX.into();
-        };
-        assert_eq!(label(petabytes), "tensors");
+    fn tensors_that_are_another_policy_than_the_schema_says_are_refused() {
+        assert_eq!(label(|_, snapshot| snapshot.schema.policy = "gaussian".to_owned()), "tensors");
+        assert_eq!(label(|_, snapshot| snapshot.tensors = tensors(17, 3)), "tensors");
+        assert_eq!(label(|_, snapshot| snapshot.tensors = tensors(11, 6)), "tensors");
         assert_eq!(label(|_, snapshot| snapshot.tensors.truncate(100)), "tensors");
     }
 }

@@ -6,7 +6,7 @@ use std::time::{Duration, Instant};
 
 use anyhow::Context;
 use quad_dataset::environment::EnvironmentSpec;
-use quad_policy::{Precision, TargetPolicy};
+use quad_policy::{Policy, Precision};
 use quad_protocol::{EpisodeScore, Hash, Job, Name, Progress, ScoreReport};
 use tokio::sync::{Notify, watch};
 use tracing::{info, warn};
@@ -36,7 +36,7 @@ pub struct Worker {
     gone: BTreeMap<RunKey, Instant>,
     snapshot_arrived: Arc<Notify>,
     /// The policy of the last job: the next one is often about the same.
-    policy: Option<(Hash, Arc<TargetPolicy>)>,
+    policy: Option<(Hash, Arc<dyn Policy>)>,
 }
 
 impl Worker {
@@ -171,7 +171,7 @@ impl Worker {
     }
 
     /// The policy that `job` names, from the last job or from a snapshot.
-    async fn policy(&mut self, job: &Job, run: &RunClient) -> anyhow::Result<Arc<TargetPolicy>> {
+    async fn policy(&mut self, job: &Job, run: &RunClient) -> anyhow::Result<Arc<dyn Policy>> {
         if let Some((_, policy)) = self.policy.as_ref().filter(|(weights, _)| *weights == job.weights) {
             return Ok(policy.clone());
         }
@@ -183,7 +183,7 @@ impl Worker {
             move || policy_for(&job, &snapshot, precision)
         });
         let policy = built.await?.inspect_err(|error| self.metrics.rejected(error.label()))?;
-        Ok(self.policy.insert((job.weights, Arc::new(policy))).1.clone())
+        Ok(self.policy.insert((job.weights, Arc::from(policy))).1.clone())
     }
 
     /// Runs the episodes, and reports progress to the learner as long as there is any: a stuck simulation loses its lease.
@@ -191,7 +191,7 @@ impl Worker {
         &self,
         job: &Job,
         spec: &'static EnvironmentSpec,
-        policy: Arc<TargetPolicy>,
+        policy: Arc<dyn Policy>,
         run: &RunClient,
     ) -> anyhow::Result<Vec<EpisodeScore>> {
         let heartbeat = HEARTBEAT.min(Duration::from_millis(job.lease_milliseconds / 3)).max(HEARTBEAT / 20);
