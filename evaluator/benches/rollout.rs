@@ -2,11 +2,15 @@
 
 #![allow(clippy::expect_used)] // what cannot be had ends the run
 
+use candle_core::Device;
 use criterion::{BatchSize, Criterion, criterion_group, criterion_main};
 use quad_dataset::environment::find;
 use quad_evaluator::environment::make;
 use quad_evaluator::rollout::Rollout;
-use quad_policy::{ActionNoise, Architecture, Parameters, Policy, Precision, TargetPolicy};
+use quad_policy::{
+    ActionNoise, Description, DiffusionPolicy, DiffusionShape, Ensemble, Layout, NoisePredictor, Policy, Precision,
+    Weights, load_policy,
+};
 use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 use std::hint::black_box;
@@ -15,11 +19,21 @@ const EPISODES: usize = 10;
 const CANDIDATES: usize = 10;
 /// Steps from the episodes' beginning, few enough that none falls over.
 const STEPS: usize = 4;
-const PAPER: Architecture =
-    Architecture { observation_dim: 11, action_dim: 3, hidden: 256, critics: 10, diffusion_steps: 5 };
+const PAPER: DiffusionShape =
+    DiffusionShape { observation_dim: 11, action_dim: 3, hidden: 256, critics: 10, diffusion_steps: 5 };
 
-fn policy(precision: Precision) -> TargetPolicy {
-    TargetPolicy::new(Parameters::initialise(&PAPER, &mut ChaCha8Rng::seed_from_u64(0)), precision)
+/// A policy with random weights, as an evaluator gets it.
+fn policy(precision: Precision) -> Box<dyn Policy> {
+    let mut generator = ChaCha8Rng::seed_from_u64(0);
+    let mut weights = |layout: Layout| {
+        let values = Weights::initial(&layout, &mut generator, &Device::Cpu).expect("weights");
+        Weights::constant(layout, values)
+    };
+    let actor = NoisePredictor::new(PAPER.actor(), weights(PAPER.actor().layout()), Precision::F32);
+    let critics = Ensemble::new(PAPER.critics(), weights(PAPER.critics().layout()), Precision::F32);
+    let tensors = DiffusionPolicy::tensors(&actor, &critics).expect("tensors");
+    let bytes = Description::Diffusion(PAPER).to_safetensors(&tensors).expect("finite weights");
+    load_policy(&bytes, precision).expect("what was just written")
 }
 
 /// Four steps of ten episodes; a policy call and a control period each.

@@ -3,16 +3,18 @@
 
 #![allow(clippy::expect_used)] // what cannot be had ends the run
 
+use candle_core::{Result, Tensor, Var};
 use criterion::measurement::WallTime;
 use criterion::{BenchmarkGroup, Criterion, criterion_group, criterion_main};
 use gemm::{Parallelism, gemm};
 use quad_dataset::Batch;
-use quad_learner::agent::adam::{AdamStep, adam, ema, reduce};
-use quad_learner::agent::{AgentConfig, EtaConfig, Guidance, Moments, TargetReduce};
+use quad_kernels::activation::{mish_in_place, mish_slope};
+use quad_learner::agent::Agent;
+use quad_learner::algorithms::Setting;
+use quad_learner::config::{Experiment, Overrides, resolve};
 use quad_learner::device::Device;
-use quad_policy::{
-    CriticEnsemble, NoisePredictor, NoisyActions, Parameters, Precision, StateActions, mish_in_place, mish_slope,
-};
+use quad_learner::optimiser::{Adam, AdamStep, follow};
+use quad_policy::{DiffusionShape, Ensemble, Layout, NoisePredictor, Precision, Weights};
 use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 use rayon::prelude::*;
@@ -21,43 +23,39 @@ use std::time::Duration;
 /// Hopper's observation and action.
 const DIMS: (usize, usize) = (11, 3);
 
-fn config(hidden: usize, critics: usize, samples: usize, threshold: Option<f32>, precision: Precision) -> AgentConfig {
-    AgentConfig {
-        hidden,
-        critics,
-        diffusion_steps: 5,
-        batch_size: 256,
-        gamma: 0.99,
-        rho: 1.0,
-        guidance: Guidance::Quad,
-        tau: 1.0,
-        delta: 1e-8,
-        samples,
-        target_reduce: TargetReduce::Mean,
-        eta: EtaConfig { initial: 1.0, threshold, rate: 0.001, minimum: 0.001, maximum: 100.0 },
-        actor_learning_rate: 3e-4,
-        critic_learning_rate: 3e-4,
-        gradient_clip: 1.0,
-        ema_rate: 0.005,
-        nu_ema_rate: 0.005,
-        actor_ema_every: 5,
-        actor_ema_start: 0,
-        precision,
-    }
+/// The configurations that are measured: preset, and next actions sampled per state. deploy/bench/bench.py knows their
+/// shapes.
+const CONFIGURATIONS: [(&str, &str, Option<u32>); 4] = [
+    ("paper, 10 samples", "hopper-medium-replay-v2", Some(10)),
+    ("paper, 1 sample", "hopper-medium-replay-v2", Some(1)),
+    ("demo", "hopper-demo", Some(1)),
+    ("demo, IQL", "hopper-demo-iql", None),
+];
+
+fn experiment(preset: &str, samples: Option<u32>) -> Experiment {
+    resolve(preset, &Overrides { samples, ..Overrides::default() }).expect("a preset")
 }
 
-/// The configurations that are measured, all but the precision; deploy/bench/bench.py knows their shapes.
-fn configurations(precision: Precision) -> [(&'static str, AgentConfig); 3] {
-    [
-        ("paper, 10 samples", config(256, 10, 10, Some(1.0), precision)),
-        ("paper, 1 sample", config(256, 10, 1, Some(1.0), precision)),
-        ("demo", config(128, 5, 1, None, precision)),
-    ]
+fn setting(experiment: &Experiment, precision: Precision, device: Device) -> Setting {
+    Setting {
+        observation_dim: DIMS.0,
+        action_dim: DIMS.1,
+        batch_size: experiment.batch_size as usize,
+        total_steps: 1_000_000,
+        seed: 0,
+        precision,
+        device: device.open().expect("a device"),
+    }
 }
 
 fn numbers(len: usize) -> Vec<f32> {
     let mut generator = ChaCha8Rng::seed_from_u64(len as u64);
     (0..len).map(|_| generator.random_range(-1.0..1.0)).collect()
+}
+
+fn tensor(shape: &[usize]) -> Tensor {
+    let numbers = numbers(shape.iter().product());
+    Tensor::from_vec(numbers, shape, &candle_core::Device::Cpu).expect("a tensor")
 }
 
 fn batch(size: usize) -> Batch {
@@ -81,23 +79,25 @@ fn updates(criterion: &mut Criterion) {
     for (group, device, precision) in groups {
         let mut group = criterion.benchmark_group(group);
         group.sample_size(20);
-        for (name, config) in configurations(precision) {
-            let architecture = config.architecture(DIMS.0, DIMS.1);
-            let mut agent =
-                device.agent(architecture, &config, 1_000_000, 0).expect("a usable configuration and device");
-            let batch = batch(config.batch_size);
+        for (name, preset, samples) in CONFIGURATIONS {
+            let experiment = experiment(preset, samples);
+            let setting = setting(&experiment, precision, device);
+            let algorithm = experiment.hyperparameters().and_then(|read| {
+                let started = read.start(&setting).expect("a usable configuration and device");
+                Ok(Agent::new(experiment.definition()?, started, setting.device.clone()))
+            });
+            let mut agent = algorithm.expect("a resolved experiment");
+            let batch = batch(setting.batch_size);
             group.bench_function(name, |bencher| bencher.iter(|| agent.update(&batch).expect("a step")));
         }
         group.finish();
     }
 }
 
-/// All threads at once, each on a tile of its own: 128 rows through a layer of 256, 1,000 times; and as many of the
-/// activations that follow.
+/// Products and activations per second, on all threads: 1000 tiles of 128 × 256 on each.
 fn peaks(criterion: &mut Criterion) {
-    const REPEAT: usize = 1_000;
-    let (rows, width) = (128, 256);
-    let threads = 0..rayon::current_num_threads();
+    const REPEAT: usize = 1000;
+    let (rows, width, threads) = (128, 256, 0..rayon::current_num_threads());
     let mut group = criterion.benchmark_group("peak");
     group.sample_size(10);
     let mut tiles: Vec<_> =
@@ -128,75 +128,76 @@ fn peaks(criterion: &mut Criterion) {
     group.finish();
 }
 
-/// What an update consists of, in its order, each by itself.
+/// What QUAD's update consists of, in its order, each by itself.
 fn parts(criterion: &mut Criterion) {
-    for (name, config) in configurations(Precision::F32) {
+    for (name, preset, samples) in CONFIGURATIONS {
+        let Some(samples) = samples else { continue };
         let mut group = criterion.benchmark_group(name);
         group.sample_size(20).measurement_time(Duration::from_secs(2)).warm_up_time(Duration::from_millis(500));
-        parts_of(&mut group, &config);
+        parts_of(&mut group, &experiment(preset, Some(samples)), samples as usize).expect("candle works");
         group.finish();
     }
 }
 
 /// Benchmarks `work` on a thread of the pool, as an update runs.
-fn bench(group: &mut BenchmarkGroup<'_, WallTime>, name: &str, mut work: impl FnMut() + Send) {
-    group.bench_function(name, |bencher| bencher.iter(|| rayon::scope(|_| work())));
+fn bench<R: Send>(group: &mut BenchmarkGroup<'_, WallTime>, name: &str, mut work: impl FnMut() -> Result<R> + Send) {
+    group.bench_function(name, |bencher| bencher.iter(|| rayon::scope(|_| work()).expect("candle works")));
 }
 
-fn parts_of(group: &mut BenchmarkGroup<'_, WallTime>, config: &AgentConfig) {
-    let architecture = config.architecture(DIMS.0, DIMS.1);
-    let mut weights = Parameters::initialise(&architecture, &mut ChaCha8Rng::seed_from_u64(0));
-    let mut target = weights.clone();
-    let (actor, critics) = (NoisePredictor::new(&architecture), CriticEnsemble::new(&architecture));
-    let (b, a, samples) = (config.batch_size, DIMS.1, config.samples);
-    let Batch { observations, actions, rewards, next_observations, .. } = batch(b);
-    // As they are.
-    let plain = (actor.round(&target.actor, Precision::F32), critics.round(&target.critics, Precision::F32));
+fn parts_of(group: &mut BenchmarkGroup<'_, WallTime>, experiment: &Experiment, samples: usize) -> Result<()> {
+    let count = |name: &str| experiment.agent[name].as_integer().expect("a whole number") as usize;
+    let (b, k, steps) = (experiment.batch_size as usize, count("critics"), count("diffusion_steps"));
+    let (observation_dim, action_dim) = DIMS;
+    let shape =
+        DiffusionShape { observation_dim, action_dim, hidden: count("hidden"), critics: k, diffusion_steps: steps };
+    let weights = |layout: Layout| {
+        let values = Weights::initial(&layout, &mut ChaCha8Rng::seed_from_u64(0), &candle_core::Device::Cpu)?;
+        Weights::trainable(layout, &values)
+    };
+    let (actor, critics) = (weights(shape.actor().layout())?, weights(shape.critics().layout())?);
+    let (mut actor_adam, mut critic_adam) = (Adam::new(&actor)?, Adam::new(&critics)?);
+    let mut target_actor = NoisePredictor::new(shape.actor(), actor.copy()?, Precision::F32);
+    let mut target_critics = Ensemble::new(shape.critics(), critics.copy()?, Precision::F32);
+    let mut actor = NoisePredictor::new(shape.actor(), actor, Precision::F32);
+    let mut critics = Ensemble::new(shape.critics(), critics, Precision::F32);
+    let (observations, actions) = (tensor(&[b, observation_dim]), tensor(&[b, action_dim]));
+    let (noise, targets) = (tensor(&[steps, b * samples, action_dim]), tensor(&[b]));
 
-    let (noise, mut sampled) = (numbers(config.diffusion_steps * b * samples * a), vec![0.0; b * samples * a]);
-    let sample = |out: &mut [f32]| actor.sample(&target.actor, &plain.0, &next_observations, samples, &noise, out);
-    bench(group, "sampled next actions", || sample(&mut sampled));
-    let mut values = vec![0.0; config.critics * b * samples];
-    let next = StateActions { observations: &next_observations, actions: &sampled, repeat: samples };
-    bench(group, "target critics", || critics.values(&target.critics, &plain.1, next, &mut values));
-    let len = critics.parameters();
-    let mut gradient = vec![0.0; critics.gradient_tiles(b) * len];
-    bench(group, "critic step", || {
-        critics.regress(&weights.critics, &observations, &actions, &rewards, 1e-3, &mut gradient);
-    });
-    let mut moments = Moments::zeros(len);
-    let step = AdamStep { learning_rate: 1e-9, clip: 1.0, count: 1 };
-    bench(group, "critic optimiser", || {
-        let norm = reduce(&mut gradient, len);
-        adam(step, norm, &mut weights.critics, &mut moments, &gradient[..len]);
-    });
-    bench(group, "critic EMA", || ema(&mut target.critics, &weights.critics, 0.005));
-
-    let data = StateActions { observations: &observations, actions: &actions, repeat: 1 };
-    bench(group, "Q-gradients' scale", || {
-        critics.values(&target.critics, &plain.1, data, &mut values[..config.critics * b])
-    });
-    let mut gradients = vec![0.0; config.critics * b * a];
+    bench(group, "sampled next actions", || target_actor.sample(&observations, &noise));
+    let next = target_actor.sample(&observations, &noise)?;
+    bench(group, "target critics", || target_critics.values(&observations, &next));
+    let regress = |critics: &Ensemble| {
+        let q = critics.values(&observations, &actions)?;
+        q.broadcast_sub(&targets)?.sqr()?.mean_all()?.backward()
+    };
+    // The gradient is asked for as the optimiser does, which also readies its memory for the next pass.
+    bench(group, "critic step", || critics.weights().gradient(&regress(&critics)?));
+    let step = AdamStep { rate: 1e-9, clip: Some(1.0), count: 1 };
+    let gradient = critics.weights().gradient(&regress(&critics)?)?.copy()?;
+    bench(group, "critic optimiser", || critic_adam.descend(critics.weights_mut(), &gradient, step));
+    bench(group, "critic EMA", || follow(target_critics.weights_mut(), critics.weights(), 0.005));
+    bench(group, "Q-gradients' scale", || target_critics.values(&observations, &actions));
     bench(group, "Q-gradients", || {
-        critics.action_gradients(&target.critics, &observations, &actions, &mut gradients);
+        let each = Var::from_tensor(&actions.broadcast_left(k)?)?;
+        Ok(target_critics.values(&observations, &each)?.sum_all()?.backward()?.remove(&each))
     });
-    let t: Vec<usize> = (0..b).map(|i| i % config.diffusion_steps + 1).collect();
-    let noisy = NoisyActions { observations: &observations, actions: &actions, t: &t };
-    let (mut predicted, mut gradient) = (vec![0.0; b * a], vec![0.0; weights.actor.len()]);
-    let mut moments = Moments::zeros(weights.actor.len());
+    let t = Tensor::from_iter((0..b).map(|i| (i % steps + 1) as u32), observations.device())?;
+    let clone = |actor: &NoisePredictor| actor.predict(&observations, &actions, &t)?.sqr()?.mean_all()?.backward();
+    let threshold = experiment.agent["eta"].get("threshold").is_some();
     bench(group, "actor step", || {
-        let recording = actor.record(&weights.actor, noisy, &mut predicted);
-        actor.differentiate(&weights.actor, noisy, recording, &actions, &mut gradient);
+        let gradient = actor.weights().gradient(&clone(&actor)?)?;
         // Again for η, with the new weights.
-        if config.eta.threshold.is_some() {
-            actor.predict(&weights.actor, noisy, &mut predicted);
+        if threshold {
+            actor.frozen().predict(&observations, &actions, &t)?;
         }
+        Ok(gradient)
     });
+    let gradient = actor.weights().gradient(&clone(&actor)?)?.copy()?;
     bench(group, "actor optimiser and EMA", || {
-        let norm = reduce(&mut gradient, weights.actor.len());
-        adam(step, norm, &mut weights.actor, &mut moments, &gradient);
-        ema(&mut target.actor, &weights.actor, 0.005);
+        actor_adam.descend(actor.weights_mut(), &gradient, step)?;
+        follow(target_actor.weights_mut(), actor.weights(), 0.005)
     });
+    Ok(())
 }
 
 criterion_group!(benches, peaks, updates, parts);

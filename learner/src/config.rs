@@ -285,10 +285,15 @@ mod tests {
     #[test]
     fn the_papers_preset_holds_the_papers_numbers() {
         let paper = resolve("hopper-medium-replay-v2", &Overrides::default()).unwrap();
-        let number = |key: &str| paper.agent[key].as_float().unwrap_or_else(|| paper.agent[key].as_integer().unwrap() as f64);
-        let keys = ["diffusion_steps", "critics", "hidden", "rho", "tau", "actor_learning_rate", "critic_learning_rate"];
+        let number =
+            |key: &str| paper.agent[key].as_float().unwrap_or_else(|| paper.agent[key].as_integer().unwrap() as f64);
+        let keys =
+            ["diffusion_steps", "critics", "hidden", "rho", "tau", "actor_learning_rate", "critic_learning_rate"];
         assert_eq!(keys.map(number), [5.0, 10.0, 256.0, 1.5, 0.1, 3e-4, 3e-4]);
-        assert_eq!((number("ema_rate"), paper.agent["eta"]["threshold"].as_float(), paper.batch_size), (5e-3, Some(1.0), 256));
+        assert_eq!(
+            (number("ema_rate"), paper.agent["eta"]["threshold"].as_float(), paper.batch_size),
+            (5e-3, Some(1.0), 256)
+        );
         assert_eq!((paper.steps, paper.eval_interval, paper.episodes, paper.candidates), (2_000_000, 20_000, 10, 10));
     }
 
@@ -304,7 +309,10 @@ mod tests {
         let preset = resolve("hopper-demo", &Overrides::default()).unwrap();
         let resolved = resolve("hopper-demo", &overrides).unwrap();
         assert_eq!((resolved.steps, resolved.eval_interval, resolved.seed), (5, 0, preset.seed));
-        assert_eq!((resolved.agent["guidance"].as_str(), resolved.agent["samples"].as_integer()), (Some("none"), Some(7)));
+        assert_eq!(
+            (resolved.agent["guidance"].as_str(), resolved.agent["samples"].as_integer()),
+            (Some("none"), Some(7))
+        );
     }
 
     #[test]

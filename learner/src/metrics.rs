@@ -98,11 +98,7 @@ fn full(name: &str) -> String {
 
 impl Metrics {
     /// Makes them all, in a registry that labels each with the run.
-    pub fn new(
-        run: &Name,
-        target_steps: u64,
-        measured: &'static [Metric],
-    ) -> prometheus::Result<(Self, Registry)> {
+    pub fn new(run: &Name, target_steps: u64, measured: &'static [Metric]) -> prometheus::Result<(Self, Registry)> {
         let labels = HashMap::from([("run".to_owned(), run.to_string())]);
         let registry = Registry::new_custom(None, Some(labels))?;
         registry.register(Box::new(ProcessCollector::for_self()))?;
@@ -120,7 +116,7 @@ impl Metrics {
                 .collect::<prometheus::Result<_>>()?,
         };
         training.gradient_steps_target.set(i64::try_from(target_steps).unwrap_or(i64::MAX));
-        let outcomes = Opts::new(full("jobs_total"), "Evaluation jobs by what became of them");
+        let outcomes = Opts::new(full("jobs_total"), "Evaluation jobs by outcome");
         let jobs = make.add(IntCounterVec::new(outcomes, &["outcome"]))?;
         let evaluation = EvaluationMetrics {
             snapshots_published: make.counter("snapshots_published_total", "Snapshots handed to evaluation")?,
@@ -203,7 +199,8 @@ mod tests {
     #[test]
     fn every_series_carries_the_run_and_a_help_text() {
         let run = Name::new("a-run").unwrap();
-        let (metrics, registry) = Metrics::new(&run, 10).unwrap();
+        let measured = crate::algorithms::ALGORITHMS[0].metrics;
+        let (metrics, registry) = Metrics::new(&run, 10, measured).unwrap();
         metrics.reject("truncated");
         let progress = Progress {
             evaluator: Name::new("e1").unwrap(),

@@ -32,9 +32,14 @@ impl Adam {
     /// Moves the weights down the loss that `gradients` are of. Gives the gradient's norm before clipping, `[]`.
     pub fn step(&mut self, weights: &mut Weights, gradients: &GradStore, step: AdamStep) -> Result<Tensor> {
         let gradient = weights.gradient(gradients)?;
+        self.descend(weights, &gradient, step)
+    }
+
+    /// [`Self::step`] along a gradient.
+    pub fn descend(&mut self, weights: &mut Weights, gradient: &Tensor, step: AdamStep) -> Result<Tensor> {
         match has_fast_body(gradient.device()) {
-            true => self.fused_step(weights, &gradient, step),
-            false => self.plain_step(weights, &gradient, step),
+            true => self.fused_step(weights, gradient, step),
+            false => self.plain_step(weights, gradient, step),
         }
     }
 
@@ -56,16 +61,15 @@ impl Adam {
     }
 
     fn plain_step(&mut self, weights: &mut Weights, gradient: &Tensor, step: AdamStep) -> Result<Tensor> {
-        let [beta1, beta2] = [BETA1, BETA2].map(f64::from);
         let size = gradient.sqr()?.sum_all()?.sqrt()?;
         let gradient = match step.clip {
             Some(clip) => gradient.broadcast_mul(&(size.recip()? * f64::from(clip))?.minimum(1f32)?)?,
             None => gradient.clone(),
         };
-        let first = ((self.moments.get(0)? * beta1)? + (&gradient * (1.0 - beta1))?)?;
-        let second = ((self.moments.get(1)? * beta2)? + (gradient.sqr()? * (1.0 - beta2))?)?;
-        let unbiased = (&first / (1.0 - beta1.powf(step.count as f64)))?;
-        let deviation = (&second / (1.0 - beta2.powf(step.count as f64)))?.sqrt()?;
+        let first = ((self.moments.get(0)? * BETA1)? + (&gradient * (1.0 - BETA1))?)?;
+        let second = ((self.moments.get(1)? * BETA2)? + (gradient.sqr()? * (1.0 - BETA2))?)?;
+        let unbiased = (&first / (1.0 - BETA1.powf(step.count as f64)))?;
+        let deviation = (&second / (1.0 - BETA2.powf(step.count as f64)))?.sqrt()?;
         let change = ((unbiased / (deviation + f64::from(EPSILON))?)? * f64::from(step.rate))?;
         self.moments = Tensor::stack(&[first, second], 0)?;
         weights.change(|weights| weights.slice_set(&(weights - change)?, 0, 0))?;
@@ -83,7 +87,12 @@ impl Adam {
     ///
     /// # Errors
     /// A moment that is missing or does not fit.
-    pub fn load(&mut self, weights: &Weights, tensors: &mut Tensors, name: &str) -> std::result::Result<(), PolicyError> {
+    pub fn load(
+        &mut self,
+        weights: &Weights,
+        tensors: &mut Tensors,
+        name: &str,
+    ) -> std::result::Result<(), PolicyError> {
         let first = weights.layout().join(tensors, &format!("adam_m.{name}"))?;
         let second = weights.layout().join(tensors, &format!("adam_v.{name}"))?;
         self.moments = Tensor::stack(&[first, second], 0)?.to_device(self.moments.device())?;
@@ -100,7 +109,8 @@ pub fn follow(target: &mut Weights, online: &Weights, rate: f32) -> Result<()> {
         })?;
     }
     let online = online.detach();
-    target.change(|target| target.slice_set(&((target * (1.0 - f64::from(rate)))? + (online * f64::from(rate))?)?, 0, 0))
+    target
+        .change(|target| target.slice_set(&((target * (1.0 - f64::from(rate)))? + (online * f64::from(rate))?)?, 0, 0))
 }
 
 /// A factor that falls from 1 at step 0 to 0 at `total` along a cosine.

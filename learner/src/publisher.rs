@@ -14,12 +14,12 @@ use zenoh::bytes::ZBytes;
 use zenoh::pubsub::Publisher;
 use zenoh::query::Query;
 
+use crate::agent::PolicyFile;
 use crate::hub;
 use crate::inbox::{Inbox, Messages};
 use crate::metrics::Metrics;
 use crate::notice::Notice;
 use crate::run_dir::RunDir;
-use crate::agent::PolicyFile;
 use crate::train::TrainedPolicy;
 
 /// Longest wait for a message. The thread does nothing between messages, so the value does not matter.
@@ -47,13 +47,8 @@ pub struct Identity {
     pub run: Name,
     /// Which start of the learner this is.
     pub incarnation: u64,
-<<<<<<< HEAD
     /// Environment that the policy acts in.
     pub environment: &'static EnvironmentSpec,
-=======
-    /// Environment and kind of policy.
-    pub schema: Schema,
->>>>>>> service
 }
 
 /// State of the thread.

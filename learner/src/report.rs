@@ -241,8 +241,7 @@ impl Report {
 
     fn summary(&self) -> String {
         let mut text = String::from("Over seeds (mean ± standard deviation of the runs):\n\n");
-        let header =
-            ["preset", "algorithm", "candidates", "steps", "runs", "last 3", "last 5"].map(str::to_owned);
+        let header = ["preset", "algorithm", "candidates", "steps", "runs", "last 3", "last 5"].map(str::to_owned);
         let cell = |value: Option<Spread>| value.map_or_else(|| "-".to_owned(), spread);
         let rows = self.groups.iter().map(|g| {
             let (candidates, steps, runs) = (g.candidates.to_string(), g.steps.to_string(), g.seeds.len().to_string());

@@ -77,12 +77,7 @@ impl Threads {
         let (hub, hub_messages) = inbox();
         let hub_thread = spawn("hub", move || state.run(&hub_messages))?;
 
-<<<<<<< HEAD
-        let identity =
-            Identity { run: run.clone(), incarnation: config.run.incarnation, environment };
-=======
-        let identity = Identity { run: run.clone(), incarnation: config.run.incarnation, schema: schema(environment) };
->>>>>>> service
+        let identity = Identity { run: run.clone(), incarnation: config.run.incarnation, environment };
         let state = SnapshotPublisher::new(identity, run_dir.clone(), metrics.clone(), hub.clone(), notices.clone());
         let (publisher, publisher_messages) = inbox();
         let publisher_thread = spawn("publisher", move || state.run(&publisher_messages))?;
@@ -160,8 +155,7 @@ impl Trainer {
         };
         let algorithm = experiment.hyperparameters()?.start(&setting)?;
         let mut agent = Agent::new(experiment.definition()?, algorithm, setting.device.clone());
-        let mut sampler =
-            BatchSampler::new(self.transitions.len(), setting.batch_size, experiment.seed, agent.step());
+        let mut sampler = BatchSampler::new(self.transitions.len(), setting.batch_size, experiment.seed, agent.step());
         let outlets = Outlets {
             metrics: self.metrics,
             rows: self.rows,
@@ -177,18 +171,6 @@ impl Trainer {
     }
 }
 
-<<<<<<< HEAD
-=======
-fn schema(environment: &EnvironmentSpec) -> Schema {
-    Schema {
-        environment: environment.name.to_owned(),
-        observation_dim: environment.observation_dim as u32,
-        action_dim: environment.action_dim as u32,
-        policy: "diffusion".to_owned(),
-    }
-}
-
->>>>>>> service
 fn write_rows(rows: &Receiver<Row>, mut log: Log) {
     let mut warned = false;
     for row in rows {

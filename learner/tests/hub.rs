@@ -4,19 +4,19 @@
 use std::net::TcpListener;
 use std::time::{Duration, Instant};
 
+use quad_learner::agent::PolicyFile;
 use quad_learner::hub::{self, EvaluationPlan, Hub};
 use quad_learner::inbox::{Inbox, inbox};
 use quad_learner::metrics::Metrics;
 use quad_learner::notice::Notice;
-use quad_learner::agent::PolicyFile;
 use quad_learner::publisher::{self, Identity, SnapshotPublisher};
 use quad_learner::run_dir::RunDir;
 use quad_learner::scoreboard::{Rules, Scoreboard};
 use quad_learner::train::TrainedPolicy;
 use quad_learner::wire::Wire;
 use quad_protocol::{
-    EpisodeScore, Hash, Job, JobReply, JobRequest, Message, Name, Progress, RecordedScores, ScoreReply,
-    ScoreReport, Snapshot, decode, encode, keys,
+    EpisodeScore, Hash, Job, JobReply, JobRequest, Message, Name, Progress, RecordedScores, ScoreReply, ScoreReport,
+    Snapshot, decode, encode, keys,
 };
 use quad_service::{Endpoints, open_session};
 use tokio::sync::mpsc::UnboundedReceiver;
@@ -86,7 +86,8 @@ impl Bench {
     }
 
     async fn snapshot(&mut self, step: u64) {
-        let policy = TrainedPolicy { step, policy: PolicyFile { kind: "diffusion", bytes: tensors(step) }, evaluate: true };
+        let policy =
+            TrainedPolicy { step, policy: PolicyFile { kind: "diffusion", bytes: tensors(step) }, evaluate: true };
         self.publisher.send(publisher::Event::Trained(policy));
         self.until(|notice| matches!(notice, Notice::Published { step: published } if *published == step)).await;
     }

@@ -5,8 +5,8 @@ use std::cell::RefCell;
 use std::sync::atomic::AtomicBool;
 use std::sync::mpsc::{Receiver, sync_channel};
 
-use quad_dataset::{BatchSampler, D4rlWriter, Metadata, ReadOptions, RewardRule, Row, Transitions, environment};
 use candle_core::Device;
+use quad_dataset::{BatchSampler, D4rlWriter, Metadata, ReadOptions, RewardRule, Row, Transitions, environment};
 use quad_learner::agent::Agent;
 use quad_learner::algorithms::{Setting, named};
 use quad_learner::config::{Overrides, resolve};

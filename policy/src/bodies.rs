@@ -27,7 +27,10 @@ fn close(what: &str, fast: &Tensor, plain: &Tensor) {
     let (fast, plain) = (numbers(fast), numbers(plain));
     let size = (plain.iter().map(|x| x * x).sum::<f32>() / plain.len() as f32).sqrt();
     for (i, (fast, plain)) in fast.iter().zip(&plain).enumerate() {
-        assert!((fast - plain).abs() <= 2e-5 * size.max(1e-3) + 1e-4 * plain.abs(), "{what} at {i}: {fast} for {plain}");
+        assert!(
+            (fast - plain).abs() <= 2e-5 * size.max(1e-3) + 1e-4 * plain.abs(),
+            "{what} at {i}: {fast} for {plain}"
+        );
     }
 }
 

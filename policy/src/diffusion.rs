@@ -93,7 +93,11 @@ impl DiffusionPolicy {
         Ok(tensors)
     }
 
-    pub(crate) fn load(shape: DiffusionShape, tensors: &mut Tensors, precision: Precision) -> Result<Self, PolicyError> {
+    pub(crate) fn load(
+        shape: DiffusionShape,
+        tensors: &mut Tensors,
+        precision: Precision,
+    ) -> Result<Self, PolicyError> {
         shape.check()?;
         let mut weights = |layout: crate::Layout, prefix: &str| -> Result<Weights, PolicyError> {
             let values = layout.join(tensors, prefix)?;
@@ -106,7 +110,12 @@ impl DiffusionPolicy {
 
     /// Draws candidates, with noise `T × states × candidates × action_dim`, and chooses the best. With one candidate the
     /// critics are not asked.
-    pub(crate) fn choose(&self, observations: &[f32], candidates: usize, noise: Vec<f32>) -> Result<Choice, PolicyError> {
+    pub(crate) fn choose(
+        &self,
+        observations: &[f32],
+        candidates: usize,
+        noise: Vec<f32>,
+    ) -> Result<Choice, PolicyError> {
         let DiffusionShape { observation_dim, action_dim, critics, diffusion_steps, .. } = self.shape;
         let states = observations.len() / observation_dim;
         let rows = states * candidates;

@@ -3,6 +3,7 @@
 //! On the CPU a custom operation of candle's does the work. It is cut into (member, tile of rows) and runs in parallel; the
 //! cut does not depend on the number of threads, so neither do the results.
 
+use crate::Precision;
 use crate::layers::Layers;
 use crate::network::{Input, Network, TILE, part, with_workspace};
 use crate::plain;
@@ -10,7 +11,6 @@ use crate::record::{Lent, Records, concatenate};
 use crate::rounded::RoundedOnce;
 use crate::slices::{has_fast_body, read, slice};
 use crate::weights::{KeptGradient, Layout, Weights};
-use crate::Precision;
 use candle_core::{CpuStorage, CustomOp3, Result, Shape, Tensor, bail};
 use quad_kernels::product::Rounded;
 use rayon::prelude::*;
@@ -275,7 +275,14 @@ impl Outputs {
         });
     }
 
-    fn weight_gradient(&self, weights: &[f32], input: &[f32], output_gradient: &[f32], lent: &Lent, gradient: &mut [f32]) {
+    fn weight_gradient(
+        &self,
+        weights: &[f32],
+        input: &[f32],
+        output_gradient: &[f32],
+        lent: &Lent,
+        gradient: &mut [f32],
+    ) {
         let mut record = lent.record.lock().unwrap_or_else(PoisonError::into_inner);
         let mut of_tiles = output_gradient.to_vec();
         record.tiles(&mut of_tiles).into_par_iter().for_each(|mut tile| {
@@ -336,7 +343,8 @@ impl CustomOp3 for Outputs {
                 Ok((None, None, Some(if self.own_actions { each } else { each.sum(0)? })))
             }
             Gradient::Weights(kept, lent) => {
-                let input = read(observations, |s: &[f32]| read(actions, |a: &[f32]| concatenate(s, a, self.shape.dims())))??;
+                let input =
+                    read(observations, |s: &[f32]| read(actions, |a: &[f32]| concatenate(s, a, self.shape.dims())))??;
                 let output_gradient = output_gradient.contiguous()?;
                 read(weights, |weights: &[f32]| {
                     read(&output_gradient, |output_gradient: &[f32]| {

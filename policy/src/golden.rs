@@ -44,9 +44,8 @@ fn golden_reverse_steps() {
 fn golden_choices() {
     for golden in goldens("quad") {
         let (shape, candidates) = (shape(&golden), golden.count("/candidates"));
-        let network = |(name, tensor): (&String, &Tensor)| {
-            Some((name.strip_prefix("target_")?.to_owned(), tensor.clone()))
-        };
+        let network =
+            |(name, tensor): (&String, &Tensor)| Some((name.strip_prefix("target_")?.to_owned(), tensor.clone()));
         let mut tensors = golden.state.iter().filter_map(network).collect();
         let policy = DiffusionPolicy::load(shape, &mut tensors, Precision::F32).unwrap();
         let numbers = |name: &str| golden.input(name, &Device::Cpu).flatten_all().unwrap().to_vec1::<f32>().unwrap();

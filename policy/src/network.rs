@@ -72,7 +72,12 @@ pub(crate) fn with_workspace<R>(work: impl FnOnce(&mut Workspace) -> R) -> R {
 
 impl Workspace {
     /// Lends the buffer of the state part, `len` numbers, and that of the output, `out` numbers, beside the others.
-    pub fn with_base<R>(&mut self, len: usize, out: usize, work: impl FnOnce(&mut [f32], &mut [f32], &mut Self) -> R) -> R {
+    pub fn with_base<R>(
+        &mut self,
+        len: usize,
+        out: usize,
+        work: impl FnOnce(&mut [f32], &mut [f32], &mut Self) -> R,
+    ) -> R {
         let (mut base, mut outputs) = (std::mem::take(&mut self.base), std::mem::take(&mut self.out));
         let result = work(base.sized(len), outputs.sized(out), self);
         (self.base, self.out) = (base, outputs);
@@ -82,7 +87,8 @@ impl Workspace {
     /// The activations of `len` numbers a layer, for a tile whose gradients are taken at once.
     pub fn activations(&mut self, len: usize) -> (Activations<'_>, Scratch<'_>) {
         let Self { x, slope, temporary, output, .. } = self;
-        let activations = Activations { x: x.each_mut().map(|x| x.sized(len)), slope: slope.each_mut().map(|s| s.sized(len)) };
+        let activations =
+            Activations { x: x.each_mut().map(|x| x.sized(len)), slope: slope.each_mut().map(|s| s.sized(len)) };
         (activations, Scratch { temporary, output })
     }
 
@@ -199,7 +205,13 @@ impl<'a> Network<'a> {
     }
 
     /// `forward` that leaves activations and slopes behind for `backward`.
-    pub fn forward_recorded(&self, input: Input<'_>, left: &mut Activations<'_>, scratch: Scratch<'_>, out: &mut [f32]) {
+    pub fn forward_recorded(
+        &self,
+        input: Input<'_>,
+        left: &mut Activations<'_>,
+        scratch: Scratch<'_>,
+        out: &mut [f32],
+    ) {
         let h = self.hidden();
         let ([x1, x2, x3], [s1, s2, s3]) = (&mut left.x, &mut left.slope);
         let network: Network<'_> = *self;

@@ -170,7 +170,13 @@ impl NoisePredictor {
         self.plain_predict_with(&weights, observations, actions, t)
     }
 
-    fn plain_predict_with(&self, weights: &Tensors, observations: &Tensor, actions: &Tensor, t: &Tensor) -> Result<Tensor> {
+    fn plain_predict_with(
+        &self,
+        weights: &Tensors,
+        observations: &Tensor,
+        actions: &Tensor,
+        t: &Tensor,
+    ) -> Result<Tensor> {
         let steps = self.parts.shape.diffusion_steps;
         let features = Tensor::from_slice(&self.parts.features, (steps, TIME_FEATURES), t.device())?;
         let embedding = plain::mlp(weights, "time.", 2, &features)?;
@@ -219,7 +225,14 @@ impl Parts {
         TimeEmbedding { hidden, slope, embedding, shift }
     }
 
-    fn sample(&self, weights: &[f32], rounded: Option<&[Rounded; 2]>, observations: &[f32], noise: &[f32], actions: &mut [f32]) {
+    fn sample(
+        &self,
+        weights: &[f32],
+        rounded: Option<&[Rounded; 2]>,
+        observations: &[f32],
+        noise: &[f32],
+        actions: &mut [f32],
+    ) {
         let NoiseShape { observation_dim, action_dim: a, hidden, diffusion_steps: steps } = self.shape;
         let (network, embedding) = (self.network(weights).with_rounded(rounded), self.embed(weights));
         let (all, rows) = (actions.len(), actions.len() / a);
@@ -291,7 +304,8 @@ impl Parts {
 
 fn check_shapes(shape: &NoiseShape, observations: &[usize], actions: &[usize]) -> Result<()> {
     let fits = |dims: &[usize], width| dims.len() == 2 && dims[0] > 0 && dims[1] == width;
-    if fits(observations, shape.observation_dim) && fits(actions, shape.action_dim) && actions[0] % observations[0] == 0 {
+    if fits(observations, shape.observation_dim) && fits(actions, shape.action_dim) && actions[0] % observations[0] == 0
+    {
         return Ok(());
     }
     bail!("a noise predictor of {shape:?} got observations {observations:?} and actions {actions:?}")
@@ -333,7 +347,14 @@ impl Predict {
         });
     }
 
-    fn weight_gradient(&self, weights: &[f32], input: &[f32], output_gradient: &[f32], lent: &Lent, gradient: &mut [f32]) {
+    fn weight_gradient(
+        &self,
+        weights: &[f32],
+        input: &[f32],
+        output_gradient: &[f32],
+        lent: &Lent,
+        gradient: &mut [f32],
+    ) {
         let Parts { shape, time, trunk, .. } = &*self.parts;
         let network = self.parts.network(weights);
         let mut record = lent.record.lock().unwrap_or_else(PoisonError::into_inner);
@@ -437,4 +458,3 @@ impl CustomOp3 for Sample {
         Ok((CpuStorage::F32(actions), (rows, a).into()))
     }
 }
-

@@ -171,15 +171,23 @@ impl SnapshotReceiver {
 
 #[cfg(test)]
 mod tests {
-    use quad_policy::{Architecture, Parameters};
+    use candle_core::{DType, Device, Tensor};
+    use quad_policy::{Description, DiffusionPolicy, DiffusionShape, Ensemble, Layout, NoisePredictor, Weights};
     use quad_protocol::Hash;
 
     use super::*;
 
-    /// The tensors of a diffusion policy.
+    /// A diffusion policy whose weights are all zero.
     fn tensors(observation_dim: usize, action_dim: usize) -> Vec<u8> {
-        let architecture = Architecture { observation_dim, action_dim, hidden: 8, critics: 2, diffusion_steps: 5 };
-        Parameters::zeros(&architecture).to_safetensors().unwrap()
+        let shape = DiffusionShape { observation_dim, action_dim, hidden: 8, critics: 2, diffusion_steps: 5 };
+        let zeros = |layout: Layout| {
+            let values = Tensor::zeros(layout.count(), DType::F32, &Device::Cpu).unwrap();
+            Weights::constant(layout, values)
+        };
+        let actor = NoisePredictor::new(shape.actor(), zeros(shape.actor().layout()), Precision::F32);
+        let critics = Ensemble::new(shape.critics(), zeros(shape.critics().layout()), Precision::F32);
+        let tensors = DiffusionPolicy::tensors(&actor, &critics).unwrap();
+        Description::Diffusion(shape).to_safetensors(&tensors).unwrap()
     }
 
     fn job_and_snapshot() -> (Job, Snapshot) {

@@ -24,12 +24,32 @@ const MOST_WEIGHT: f64 = 100.0;
 const LOG_STD: (f32, f32) = (-5.0, 2.0);
 
 const METRICS: &[Metric] = &[
-    Metric { name: "q_mean", label: "", help: "Mean over the batch of the critics' target y = r + γ·mask·V(s') (IQL's Eq. 6)." },
+    Metric {
+        name: "q_mean",
+        label: "",
+        help: "Mean over the batch of the critics' target y = r + γ·mask·V(s') (IQL's Eq. 6).",
+    },
     Metric { name: "v_mean", label: "V", help: "Mean over the batch of the value V(s) after its step." },
-    Metric { name: "value_loss", label: "value loss", help: "Expectile loss of V: mean over the batch of |expectile − 1(u < 0)|·u² with u = min_k Q̂_k(s, a) − V(s) (IQL's Eq. 5)." },
-    Metric { name: "critic_loss", label: "critic loss", help: "Mean over the batch of the sum over both critics of (Q_k(s, a) − y)² (IQL's Eq. 6)." },
-    Metric { name: "actor_loss", label: "actor loss", help: "Mean over the batch of −weight·log π(a|s) with weight = exp(temperature·A), at most 100 (IQL's Eq. 7)." },
-    Metric { name: "advantage_mean", label: "", help: "Mean over the batch of the advantage A = min_k Q̂_k(s, a) − V(s)." },
+    Metric {
+        name: "value_loss",
+        label: "value loss",
+        help: "Expectile loss of V: mean over the batch of |expectile − 1(u < 0)|·u² with u = min_k Q̂_k(s, a) − V(s) (IQL's Eq. 5).",
+    },
+    Metric {
+        name: "critic_loss",
+        label: "critic loss",
+        help: "Mean over the batch of the sum over both critics of (Q_k(s, a) − y)² (IQL's Eq. 6).",
+    },
+    Metric {
+        name: "actor_loss",
+        label: "actor loss",
+        help: "Mean over the batch of −weight·log π(a|s) with weight = exp(temperature·A), at most 100 (IQL's Eq. 7).",
+    },
+    Metric {
+        name: "advantage_mean",
+        label: "",
+        help: "Mean over the batch of the advantage A = min_k Q̂_k(s, a) − V(s).",
+    },
     Metric { name: "weight_mean", label: "", help: "Mean over the batch of the weights in the actor's loss." },
     Metric { name: "clipped_share", label: "", help: "Share of the batch, 0 to 1, whose weight is clipped at 100." },
     Metric { name: "learning_rate", label: "", help: "The actor's learning rate; falls to 0 along a cosine." },

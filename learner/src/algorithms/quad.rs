@@ -12,7 +12,9 @@ use crate::random::{Purpose, stream};
 use candle_core::{DType, Device, Result, Tensor, Var};
 use candle_nn::loss::mse;
 use config::{Guidance, Quad as Config, TargetReduce};
-use quad_policy::{Description, DiffusionPolicy, DiffusionShape, Ensemble, NoisePredictor, PolicyError, Tensors, Weights};
+use quad_policy::{
+    Description, DiffusionPolicy, DiffusionShape, Ensemble, NoisePredictor, PolicyError, Tensors, Weights,
+};
 use rand::Rng;
 use rand_distr::{Distribution, StandardNormal};
 
@@ -20,14 +22,46 @@ use rand_distr::{Distribution, StandardNormal};
 pub const DEFINITION: Definition = Definition { name: "quad", metrics: METRICS, read: config::read };
 
 const METRICS: &[Metric] = &[
-    Metric { name: "q_mean", label: "", help: "Mean over the batch of the critics' target y (Eq. 20). A value that grows without end is overestimation." },
-    Metric { name: "critic_loss", label: "critic loss", help: "Mean over critics and batch of (y − Q_k(s, a))² with y = r + γ·mask·Q_LCB(s', a'), Q_LCB = mean_k Q̂_k − ρ·std_k Q̂_k (Eq. 20)." },
-    Metric { name: "bc_loss", label: "BC loss", help: "Mean over batch and dimensions of (ε − ε_θ(a^t, s, t))², the behaviour-cloning term of Eq. 19 before η. 1 is a predictor that always says 0; a policy that knows the data lies well below." },
-    Metric { name: "actor_loss", label: "", help: "Eq. 19: η·(BC loss) + mean of λ·w(t)·ε_θ·ḡ, where ḡ is the Q-gradient (Eq. 10) over the mean of |Q̂_k(s, a)| and w(t) = √(1 − ᾱ_t)." },
-    Metric { name: "eta", label: "η", help: "Strength η of behaviour cloning (Eq. 19). With a threshold b it rises while the BC loss is above b and falls while it is below; without one, or without guidance, it is constant." },
-    Metric { name: "lambda_mean", label: "λ", help: "Mean over the batch of λ = ν̂²/(ν̂² + σ²/τ + δ) (Eq. 24), in (0, 1]: how far the critics' gradients are trusted. 1 with guidance dac, 0 with guidance none." },
-    Metric { name: "delta_share", label: "", help: "Share of the batch, 0 to 1, in which δ is more than a hundredth of the denominator of λ (Eq. 24), so that it decides λ and not the critics. 0 unless guidance is quad." },
-    Metric { name: "nu_squared", label: "", help: "ν̂²: moving average of the variance over the batch of the critics' mean alignment (Eq. 21–23). 0 without guidance." },
+    Metric {
+        name: "q_mean",
+        label: "",
+        help: "Mean over the batch of the critics' target y (Eq. 20). A value that grows without end is overestimation.",
+    },
+    Metric {
+        name: "critic_loss",
+        label: "critic loss",
+        help: "Mean over critics and batch of (y − Q_k(s, a))² with y = r + γ·mask·Q_LCB(s', a'), Q_LCB = mean_k Q̂_k − ρ·std_k Q̂_k (Eq. 20).",
+    },
+    Metric {
+        name: "bc_loss",
+        label: "BC loss",
+        help: "Mean over batch and dimensions of (ε − ε_θ(a^t, s, t))², the behaviour-cloning term of Eq. 19 before η. 1 is a predictor that always says 0; a policy that knows the data lies well below.",
+    },
+    Metric {
+        name: "actor_loss",
+        label: "",
+        help: "Eq. 19: η·(BC loss) + mean of λ·w(t)·ε_θ·ḡ, where ḡ is the Q-gradient (Eq. 10) over the mean of |Q̂_k(s, a)| and w(t) = √(1 − ᾱ_t).",
+    },
+    Metric {
+        name: "eta",
+        label: "η",
+        help: "Strength η of behaviour cloning (Eq. 19). With a threshold b it rises while the BC loss is above b and falls while it is below; without one, or without guidance, it is constant.",
+    },
+    Metric {
+        name: "lambda_mean",
+        label: "λ",
+        help: "Mean over the batch of λ = ν̂²/(ν̂² + σ²/τ + δ) (Eq. 24), in (0, 1]: how far the critics' gradients are trusted. 1 with guidance dac, 0 with guidance none.",
+    },
+    Metric {
+        name: "delta_share",
+        label: "",
+        help: "Share of the batch, 0 to 1, in which δ is more than a hundredth of the denominator of λ (Eq. 24), so that it decides λ and not the critics. 0 unless guidance is quad.",
+    },
+    Metric {
+        name: "nu_squared",
+        label: "",
+        help: "ν̂²: moving average of the variance over the batch of the critics' mean alignment (Eq. 21–23). 0 without guidance.",
+    },
     Metric { name: "critic_gradient_norm", label: "", help: "Global norm of the critics' gradient before clipping." },
     Metric { name: "actor_gradient_norm", label: "", help: "Global norm of the actor's gradient before clipping." },
     Metric { name: "learning_rate", label: "", help: "The actor's learning rate; falls to 0 along a cosine." },
@@ -66,8 +100,6 @@ struct Noise {
 struct Advice {
     /// g_k: ∇_a Q̂_k(s, a^t) over the mean of |Q̂_k(s, a)|, `[K, B, a]`; ḡ is their mean (Eq. 10).
     gradients: Tensor,
-    /// σ² (Eq. 22), `[B]`.
-    variance: Tensor,
     /// ν̂² after this batch (Eq. 23), `[]`.
     nu_squared: Tensor,
     /// λ (Eq. 24), `[B]`.
@@ -214,7 +246,7 @@ impl Quad {
         let size = (predicted.sqr()?.sum_keepdim(1)?.sqrt()? + 1e-8)?;
         let direction = predicted.broadcast_div(&size)?; // u, Eq. 21
         let alignment = gradients.broadcast_mul(&direction)?.sum(2)?; // l_k = u·g_k, [K, B]
-        let (mean, variance) = mean_and_variance(&alignment)?;
+        let (mean, variance) = mean_and_variance(&alignment)?; // l̄, and σ² of Eq. 22
         let spread = mean.broadcast_sub(&mean.mean_all()?)?.sqr()?.mean_all()?;
         let nu_squared = match &self.nu_squared {
             Some(before) => (before + ((spread - before)? * f64::from(self.config.nu_ema_rate))?)?,
@@ -228,7 +260,7 @@ impl Quad {
             }
             Guidance::Dac | Guidance::None => (variance.ones_like()?, nu_squared.zeros_like()?),
         };
-        Ok(Advice { gradients, variance, nu_squared, lambda, delta_share })
+        Ok(Advice { gradients, nu_squared, lambda, delta_share })
     }
 }
 
@@ -272,7 +304,8 @@ impl Algorithm for Quad {
         self.target_critics.weights_mut().load(tensors, "target_critic.")?;
         self.actor_adam.load(self.actor.weights(), tensors, "actor.")?;
         self.critic_adam.load(self.critics.weights(), tensors, "critic.")?;
-        self.eta = scalar(tensors, "eta", &self.setting.device)?.ok_or_else(|| PolicyError::Missing("eta".to_owned()))?;
+        self.eta =
+            scalar(tensors, "eta", &self.setting.device)?.ok_or_else(|| PolicyError::Missing("eta".to_owned()))?;
         self.nu_squared = scalar(tensors, "nu_squared", &self.setting.device)?;
         Ok(())
     }

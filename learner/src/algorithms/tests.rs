@@ -47,9 +47,12 @@ pub(super) fn setting(seed: u64, device: &Device) -> Setting {
 /// The presets of all algorithms and variants, with small networks.
 fn variants() -> Vec<(Definition, toml::Table)> {
     let mut variants = Vec::new();
-    for (preset, guidance) in
-        [("hopper-demo", Some("quad")), ("hopper-demo", Some("dac")), ("hopper-demo", Some("none")), ("hopper-demo-iql", None)]
-    {
+    for (preset, guidance) in [
+        ("hopper-demo", Some("quad")),
+        ("hopper-demo", Some("dac")),
+        ("hopper-demo", Some("none")),
+        ("hopper-demo-iql", None),
+    ] {
         let overrides = Overrides { guidance: guidance.map(str::to_owned), ..Overrides::default() };
         let mut experiment = resolve(preset, &overrides).unwrap();
         experiment.agent.insert("hidden".to_owned(), 24.into());
@@ -87,7 +90,9 @@ fn train(agent: &mut Agent, steps: u64, batch_size: usize) -> Vec<Vec<f32>> {
 
 #[test]
 fn a_saved_state_goes_on_bit_for_bit() {
-    for (device, (definition, table)) in devices().iter().flat_map(|device| variants().into_iter().map(move |v| (device, v))) {
+    for (device, (definition, table)) in
+        devices().iter().flat_map(|device| variants().into_iter().map(move |v| (device, v)))
+    {
         let setting = setting(3, device);
         let mut straight = agent(definition, &table, &setting);
         train(&mut straight, 7, setting.batch_size);
