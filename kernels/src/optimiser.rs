@@ -26,22 +26,27 @@ fn sum_of_squares(x: &[f32]) -> f32 {
     lanes.iter().sum::<f32>() + rest
 }
 
-#[multiversion(targets("x86_64+avx512f+avx512dq+avx512vl+avx512bw+avx2+fma", "x86_64+avx2+fma"))]
-fn decay_chunk(first: &mut [f32], second: &mut [f32], gradient: &[f32], scale: f32) {
-    // Of the new gradient: rounded from f64, since 1 - 0.999 in f32 would be off by a part in 20,000.
-    const NEW: [f32; 2] = [(1.0 - BETA1) as f32, (1.0 - BETA2) as f32];
-    const OLD: [f32; 2] = [BETA1 as f32, BETA2 as f32];
-    for ((m, v), g) in first.iter_mut().zip(second).zip(gradient) {
-        let g = g * scale;
-        *m = OLD[0] * *m + NEW[0] * g;
-        *v = OLD[1] * *v + NEW[1] * g * g;
-    }
+/// Coefficients of Adam's element-wise update.
+#[derive(Clone, Copy)]
+struct Update {
+    /// Of the gradient.
+    scale: f32,
+    /// Learning rate over the first moment's bias correction.
+    rate: f32,
+    /// 1/sqrt of the second moment's bias correction.
+    correction: f32,
 }
 
 #[multiversion(targets("x86_64+avx512f+avx512dq+avx512vl+avx512bw+avx2+fma", "x86_64+avx2+fma"))]
-fn descend_chunk(parameters: &mut [f32], first: &[f32], second: &[f32], rate: f32, correction: f32) {
-    for ((p, m), v) in parameters.iter_mut().zip(first).zip(second) {
-        *p -= rate * *m / (v.sqrt() * correction + EPSILON);
+fn adam_chunk(update: Update, parameters: &mut [f32], first: &mut [f32], second: &mut [f32], gradient: &[f32]) {
+    // Of the new gradient: rounded from f64, since 1 - 0.999 in f32 would be off by a part in 20,000.
+    const NEW: [f32; 2] = [(1.0 - BETA1) as f32, (1.0 - BETA2) as f32];
+    const OLD: [f32; 2] = [BETA1 as f32, BETA2 as f32];
+    for (((p, m), v), g) in parameters.iter_mut().zip(first).zip(second).zip(gradient) {
+        let g = g * update.scale;
+        *m = OLD[0] * *m + NEW[0] * g;
+        *v = OLD[1] * *v + NEW[1] * g * g;
+        *p -= update.rate * *m / (v.sqrt() * update.correction + EPSILON);
     }
 }
 
@@ -58,26 +63,28 @@ pub fn norm(x: &[f32]) -> f32 {
     squares.iter().map(|x| f64::from(*x)).sum::<f64>().sqrt() as f32
 }
 
-/// Takes a gradient, times `scale`, into Adam's moments: m = β1·m + (1 - β1)·g, v = β2·v + (1 - β2)·g².
-pub fn decay_moments(first: &mut [f32], second: &mut [f32], gradient: &[f32], scale: f32) {
-    first
-        .par_chunks_mut(CHUNK)
-        .zip(second.par_chunks_mut(CHUNK))
-        .zip(gradient.par_chunks(CHUNK))
-        .for_each(|((m, v), g)| decay_chunk(m, v, g, scale));
-}
-
-/// Adam's step number `count`, from 1, along moments that have just taken in the gradient:
-/// p -= rate · m/(1 - β1^count) / (√(v/(1 - β2^count)) + ε).
-pub fn descend(parameters: &mut [f32], first: &[f32], second: &[f32], rate: f32, count: u64) {
+/// Adam's step number `count`, from 1, along a gradient g that is first multiplied by `scale`:
+/// m = β1·m + (1 - β1)·g, v = β2·v + (1 - β2)·g², p -= rate · m/(1 - β1^count) / (√(v/(1 - β2^count)) + ε).
+pub fn adam(
+    parameters: &mut [f32],
+    (first, second): (&mut [f32], &mut [f32]),
+    gradient: &[f32],
+    scale: f32,
+    rate: f32,
+    count: u64,
+) {
     let count = count as f64;
-    let rate = (f64::from(rate) / (1.0 - BETA1.powf(count))) as f32;
-    let correction = (1.0 / (1.0 - BETA2.powf(count)).sqrt()) as f32;
+    let update = Update {
+        scale,
+        rate: (f64::from(rate) / (1.0 - BETA1.powf(count))) as f32,
+        correction: (1.0 / (1.0 - BETA2.powf(count)).sqrt()) as f32,
+    };
     parameters
         .par_chunks_mut(CHUNK)
-        .zip(first.par_chunks(CHUNK))
-        .zip(second.par_chunks(CHUNK))
-        .for_each(|((p, m), v)| descend_chunk(p, m, v, rate, correction));
+        .zip(first.par_chunks_mut(CHUNK))
+        .zip(second.par_chunks_mut(CHUNK))
+        .zip(gradient.par_chunks(CHUNK))
+        .for_each(|(((p, m), v), g)| adam_chunk(update, p, m, v, g));
 }
 
 /// `target = (1 - rate)·target + rate·online`.

@@ -3,7 +3,7 @@
 
 #![allow(clippy::expect_used)] // what cannot be had ends the run
 
-use candle_core::{Result, Tensor, Var};
+use candle_core::{Result, Tensor};
 use criterion::measurement::WallTime;
 use criterion::{BenchmarkGroup, Criterion, criterion_group, criterion_main};
 use gemm::{Parallelism, gemm};
@@ -166,10 +166,7 @@ fn parts_of(group: &mut BenchmarkGroup<'_, WallTime>, experiment: &Experiment, s
     bench(group, "sampled next actions", || target_actor.sample(&observations, &noise));
     let next = target_actor.sample(&observations, &noise)?;
     bench(group, "target critics", || target_critics.values(&observations, &next));
-    let regress = |critics: &Ensemble| {
-        let q = critics.values(&observations, &actions)?;
-        q.broadcast_sub(&targets)?.sqr()?.mean_all()?.backward()
-    };
+    let regress = |critics: &Ensemble| critics.squared_error(&observations, &actions, &targets)?.backward();
     // The gradient is asked for as the optimiser does, which also readies its memory for the next pass.
     bench(group, "critic step", || critics.weights().gradient(&regress(&critics)?));
     let step = AdamStep { rate: 1e-9, clip: Some(1.0), count: 1 };
@@ -177,10 +174,7 @@ fn parts_of(group: &mut BenchmarkGroup<'_, WallTime>, experiment: &Experiment, s
     bench(group, "critic optimiser", || critic_adam.descend(critics.weights_mut(), &gradient, step));
     bench(group, "critic EMA", || follow(target_critics.weights_mut(), critics.weights(), 0.005));
     bench(group, "Q-gradients' scale", || target_critics.values(&observations, &actions));
-    bench(group, "Q-gradients", || {
-        let each = Var::from_tensor(&actions.broadcast_left(k)?)?;
-        Ok(target_critics.values(&observations, &each)?.sum_all()?.backward()?.remove(&each))
-    });
+    bench(group, "Q-gradients", || target_critics.action_gradients(&observations, &actions));
     let t = Tensor::from_iter((0..b).map(|i| (i % steps + 1) as u32), observations.device())?;
     let clone = |actor: &NoisePredictor| actor.predict(&observations, &actions, &t)?.sqr()?.mean_all()?.backward();
     let threshold = experiment.agent["eta"].get("threshold").is_some();

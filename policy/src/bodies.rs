@@ -1,7 +1,7 @@
 //! Tests: each custom operation against its plain body, values and gradients, at random shapes.
 
 use crate::*;
-use candle_core::{Device, Tensor, Var};
+use candle_core::{Device, Tensor};
 use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 
@@ -56,12 +56,9 @@ fn ensembles_give_the_plain_bodys_values() {
         let (states, repeat) = (generator.random_range(1..300), generator.random_range(1..12));
         let observations = tensor(&mut generator, &[states, shape.observation_dim]);
         let actions = tensor(&mut generator, &[states * repeat, shape.action_dim]);
-        let own = tensor(&mut generator, &[shape.members, states, shape.action_dim]);
-        for actions in [actions, own] {
-            let fast = ensemble.outputs(&observations, &actions).unwrap();
-            let plain = ensemble.plain_outputs(&observations, &actions).unwrap();
-            close(&format!("{shape:?}, {states} × {repeat}"), &fast, &plain);
-        }
+        let fast = ensemble.outputs(&observations, &actions).unwrap();
+        let plain = ensemble.plain_outputs(&observations, &actions).unwrap();
+        close(&format!("{shape:?}, {states} × {repeat}"), &fast, &plain);
         let shape = EnsembleShape { action_dim: 0, ..shape };
         let ensemble = Ensemble::new(shape, self::weights(shape.layout(), &mut generator), Precision::F32);
         let none = Tensor::zeros((states, 0), candle_core::DType::F32, &Device::Cpu).unwrap();
@@ -102,27 +99,39 @@ fn ensembles_give_the_plain_bodys_gradients() {
 }
 
 #[test]
-fn ensembles_give_the_plain_bodys_gradients_at_actions() {
+fn squared_errors_are_the_plain_bodys() {
+    for seed in 0..20 {
+        let mut generator = ChaCha8Rng::seed_from_u64(seed);
+        let shape = shape(&mut generator, 1);
+        let ensemble = Ensemble::new(shape, weights(shape.layout(), &mut generator), Precision::Bf16);
+        let rows = generator.random_range(1..300);
+        let observations = tensor(&mut generator, &[rows, shape.observation_dim]);
+        let actions = tensor(&mut generator, &[rows, shape.action_dim]);
+        let targets = tensor(&mut generator, &[rows]);
+        for factor in [1.0, -2.5] {
+            let fast = (ensemble.squared_error(&observations, &actions, &targets).unwrap() * factor).unwrap();
+            let plain = (ensemble.plain_squared_error(&observations, &actions, &targets).unwrap() * factor).unwrap();
+            close("loss", &fast, &plain);
+            let gradient = |loss: Tensor| ensemble.weights().gradient(&loss.backward().unwrap()).unwrap();
+            let expected = gradient(plain);
+            close(&format!("{shape:?}, {rows} rows, times {factor}"), &gradient(fast), &expected);
+        }
+    }
+}
+
+#[test]
+fn action_gradients_are_the_plain_bodys() {
     for seed in 0..20 {
         let mut generator = ChaCha8Rng::seed_from_u64(seed);
         let shape = shape(&mut generator, 1);
         let weights = weights(shape.layout(), &mut generator).copy().unwrap();
         let ensemble = Ensemble::new(shape, weights, Precision::F32);
-        let (rows, repeat) = (generator.random_range(1..200), generator.random_range(1..4));
-        let observations = tensor(&mut generator, &[rows, shape.observation_dim]);
-        let each = tensor(&mut generator, &[shape.members, rows, shape.action_dim]);
-        let shared = tensor(&mut generator, &[rows * repeat, shape.action_dim]);
-        for actions in [each, shared] {
-            let actions = Var::from_tensor(&actions).unwrap();
-            let scales = tensor(&mut generator, &[shape.members, actions.dims()[actions.rank() - 2], 1]);
-            let gradient = |q: Tensor| {
-                let all = (q * &scales).unwrap().sum_all().unwrap().backward().unwrap();
-                all.get(&actions).unwrap().clone()
-            };
-            let fast = gradient(ensemble.outputs(&observations, &actions).unwrap());
-            let plain = gradient(ensemble.plain_outputs(&observations, &actions).unwrap());
-            close(&format!("{shape:?}, {:?}", actions.dims()), &fast, &plain);
-        }
+        let (states, repeat) = (generator.random_range(1..200), generator.random_range(1..4));
+        let observations = tensor(&mut generator, &[states, shape.observation_dim]);
+        let actions = tensor(&mut generator, &[states * repeat, shape.action_dim]);
+        let fast = ensemble.action_gradients(&observations, &actions).unwrap();
+        let plain = ensemble.plain_action_gradients(&observations, &actions).unwrap();
+        close(&format!("{shape:?}, {states} × {repeat}"), &fast, &plain);
     }
 }
 

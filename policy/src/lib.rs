@@ -21,6 +21,7 @@
 mod bodies;
 mod diffusion;
 mod ensemble;
+mod ensemble_ops;
 mod error;
 mod gaussian;
 #[cfg(test)]

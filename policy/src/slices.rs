@@ -1,5 +1,7 @@
 //! Candle's CPU tensors as slices.
 
+use std::cell::Cell;
+
 use candle_core::{CpuStorage, Device, Error, InplaceOp1, Layout, Result, Storage, Tensor};
 
 /// Whether operations on this device run in their fast bodies: on the CPU, unless the feature `plain` says otherwise.
@@ -21,20 +23,25 @@ pub fn read<T: candle_core::WithDType, R>(tensor: &Tensor, work: impl FnOnce(&[T
 }
 
 /// Has `work` change the numbers of a contiguous tensor on the CPU in place.
-pub fn modify(tensor: &Tensor, work: impl Fn(&mut [f32])) -> Result<()> {
-    struct Modify<F>(F);
-    impl<F: Fn(&mut [f32])> InplaceOp1 for Modify<F> {
+pub fn modify<R>(tensor: &Tensor, work: impl FnOnce(&mut [f32]) -> R) -> Result<R> {
+    /// Candle asks for an operation that could be applied many times; this one is applied once.
+    struct Once<F, R>(Cell<Option<F>>, Cell<Option<R>>);
+    impl<R, F: FnOnce(&mut [f32]) -> R> InplaceOp1 for Once<F, R> {
         fn name(&self) -> &'static str {
             "modify"
         }
 
         fn cpu_fwd(&self, storage: &mut CpuStorage, layout: &Layout) -> Result<()> {
-            let (CpuStorage::F32(numbers), Some((from, to))) = (storage, layout.contiguous_offsets()) else {
+            let (CpuStorage::F32(numbers), Some((from, to)), Some(work)) =
+                (storage, layout.contiguous_offsets(), self.0.take())
+            else {
                 return Err(Error::Msg("only contiguous tensors of f32 can be changed in place".into()));
             };
-            (self.0)(&mut numbers[from..to]);
+            self.1.set(Some(work(&mut numbers[from..to])));
             Ok(())
         }
     }
-    tensor.inplace_op1(&Modify(work))
+    let once = Once(Cell::new(Some(work)), Cell::new(None));
+    tensor.inplace_op1(&once)?;
+    once.1.take().ok_or_else(|| Error::Msg("a tensor is not on the CPU".into()))
 }

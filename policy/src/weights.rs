@@ -191,7 +191,7 @@ impl KeptGradient {
     }
 
     /// Has `work` write the gradient; added up where the weights have a part in the loss more than once.
-    pub fn write(&self, work: impl Fn(&mut [f32])) -> Result<()> {
+    pub fn write(&self, work: impl FnOnce(&mut [f32])) -> Result<()> {
         if !self.written.swap(true, Ordering::Relaxed) {
             return modify(&self.values, work);
         }

@@ -215,8 +215,8 @@ impl Algorithm for Iql {
         // Q(s, a) towards r + γ·V(s'), Eq. 6.
         let next = value.state_values(&batch.next_observations)?.squeeze(0)?;
         let targets = (&batch.rewards + ((next * &batch.masks)? * f64::from(self.config.gamma))?)?;
-        let q = self.critics.network.values(&batch.observations, &batch.actions)?;
-        let critic_loss = q.broadcast_sub(&targets)?.sqr()?.sum(0)?.mean_all()?;
+        let error = self.critics.network.squared_error(&batch.observations, &batch.actions, &targets)?;
+        let critic_loss = (error * CRITICS as f64)?;
         self.critics.descend(&critic_loss.backward()?, self.config.critic_learning_rate, count)?;
         follow(self.target_critics.weights_mut(), self.critics.network.weights(), self.config.ema_rate)?;
 

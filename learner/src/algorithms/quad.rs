@@ -9,7 +9,7 @@ mod golden;
 use super::{Algorithm, AlgorithmError, Definition, Metric, Minibatch, Setting, numbers};
 use crate::optimiser::{Adam, AdamStep, cosine_decay, follow};
 use crate::random::{Purpose, stream};
-use candle_core::{DType, Device, Result, Tensor, Var};
+use candle_core::{DType, Device, Result, Tensor};
 use candle_nn::loss::mse;
 use config::{Guidance, Quad as Config, TargetReduce};
 use quad_policy::{
@@ -159,8 +159,7 @@ impl Quad {
 
         // Lines 4–7: every critic towards the lower confidence bound (Eq. 20).
         let targets = self.targets(batch, noise)?;
-        let q = self.critics.values(&batch.observations, &batch.actions)?;
-        let critic_loss = q.broadcast_sub(&targets)?.sqr()?.mean_all()?;
+        let critic_loss = self.critics.squared_error(&batch.observations, &batch.actions, &targets)?;
         let adam = AdamStep { rate: self.config.critic_learning_rate * decay, clip, count };
         let critic_gradient_norm = self.critic_adam.step(self.critics.weights_mut(), &critic_loss.backward()?, adam)?;
         follow(self.target_critics.weights_mut(), self.critics.weights(), ema_rate)?;
@@ -236,12 +235,7 @@ impl Quad {
     fn advice(&self, batch: &Minibatch, noisy: &Tensor, predicted: &Tensor) -> Result<Advice> {
         let (tau, delta) = (f64::from(self.config.tau), f64::from(self.config.delta));
         let scale = (self.target_critics.values(&batch.observations, &batch.actions)?.abs()?.mean_all()? + 1e-6)?;
-        // Actions for each critic, so that one pass gives the gradients of all: none has a part in another's.
-        let actions = Var::from_tensor(&noisy.broadcast_left(self.config.critics)?)?;
-        let q = self.target_critics.values(&batch.observations, &actions)?;
-        let gradients = q.sum_all()?.backward()?.remove(&actions);
-        let gradients = gradients.ok_or_else(|| candle_core::Error::Msg("no gradient at actions".into()))?;
-        let gradients = gradients.broadcast_div(&scale)?;
+        let gradients = self.target_critics.action_gradients(&batch.observations, noisy)?.broadcast_div(&scale)?;
 
         let size = (predicted.sqr()?.sum_keepdim(1)?.sqrt()? + 1e-8)?;
         let direction = predicted.broadcast_div(&size)?; // u, Eq. 21
@@ -264,7 +258,7 @@ impl Quad {
     }
 }
 
-/// `[K, B]` → mean over K, and population variance over K.
+/// `[K, B]` → mean over K, and population variance over K; both `[B]`.
 fn mean_and_variance(x: &Tensor) -> Result<(Tensor, Tensor)> {
     let mean = x.mean_keepdim(0)?;
     let variance = x.broadcast_sub(&mean)?.sqr()?.mean(0)?;

@@ -1,0 +1,283 @@
+//! An ensemble's work on the CPU: custom operations of (weights, observations, actions).
+//!
+//! It is cut into (member, tile of rows) and runs in parallel; the cut does not depend on the number of threads, so neither
+//! do the results.
+
+use crate::EnsembleShape;
+use crate::layers::Layers;
+use crate::network::{Input, Network, TILE, part, with_workspace};
+use crate::record::{Lent, Record, concatenate};
+use crate::slices::{read, slice};
+use crate::weights::KeptGradient;
+use candle_core::{CpuStorage, CustomOp3, Layout, Result, Shape, Tensor};
+use quad_kernels::product::Rounded;
+use rayon::prelude::*;
+use std::sync::{Arc, Mutex, PoisonError};
+
+/// The gradients of a custom operation's three arguments.
+type Gradients = (Option<Tensor>, Option<Tensor>, Option<Tensor>);
+
+/// Where an ensemble's networks lie in its vector of weights.
+pub(crate) struct Networks {
+    pub shape: EnsembleShape,
+    pub layers: Layers,
+}
+
+impl Networks {
+    pub fn member<'a>(&'a self, weights: &'a [f32], k: usize) -> Network<'a> {
+        Network::new(weights, &self.layers, k, (self.shape.observation_dim, self.shape.action_dim))
+    }
+
+    /// Cuts `out`, `K × rows × width`, into tiles of rows that do not part the actions of a state, and has `work` fill
+    /// them in parallel: it gets the member, its input but for the state's part, the observations, and the tile.
+    fn for_each_tile<'a>(
+        &'a self,
+        weights: &'a [f32],
+        observations: &'a [f32],
+        actions: &'a [f32],
+        out: &mut [f32],
+        work: impl Fn(usize, Network<'a>, &'a [f32], &'a [f32], &mut [f32]) + Sync,
+    ) {
+        let EnsembleShape { members, observation_dim, action_dim, .. } = self.shape;
+        let rows = if action_dim == 0 { observations.len() / observation_dim } else { actions.len() / action_dim };
+        let repeat = rows * observation_dim / observations.len();
+        let states = (TILE / repeat).max(1);
+        let (tile, width) = (states * repeat, out.len() / (members * rows));
+        out.par_chunks_mut(rows * width).enumerate().for_each(|(k, out)| {
+            let network = self.member(weights, k);
+            out.par_chunks_mut(tile * width).enumerate().for_each(|(i, out)| {
+                let observations = part(observations, i * states, states, observation_dim);
+                work(k, network, observations, part(actions, i * tile, tile, action_dim), out);
+            });
+        });
+    }
+
+    /// Runs all members forward, tile by tile, and keeps what the way back needs; `after` is given each tile's place among
+    /// its member's, the network, its slopes and its outputs.
+    fn record(
+        &self,
+        weights: &[f32],
+        observations: &[f32],
+        actions: &[f32],
+        record: &mut Record,
+        out: &mut [f32],
+        after: impl Fn(usize, Network<'_>, &mut [&mut [f32]; 3], &mut [f32]) + Sync,
+    ) {
+        let EnsembleShape { members, observation_dim, action_dim, hidden, outputs } = self.shape;
+        record.resize(members, out.len() / (members * outputs), hidden);
+        record.tiles(out).into_par_iter().for_each(|mut tile| {
+            let network = self.member(weights, tile.member);
+            let observations = part(observations, tile.index * TILE, TILE, observation_dim);
+            let actions = part(actions, tile.index * TILE, TILE, action_dim);
+            with_workspace(|work| {
+                work.with_base(observations.len() / observation_dim * hidden, 0, |base, _, work| {
+                    network.state_part(observations, base);
+                    let input = Input { base, repeat: 1, shift: network.bias(0), actions };
+                    network.forward_recorded(input, &mut tile.activations, work.scratch(), tile.out);
+                });
+            });
+            after(tile.index, network, &mut tile.activations.slope, tile.out);
+        });
+    }
+
+    /// Goes from the outputs' gradient, `K × rows × outputs`, back to those before each activation.
+    fn back(&self, weights: &[f32], record: &mut Record, output_gradient: &mut [f32]) {
+        record.tiles(output_gradient).into_par_iter().for_each(|mut tile| {
+            let network = self.member(weights, tile.member);
+            with_workspace(|work| network.backward(tile.out, &mut tile.activations.slope, work.scratch()));
+        });
+    }
+
+    /// `[s, a]`, row by row.
+    fn input(&self, observations: &Tensor, actions: &Tensor) -> Result<Vec<f32>> {
+        let dims = (self.shape.observation_dim, self.shape.action_dim);
+        read(observations, |s: &[f32]| read(actions, |a: &[f32]| concatenate(s, a, dims)))?
+    }
+}
+
+/// What comes out of the networks: `K × rows × outputs`.
+pub(crate) struct Outputs {
+    pub networks: Arc<Networks>,
+    pub rounded: Option<Arc<Vec<[Rounded; 2]>>>,
+    /// For a way back to the weights: where their gradient is left, and what is kept for it.
+    pub record: Option<(Arc<KeptGradient>, Lent)>,
+}
+
+impl CustomOp3 for Outputs {
+    fn name(&self) -> &'static str {
+        "ensemble"
+    }
+
+    fn cpu_fwd(
+        &self,
+        weights: &CpuStorage,
+        weights_layout: &Layout,
+        observations: &CpuStorage,
+        observations_layout: &Layout,
+        actions: &CpuStorage,
+        actions_layout: &Layout,
+    ) -> Result<(CpuStorage, Shape)> {
+        let EnsembleShape { members, observation_dim, hidden, outputs, .. } = self.networks.shape;
+        let weights = slice(weights, weights_layout)?;
+        let (observations, actions) = (slice(observations, observations_layout)?, slice(actions, actions_layout)?);
+        let (states, rows) = (observations_layout.dims()[0], actions_layout.dims()[0]);
+        let mut out = vec![0.0; members * rows * outputs];
+        if let Some((_, lent)) = &self.record {
+            let mut record = lent.record.lock().unwrap_or_else(PoisonError::into_inner);
+            self.networks.record(weights, observations, actions, &mut record, &mut out, |_, _, _, _| {});
+        } else {
+            let repeat = rows / states;
+            self.networks.for_each_tile(
+                weights,
+                observations,
+                actions,
+                &mut out,
+                |k, network, states, actions, out| {
+                    let rounded = self.rounded.as_ref().and_then(|rounded| rounded.get(k));
+                    with_workspace(|work| {
+                        work.with_base(states.len() / observation_dim * hidden, 0, |base, _, work| {
+                            network.state_part(states, base);
+                            let input = Input { base, repeat, shift: network.bias(0), actions };
+                            network.with_rounded(rounded).forward(input, work, out);
+                        });
+                    });
+                },
+            );
+        }
+        Ok((CpuStorage::F32(out), (members, rows, outputs).into()))
+    }
+
+    fn bwd(
+        &self,
+        weights: &Tensor,
+        observations: &Tensor,
+        actions: &Tensor,
+        _: &Tensor,
+        gradient: &Tensor,
+    ) -> Result<Gradients> {
+        if let Some((kept, lent)) = &self.record {
+            let input = self.networks.input(observations, actions)?;
+            let gradient = read(&gradient.contiguous()?, <[f32]>::to_vec)?;
+            let mut record = lent.record.lock().unwrap_or_else(PoisonError::into_inner);
+            // The copy is cut up; the other is read as a whole.
+            read(weights, |weights: &[f32]| self.networks.back(weights, &mut record, &mut gradient.clone()))?;
+            kept.write(|out| record.weight_gradients(self.networks.layers.split_mut(out), &input, &gradient))?;
+        }
+        Ok((None, None, None))
+    }
+}
+
+/// Mean over members and rows of (Q_k(s, a) - y)².
+pub(crate) struct SquaredError {
+    networks: Arc<Networks>,
+    targets: Vec<f32>,
+    kept: Arc<KeptGradient>,
+    lent: Lent,
+    /// The loss's gradient at the outputs, `K × rows`.
+    output_gradient: Mutex<Vec<f32>>,
+}
+
+impl SquaredError {
+    pub fn new(networks: Arc<Networks>, targets: Vec<f32>, kept: Arc<KeptGradient>, lent: Lent) -> Self {
+        Self { networks, targets, kept, lent, output_gradient: Mutex::default() }
+    }
+}
+
+impl CustomOp3 for SquaredError {
+    fn name(&self) -> &'static str {
+        "squared-error"
+    }
+
+    fn cpu_fwd(
+        &self,
+        weights: &CpuStorage,
+        weights_layout: &Layout,
+        observations: &CpuStorage,
+        observations_layout: &Layout,
+        actions: &CpuStorage,
+        actions_layout: &Layout,
+    ) -> Result<(CpuStorage, Shape)> {
+        let (members, rows) = (self.networks.shape.members, actions_layout.dims()[0]);
+        if [observations_layout.dims()[0], self.targets.len()] != [rows; 2] {
+            candle_core::bail!("{rows} actions need as many observations and targets");
+        }
+        let weights = slice(weights, weights_layout)?;
+        let (observations, actions) = (slice(observations, observations_layout)?, slice(actions, actions_layout)?);
+        let scale = 1.0 / (members * rows) as f32;
+        let mut record = self.lent.record.lock().unwrap_or_else(PoisonError::into_inner);
+        let mut out = vec![0.0; members * rows];
+        self.networks.record(weights, observations, actions, &mut record, &mut out, |i, network, slope, out| {
+            for (q, y) in out.iter_mut().zip(&self.targets[i * TILE..]) {
+                *q = 2.0 * scale * (*q - y);
+            }
+            with_workspace(|work| network.backward(out, slope, work.scratch()));
+        });
+        // An error is its gradient over twice the scale.
+        let loss = out.iter().map(|g| g * g).sum::<f32>() / (4.0 * scale);
+        *self.output_gradient.lock().unwrap_or_else(PoisonError::into_inner) = out;
+        Ok((CpuStorage::F32(vec![loss]), ().into()))
+    }
+
+    fn bwd(
+        &self,
+        _: &Tensor,
+        observations: &Tensor,
+        actions: &Tensor,
+        _: &Tensor,
+        gradient: &Tensor,
+    ) -> Result<Gradients> {
+        let (input, factor) = (self.networks.input(observations, actions)?, gradient.to_scalar::<f32>()?);
+        let record = self.lent.record.lock().unwrap_or_else(PoisonError::into_inner);
+        let output_gradient = self.output_gradient.lock().unwrap_or_else(PoisonError::into_inner);
+        self.kept.write(|out| {
+            record.weight_gradients(self.networks.layers.split_mut(out), &input, &output_gradient);
+            if factor != 1.0 {
+                out.iter_mut().for_each(|g| *g *= factor);
+            }
+        })?;
+        Ok((None, None, None))
+    }
+}
+
+/// ∇_a Q_k(s, a): `K × rows × a`, worked out tile by tile on the way forward, while its activations are at hand.
+pub(crate) struct ActionGradients {
+    pub networks: Arc<Networks>,
+}
+
+impl CustomOp3 for ActionGradients {
+    fn name(&self) -> &'static str {
+        "action-gradients"
+    }
+
+    fn cpu_fwd(
+        &self,
+        weights: &CpuStorage,
+        weights_layout: &Layout,
+        observations: &CpuStorage,
+        observations_layout: &Layout,
+        actions: &CpuStorage,
+        actions_layout: &Layout,
+    ) -> Result<(CpuStorage, Shape)> {
+        let EnsembleShape { members, observation_dim, action_dim, hidden, .. } = self.networks.shape;
+        let weights = slice(weights, weights_layout)?;
+        let (observations, actions) = (slice(observations, observations_layout)?, slice(actions, actions_layout)?);
+        let (states, rows) = (observations_layout.dims()[0], actions_layout.dims()[0]);
+        let (mut out, repeat) = (vec![0.0; members * rows * action_dim], rows / states);
+        self.networks.for_each_tile(weights, observations, actions, &mut out, |_, network, states, actions, out| {
+            let rows = out.len() / action_dim;
+            with_workspace(|work| {
+                work.with_base(states.len() / observation_dim * hidden, rows, |base, values, work| {
+                    network.state_part(states, base);
+                    let input = Input { base, repeat, shift: network.bias(0), actions };
+                    let (mut left, scratch) = work.activations(rows * hidden);
+                    network.forward_recorded(input, &mut left, scratch, values);
+                    values.fill(1.0);
+                    let (mut left, scratch) = work.activations(rows * hidden);
+                    network.backward(values, &mut left.slope, scratch);
+                    network.action_gradient(left.slope[0], out);
+                });
+            });
+        });
+        Ok((CpuStorage::F32(out), (members, rows, action_dim).into()))
+    }
+}
