@@ -12,7 +12,7 @@
 //! - [`Precision`] (`precision`): how exactly networks are evaluated that no gradient is taken of.
 //! - Below the custom operations: `layers` (where each layer lies in the vector), `network` (one network on one tile of
 //!   rows, over the crate `kernels`), `record` (what is kept for the way back), `rounded` (what is made once of
-//!   weights), `slices` (candle's tensors as slices).
+//!   weights), `slices` (candle's tensors as slices). `statistics` has the mean and the variance over an ensemble.
 //!
 //! Everything that draws random numbers takes them as an argument or from a seeded generator.
 
@@ -37,6 +37,7 @@ mod record;
 mod rounded;
 mod schedule;
 mod slices;
+mod statistics;
 mod weights;
 
 pub use diffusion::{ActionNoise, DiffusionPolicy, DiffusionShape};
@@ -48,4 +49,5 @@ pub use noise_predictor::{NoisePredictor, NoiseShape};
 pub use precision::Precision;
 pub use schedule::Schedule;
 pub use slices::{has_fast_body, modify, read};
+pub use statistics::mean_and_variance;
 pub use weights::{Layout, Part, Tensors, Weights, check_finite};

@@ -15,7 +15,7 @@ use candle_core::{CpuStorage, CustomOp3, D, DType, Result, Shape, Tensor, bail};
 use quad_kernels::activation::{column_sums, mish_slope, multiply};
 use quad_kernels::product::{Rounded, outer, product, product_transposed};
 use rayon::prelude::*;
-use std::sync::{Arc, PoisonError};
+use std::sync::{Arc, OnceLock, PoisonError};
 
 /// Size of the sinusoidal features of a denoising step.
 const TIME_FEATURES: usize = 16;
@@ -136,7 +136,8 @@ impl NoisePredictor {
             (true, Some(kept)) => Some((kept, self.records.lend())),
             _ => None,
         };
-        let operation = Predict { parts: self.parts.clone(), t: read(t, <[u32]>::to_vec)?, gradient };
+        let operation =
+            Predict { parts: self.parts.clone(), t: read(t, <[u32]>::to_vec)?, gradient, embedding: OnceLock::new() };
         weights.apply_op3(&observations.contiguous()?, &actions.contiguous()?, operation)
     }
 
@@ -281,10 +282,16 @@ impl Parts {
 
     /// The way back into the time embedding, once per t rather than once per row: `by_step` is the gradient before the
     /// trunk's first activation, summed by t, `T × hidden`.
-    fn time_gradient(&self, weights: &[f32], by_step: &[f32], time: Vec<LayerMut<'_>>, tail: &mut [f32]) {
+    fn time_gradient(
+        &self,
+        weights: &[f32],
+        embedding: &TimeEmbedding,
+        by_step: &[f32],
+        time: Vec<LayerMut<'_>>,
+        tail: &mut [f32],
+    ) {
         let ((inputs, width), (_, outputs)) = (self.time.shape(0), self.time.shape(1));
         let (h, steps) = (self.shape.hidden, self.shape.diffusion_steps);
-        let embedding = self.embed(weights);
         outer(&embedding.embedding, by_step, tail, outputs, h);
         let mut d_embedding = vec![0.0; steps * outputs];
         product_transposed(by_step, self.network(weights).tail_kernel(), &mut d_embedding, outputs, h);
@@ -316,6 +323,8 @@ struct Predict {
     parts: Arc<Parts>,
     t: Vec<u32>,
     gradient: Option<(Arc<KeptGradient>, Lent)>,
+    /// Left by the way forward.
+    embedding: OnceLock<TimeEmbedding>,
 }
 
 impl Predict {
@@ -326,7 +335,7 @@ impl Predict {
     }
 
     fn forward(&self, weights: &[f32], observations: &[f32], actions: &[f32], out: &mut [f32]) {
-        let of = (self.parts.network(weights), &self.parts.embed(weights));
+        let of = (self.parts.network(weights), self.embedding.get_or_init(|| self.parts.embed(weights)));
         out.par_chunks_mut(TILE * self.parts.shape.action_dim).enumerate().for_each(|(i, out)| {
             let rows = self.tile(observations, actions, i);
             with_workspace(|work| self.parts.with_tile(of, rows, work, |input, work| of.0.forward(input, work, out)));
@@ -334,7 +343,7 @@ impl Predict {
     }
 
     fn forward_recorded(&self, weights: &[f32], observations: &[f32], actions: &[f32], lent: &Lent, out: &mut [f32]) {
-        let of = (self.parts.network(weights), &self.parts.embed(weights));
+        let of = (self.parts.network(weights), self.embedding.get_or_init(|| self.parts.embed(weights)));
         let mut record = lent.record.lock().unwrap_or_else(PoisonError::into_inner);
         record.resize(1, self.t.len(), self.parts.shape.hidden);
         record.tiles(out).into_par_iter().for_each(|mut tile| {
@@ -356,7 +365,8 @@ impl Predict {
         gradient: &mut [f32],
     ) {
         let Parts { shape, time, trunk, .. } = &*self.parts;
-        let network = self.parts.network(weights);
+        let (network, embedding) =
+            (self.parts.network(weights), self.embedding.get_or_init(|| self.parts.embed(weights)));
         let mut record = lent.record.lock().unwrap_or_else(PoisonError::into_inner);
         let mut of_tiles = output_gradient.to_vec();
         record.tiles(&mut of_tiles).into_par_iter().for_each(|mut tile| {
@@ -370,7 +380,7 @@ impl Predict {
             by_step[(*t as usize - 1) * h..][..h].iter_mut().zip(delta).for_each(|(sum, d)| *sum += d);
         }
         let tail = &mut of_trunk[(shape.observation_dim + shape.action_dim) * h..][..TIME_EMBEDDING * h];
-        self.parts.time_gradient(weights, &by_step, time.split_mut(of_time), tail);
+        self.parts.time_gradient(weights, embedding, &by_step, time.split_mut(of_time), tail);
     }
 }
 

@@ -44,13 +44,14 @@ impl Schedule {
         Self { steps: (1..=steps).map(step).collect() }
     }
 
-    /// sqrt(ᾱ_t) and sqrt(1 - ᾱ_t) for each t in 1..=T, `[B, 1]` each; the second is also the guidance weight w(t).
-    pub fn noising(&self, t: &[u32], device: &Device) -> Result<(Tensor, Tensor)> {
-        let column = |of: fn(&Step) -> f32| {
-            let values: Vec<f32> = t.iter().map(|t| of(&self.steps[*t as usize - 1])).collect();
-            Tensor::from_vec(values, (t.len(), 1), device)
+    /// sqrt(ᾱ_t) and sqrt(1 - ᾱ_t) for each t in 1..=T, `[B, width]` each, a row for each t with its number in all
+    /// columns; the second is also the guidance weight w(t).
+    pub fn noising(&self, t: &[u32], width: usize, device: &Device) -> Result<(Tensor, Tensor)> {
+        let rows = |of: fn(&Step) -> f32| {
+            let numbers = t.iter().flat_map(|t| std::iter::repeat_n(of(&self.steps[*t as usize - 1]), width));
+            Tensor::from_vec(numbers.collect(), (t.len(), width), device)
         };
-        Ok((column(|step| step.signal)?, column(|step| step.deviation)?))
+        Ok((rows(|step| step.signal)?, rows(|step| step.deviation)?))
     }
 
     /// x_0 as a predicted noise ε has it, (x_t - sqrt(1 - ᾱ_t)·ε)/sqrt(ᾱ_t), clipped to [-1, 1]; all `[rows, a]`.

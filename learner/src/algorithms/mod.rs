@@ -201,9 +201,12 @@ fn check_count(field: &'static str, value: usize, most: usize) -> std::result::R
     check(field, value, (1..=most).contains(&value), "a whole number from 1 on, of reasonable size")
 }
 
-/// Tensors `[]` as numbers, in one copy: a GPU works on its own until somebody reads from it.
+/// Tensors `[]` as numbers; from a GPU in one copy, since it works on its own until somebody reads from it.
 fn numbers(x: &[&Tensor]) -> Result<Vec<f32>> {
-    Tensor::stack(x, 0)?.to_vec1()
+    match x.iter().all(|x| x.device().is_cpu()) {
+        true => x.iter().map(|x| x.to_scalar()).collect(),
+        false => Tensor::stack(x, 0)?.to_vec1(),
+    }
 }
 
 #[cfg(test)]

@@ -14,6 +14,7 @@ use candle_nn::loss::mse;
 use config::{Guidance, Quad as Config, TargetReduce};
 use quad_policy::{
     Description, DiffusionPolicy, DiffusionShape, Ensemble, NoisePredictor, PolicyError, Tensors, Weights,
+    mean_and_variance,
 };
 use rand::Rng;
 use rand_distr::{Distribution, StandardNormal};
@@ -98,8 +99,8 @@ struct Noise {
 
 /// What the critics say about noisy actions, and how far they are trusted.
 struct Advice {
-    /// g_k: ∇_a Q̂_k(s, a^t) over the mean of |Q̂_k(s, a)|, `[K, B, a]`; ḡ is their mean (Eq. 10).
-    gradients: Tensor,
+    /// ḡ: the mean over critics of ∇_a Q̂_k(s, a^t), over the mean of |Q̂_k(s, a)| (Eq. 10), `[B, a]`.
+    gradient: Tensor,
     /// ν̂² after this batch (Eq. 23), `[]`.
     nu_squared: Tensor,
     /// λ (Eq. 24), `[B]`.
@@ -165,8 +166,9 @@ impl Quad {
         follow(self.target_critics.weights_mut(), self.critics.weights(), ema_rate)?;
 
         // Lines 8–11: behaviour cloning, pulled along the gradients that the critics agree on (Eq. 5 and 19).
-        let (signal, deviation) = self.actor.schedule().noising(&noise.t, &self.setting.device)?;
-        let noisy = (batch.actions.broadcast_mul(&signal)? + noise.epsilon.broadcast_mul(&deviation)?)?;
+        let (signal, deviation) =
+            self.actor.schedule().noising(&noise.t, self.shape.action_dim, &self.setting.device)?;
+        let noisy = ((&batch.actions * signal)? + (&noise.epsilon * &deviation)?)?;
         let t = Tensor::from_slice(&noise.t, noise.t.len(), &self.setting.device)?;
         let predicted = self.actor.predict(&batch.observations, &noisy, &t)?;
         let bc_loss = mse(&predicted, &noise.epsilon)?;
@@ -175,8 +177,7 @@ impl Quad {
         let (mut lambda_mean, mut delta_share) = (zero.clone(), zero.clone());
         if self.config.guidance != Guidance::None {
             let advice = self.advice(batch, &noisy, &predicted.detach())?;
-            let weight = (advice.lambda.unsqueeze(1)? * &deviation)?;
-            let pull = advice.gradients.mean(0)?.broadcast_mul(&weight)?;
+            let pull = (advice.gradient * deviation)?.broadcast_mul(&advice.lambda.unsqueeze(1)?)?;
             actor_loss = (actor_loss + (&predicted * pull)?.mean_all()?)?;
             (lambda_mean, delta_share) = (advice.lambda.mean_all()?, advice.delta_share);
             self.nu_squared = Some(advice.nu_squared);
@@ -248,21 +249,14 @@ impl Quad {
         };
         let (lambda, delta_share) = match self.config.guidance {
             Guidance::Quad => {
-                let denominator = ((&variance / tau)? + delta)?.broadcast_add(&nu_squared)?;
+                let denominator = variance.affine(1.0 / tau, delta)?.broadcast_add(&nu_squared)?;
                 let decided = denominator.lt(100.0 * delta)?.to_dtype(DType::F32)?.mean_all()?;
                 (denominator.recip()?.broadcast_mul(&nu_squared)?, decided)
             }
             Guidance::Dac | Guidance::None => (variance.ones_like()?, nu_squared.zeros_like()?),
         };
-        Ok(Advice { gradients, nu_squared, lambda, delta_share })
+        Ok(Advice { gradient: mean_and_variance(&gradients)?.0, nu_squared, lambda, delta_share })
     }
-}
-
-/// `[K, B]` → mean over K, and population variance over K; both `[B]`.
-fn mean_and_variance(x: &Tensor) -> Result<(Tensor, Tensor)> {
-    let mean = x.mean_keepdim(0)?;
-    let variance = x.broadcast_sub(&mean)?.sqr()?.mean(0)?;
-    Ok((mean.squeeze(0)?, variance))
 }
 
 impl Algorithm for Quad {
