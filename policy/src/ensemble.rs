@@ -6,7 +6,7 @@ use crate::Precision;
 use crate::ensemble_ops::{ActionGradients, Networks, Outputs, SquaredError};
 use crate::layers::Layers;
 use crate::plain;
-use crate::record::Records;
+use crate::record::{Pool, Record};
 use crate::rounded::RoundedOnce;
 use crate::slices::{has_fast_body, read};
 use crate::weights::{Layout, Weights};
@@ -49,14 +49,15 @@ pub struct Ensemble {
     weights: Weights,
     precision: Precision,
     rounded: RoundedOnce<Vec<[Rounded; 2]>>,
-    records: Records,
+    records: Pool<Record>,
+    gradients: Pool<Vec<f32>>,
 }
 
 impl Ensemble {
     /// `weights` are of the shape's layout; `precision` is for what no gradient is taken of.
     pub fn new(shape: EnsembleShape, weights: Weights, precision: Precision) -> Self {
         let networks = Arc::new(Networks { shape, layers: shape.layers() });
-        Self { shape, networks, weights, precision, rounded: RoundedOnce::default(), records: Records::default() }
+        Self::over(networks, weights, precision)
     }
 
     /// Its weights.
@@ -71,9 +72,12 @@ impl Ensemble {
 
     /// The same networks with their weights as constants, which share their memory with these.
     pub fn frozen(&self) -> Self {
-        let (networks, weights) = (self.networks.clone(), self.weights.frozen());
-        let (rounded, records) = (RoundedOnce::default(), Records::default());
-        Self { shape: self.shape, networks, weights, precision: Precision::F32, rounded, records }
+        Self::over(self.networks.clone(), self.weights.frozen(), Precision::F32)
+    }
+
+    fn over(networks: Arc<Networks>, weights: Weights, precision: Precision) -> Self {
+        let (rounded, records, gradients) = (RoundedOnce::default(), Pool::default(), Pool::default());
+        Self { shape: networks.shape, networks, weights, precision, rounded, records, gradients }
     }
 
     /// What comes out, `[K, rows, outputs]`, a row for each action.
@@ -123,7 +127,8 @@ impl Ensemble {
         match self.weights.kept_gradient() {
             Some(kept) if has_fast_body(weights.device()) && !actions.track_op() && self.shape.outputs == 1 => {
                 let targets = read(targets, <[f32]>::to_vec)?;
-                let operation = SquaredError::new(self.networks.clone(), targets, kept, self.records.lend());
+                let of_tiles = self.gradients.lend();
+                let operation = SquaredError { networks: self.networks.clone(), targets, kept, of_tiles };
                 weights.apply_op3(&observations.contiguous()?, &actions.contiguous()?, operation)
             }
             _ => self.plain_squared_error(observations, actions, targets),

@@ -4,15 +4,16 @@
 //! do the results.
 
 use crate::EnsembleShape;
-use crate::layers::Layers;
+use crate::layers::{LayerMut, Layers};
 use crate::network::{Input, Network, TILE, part, with_workspace};
-use crate::record::{Lent, Record, concatenate};
+use crate::record::{Lent, Record, concatenate, layer_gradient};
 use crate::slices::{read, slice};
 use crate::weights::KeptGradient;
 use candle_core::{CpuStorage, CustomOp3, Layout, Result, Shape, Tensor};
+use quad_kernels::optimiser::weighted_sum;
 use quad_kernels::product::Rounded;
 use rayon::prelude::*;
-use std::sync::{Arc, Mutex, PoisonError};
+use std::sync::Arc;
 
 /// The gradients of a custom operation's three arguments.
 type Gradients = (Option<Tensor>, Option<Tensor>, Option<Tensor>);
@@ -52,17 +53,8 @@ impl Networks {
         });
     }
 
-    /// Runs all members forward, tile by tile, and keeps what the way back needs; `after` is given each tile's place among
-    /// its member's, the network, its slopes and its outputs.
-    fn record(
-        &self,
-        weights: &[f32],
-        observations: &[f32],
-        actions: &[f32],
-        record: &mut Record,
-        out: &mut [f32],
-        after: impl Fn(usize, Network<'_>, &mut [&mut [f32]; 3], &mut [f32]) + Sync,
-    ) {
+    /// Runs all members forward, tile by tile, and keeps what the way back needs.
+    fn record(&self, weights: &[f32], observations: &[f32], actions: &[f32], record: &mut Record, out: &mut [f32]) {
         let EnsembleShape { members, observation_dim, action_dim, hidden, outputs } = self.shape;
         record.resize(members, out.len() / (members * outputs), hidden);
         record.tiles(out).into_par_iter().for_each(|mut tile| {
@@ -76,7 +68,6 @@ impl Networks {
                     network.forward_recorded(input, &mut tile.activations, work.scratch(), tile.out);
                 });
             });
-            after(tile.index, network, &mut tile.activations.slope, tile.out);
         });
     }
 
@@ -100,7 +91,7 @@ pub(crate) struct Outputs {
     pub networks: Arc<Networks>,
     pub rounded: Option<Arc<Vec<[Rounded; 2]>>>,
     /// For a way back to the weights: where their gradient is left, and what is kept for it.
-    pub record: Option<(Arc<KeptGradient>, Lent)>,
+    pub record: Option<(Arc<KeptGradient>, Lent<Record>)>,
 }
 
 impl CustomOp3 for Outputs {
@@ -123,8 +114,8 @@ impl CustomOp3 for Outputs {
         let (states, rows) = (observations_layout.dims()[0], actions_layout.dims()[0]);
         let mut out = vec![0.0; members * rows * outputs];
         if let Some((_, lent)) = &self.record {
-            let mut record = lent.record.lock().unwrap_or_else(PoisonError::into_inner);
-            self.networks.record(weights, observations, actions, &mut record, &mut out, |_, _, _, _| {});
+            let mut record = lent.lock();
+            self.networks.record(weights, observations, actions, &mut record, &mut out);
         } else {
             let repeat = rows / states;
             self.networks.for_each_tile(
@@ -158,7 +149,7 @@ impl CustomOp3 for Outputs {
         if let Some((kept, lent)) = &self.record {
             let input = self.networks.input(observations, actions)?;
             let gradient = read(&gradient.contiguous()?, <[f32]>::to_vec)?;
-            let mut record = lent.record.lock().unwrap_or_else(PoisonError::into_inner);
+            let mut record = lent.lock();
             // The copy is cut up; the other is read as a whole.
             read(weights, |weights: &[f32]| self.networks.back(weights, &mut record, &mut gradient.clone()))?;
             kept.write(|out| record.weight_gradients(self.networks.layers.split_mut(out), &input, &gradient))?;
@@ -167,19 +158,46 @@ impl CustomOp3 for Outputs {
     }
 }
 
-/// Mean over members and rows of (Q_k(s, a) - y)².
+/// Mean over members and rows of (Q_k(s, a) - y)². As soon as a tile's errors are known, its way back begins, while its
+/// activations are at hand; what is left for later is to add up the tiles' gradients.
 pub(crate) struct SquaredError {
-    networks: Arc<Networks>,
-    targets: Vec<f32>,
-    kept: Arc<KeptGradient>,
-    lent: Lent,
-    /// The loss's gradient at the outputs, `K × rows`.
-    output_gradient: Mutex<Vec<f32>>,
+    pub networks: Arc<Networks>,
+    pub targets: Vec<f32>,
+    pub kept: Arc<KeptGradient>,
+    /// The gradient of each tile of rows, one after the other.
+    pub of_tiles: Lent<Vec<f32>>,
 }
 
 impl SquaredError {
-    pub fn new(networks: Arc<Networks>, targets: Vec<f32>, kept: Arc<KeptGradient>, lent: Lent) -> Self {
-        Self { networks, targets, kept, lent, output_gradient: Mutex::default() }
+    /// One tile of one member: its share of the loss, and the gradient of its layers.
+    fn tile(&self, network: Network<'_>, rows: (&[f32], &[f32], &[f32]), scale: f32, layers: Vec<LayerMut<'_>>) -> f32 {
+        let EnsembleShape { observation_dim, action_dim, hidden, .. } = self.networks.shape;
+        let (observations, actions, targets) = rows;
+        let (count, len) = (targets.len(), targets.len() * hidden);
+        with_workspace(|work| {
+            work.with_base(len, count, |base, values, work| {
+                network.state_part(observations, base);
+                let input = Input { base, repeat: 1, shift: network.bias(0), actions };
+                let (mut left, scratch) = work.activations(len);
+                network.forward_recorded(input, &mut left, scratch, values);
+                let mut loss = 0.0;
+                for (q, y) in values.iter_mut().zip(targets) {
+                    let error = *q - y;
+                    loss += scale * error * error;
+                    *q = 2.0 * scale * error;
+                }
+                let (mut left, scratch) = work.activations(len);
+                network.backward(values, &mut left.slope, scratch);
+                let input = concatenate(observations, actions, (observation_dim, action_dim));
+                for layer in layers {
+                    let number = layer.layer;
+                    let x = if number == 0 { &input } else { &*left.x[number - 1] };
+                    let gradient = left.slope.get(number).map_or(&*values, |slope| &**slope);
+                    layer_gradient(layer, x, gradient);
+                }
+                loss
+            })
+        })
     }
 }
 
@@ -197,44 +215,33 @@ impl CustomOp3 for SquaredError {
         actions: &CpuStorage,
         actions_layout: &Layout,
     ) -> Result<(CpuStorage, Shape)> {
-        let (members, rows) = (self.networks.shape.members, actions_layout.dims()[0]);
+        let EnsembleShape { members, observation_dim, action_dim, .. } = self.networks.shape;
+        let rows = actions_layout.dims()[0];
         if [observations_layout.dims()[0], self.targets.len()] != [rows; 2] {
             candle_core::bail!("{rows} actions need as many observations and targets");
         }
         let weights = slice(weights, weights_layout)?;
         let (observations, actions) = (slice(observations, observations_layout)?, slice(actions, actions_layout)?);
-        let scale = 1.0 / (members * rows) as f32;
-        let mut record = self.lent.record.lock().unwrap_or_else(PoisonError::into_inner);
-        let mut out = vec![0.0; members * rows];
-        self.networks.record(weights, observations, actions, &mut record, &mut out, |i, network, slope, out| {
-            for (q, y) in out.iter_mut().zip(&self.targets[i * TILE..]) {
-                *q = 2.0 * scale * (*q - y);
-            }
-            with_workspace(|work| network.backward(out, slope, work.scratch()));
-        });
-        // An error is its gradient over twice the scale.
-        let loss = out.iter().map(|g| g * g).sum::<f32>() / (4.0 * scale);
-        *self.output_gradient.lock().unwrap_or_else(PoisonError::into_inner) = out;
-        Ok((CpuStorage::F32(vec![loss]), ().into()))
+        let mut of_tiles = self.of_tiles.lock();
+        of_tiles.resize(rows.div_ceil(TILE) * weights.len(), 0.0);
+        let of_members = |(i, gradient)| {
+            let mut of_members: Vec<Vec<_>> = (0..members).map(|_| Vec::new()).collect();
+            self.networks.layers.split_mut(gradient).into_iter().for_each(|layer| of_members[layer.member].push(layer));
+            of_members.into_iter().enumerate().map(move |(k, layers)| (i, k, layers))
+        };
+        let tiles: Vec<_> = of_tiles.chunks_exact_mut(weights.len()).enumerate().flat_map(of_members).collect();
+        let tile = |(i, k, layers)| {
+            let part = |matrix, width| part(matrix, i * TILE, TILE, width);
+            let rows = (part(observations, observation_dim), part(actions, action_dim), part(&self.targets, 1));
+            self.tile(self.networks.member(weights, k), rows, 1.0 / (members * self.targets.len()) as f32, layers)
+        };
+        let losses: Vec<f32> = tiles.into_par_iter().map(tile).collect();
+        Ok((CpuStorage::F32(vec![losses.iter().sum()]), ().into()))
     }
 
-    fn bwd(
-        &self,
-        _: &Tensor,
-        observations: &Tensor,
-        actions: &Tensor,
-        _: &Tensor,
-        gradient: &Tensor,
-    ) -> Result<Gradients> {
-        let (input, factor) = (self.networks.input(observations, actions)?, gradient.to_scalar::<f32>()?);
-        let record = self.lent.record.lock().unwrap_or_else(PoisonError::into_inner);
-        let output_gradient = self.output_gradient.lock().unwrap_or_else(PoisonError::into_inner);
-        self.kept.write(|out| {
-            record.weight_gradients(self.networks.layers.split_mut(out), &input, &output_gradient);
-            if factor != 1.0 {
-                out.iter_mut().for_each(|g| *g *= factor);
-            }
-        })?;
+    fn bwd(&self, _: &Tensor, _: &Tensor, _: &Tensor, _: &Tensor, gradient: &Tensor) -> Result<Gradients> {
+        let factor = gradient.to_scalar()?;
+        self.kept.write(|sum| weighted_sum(&self.of_tiles.lock(), factor, sum))?;
         Ok((None, None, None))
     }
 }

@@ -6,7 +6,7 @@
 use crate::layers::{LayerMut, Layers};
 use crate::network::{Input, Network, TILE, Workspace, part, with_workspace};
 use crate::plain;
-use crate::record::{Lent, Records, concatenate};
+use crate::record::{Lent, Pool, Record, concatenate};
 use crate::rounded::RoundedOnce;
 use crate::slices::{has_fast_body, read, slice};
 use crate::weights::{KeptGradient, Layout, Tensors, Weights};
@@ -15,7 +15,7 @@ use candle_core::{CpuStorage, CustomOp3, D, DType, Result, Shape, Tensor, bail};
 use quad_kernels::activation::{column_sums, mish_slope, multiply};
 use quad_kernels::product::{Rounded, outer, product, product_transposed};
 use rayon::prelude::*;
-use std::sync::{Arc, OnceLock, PoisonError};
+use std::sync::{Arc, OnceLock};
 
 /// Size of the sinusoidal features of a denoising step.
 const TIME_FEATURES: usize = 16;
@@ -60,7 +60,7 @@ pub struct NoisePredictor {
     weights: Weights,
     precision: Precision,
     rounded: RoundedOnce<Option<[Rounded; 2]>>,
-    records: Records,
+    records: Pool<Record>,
 }
 
 /// What does not change in training.
@@ -101,7 +101,7 @@ impl NoisePredictor {
             schedule: Schedule::variance_preserving(shape.diffusion_steps),
             features: time_features(shape.diffusion_steps),
         };
-        let (rounded, records) = (RoundedOnce::default(), Records::default());
+        let (rounded, records) = (RoundedOnce::default(), Pool::default());
         Self { parts: Arc::new(parts), weights, precision, rounded, records }
     }
 
@@ -144,7 +144,7 @@ impl NoisePredictor {
     /// The same network with its weights as constants, which share their memory with these.
     pub fn frozen(&self) -> Self {
         let (parts, weights) = (self.parts.clone(), self.weights.frozen());
-        Self { parts, weights, precision: Precision::F32, rounded: RoundedOnce::default(), records: Records::default() }
+        Self { parts, weights, precision: Precision::F32, rounded: RoundedOnce::default(), records: Pool::default() }
     }
 
     /// Draws actions by the whole reverse process (DDPM), x_0 clipped to [-1, 1] at each step.
@@ -322,7 +322,7 @@ fn check_shapes(shape: &NoiseShape, observations: &[usize], actions: &[usize]) -
 struct Predict {
     parts: Arc<Parts>,
     t: Vec<u32>,
-    gradient: Option<(Arc<KeptGradient>, Lent)>,
+    gradient: Option<(Arc<KeptGradient>, Lent<Record>)>,
     /// Left by the way forward.
     embedding: OnceLock<TimeEmbedding>,
 }
@@ -342,9 +342,16 @@ impl Predict {
         });
     }
 
-    fn forward_recorded(&self, weights: &[f32], observations: &[f32], actions: &[f32], lent: &Lent, out: &mut [f32]) {
+    fn forward_recorded(
+        &self,
+        weights: &[f32],
+        observations: &[f32],
+        actions: &[f32],
+        lent: &Lent<Record>,
+        out: &mut [f32],
+    ) {
         let of = (self.parts.network(weights), self.embedding.get_or_init(|| self.parts.embed(weights)));
-        let mut record = lent.record.lock().unwrap_or_else(PoisonError::into_inner);
+        let mut record = lent.lock();
         record.resize(1, self.t.len(), self.parts.shape.hidden);
         record.tiles(out).into_par_iter().for_each(|mut tile| {
             let rows = self.tile(observations, actions, tile.index);
@@ -361,13 +368,13 @@ impl Predict {
         weights: &[f32],
         input: &[f32],
         output_gradient: &[f32],
-        lent: &Lent,
+        lent: &Lent<Record>,
         gradient: &mut [f32],
     ) {
         let Parts { shape, time, trunk, .. } = &*self.parts;
         let (network, embedding) =
             (self.parts.network(weights), self.embedding.get_or_init(|| self.parts.embed(weights)));
-        let mut record = lent.record.lock().unwrap_or_else(PoisonError::into_inner);
+        let mut record = lent.lock();
         let mut of_tiles = output_gradient.to_vec();
         record.tiles(&mut of_tiles).into_par_iter().for_each(|mut tile| {
             with_workspace(|work| network.backward(tile.out, &mut tile.activations.slope, work.scratch()));

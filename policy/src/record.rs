@@ -6,7 +6,7 @@ use quad_kernels::Buffer;
 use quad_kernels::activation::column_sums;
 use quad_kernels::product::outer;
 use rayon::prelude::*;
-use std::sync::{Arc, Mutex, PoisonError};
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 
 /// Activations of all hidden layers of all members, and their slopes, each `members × rows × hidden`; on the way back the
 /// gradients before the activations take the slopes' place.
@@ -74,45 +74,68 @@ impl Record {
     /// After the way back: the gradients of these layers. `input` is `rows × width`; the first kernel's rows behind the
     /// first `width` are left to the caller. `output_gradient` is `members × rows × outputs`.
     pub fn weight_gradients(&self, layers: Vec<LayerMut<'_>>, input: &[f32], output_gradient: &[f32]) {
-        layers.into_par_iter().for_each(|LayerMut { layer, member, kernel, bias }| {
-            let columns = bias.len();
-            let x = match layer {
-                0 => input,
-                _ => self.of_member(&self.x[layer - 1], member),
-            };
-            let gradient = match self.slope.get(layer) {
+        layers.into_par_iter().for_each(|layer| {
+            let (number, member) = (layer.layer, layer.member);
+            let x = if number == 0 { input } else { self.of_member(&self.x[number - 1], member) };
+            let gradient = match self.slope.get(number) {
                 Some(delta) => self.of_member(delta, member),
-                None => &output_gradient[member * self.rows * columns..][..self.rows * columns],
+                None => &output_gradient[member * self.rows * layer.bias.len()..][..self.rows * layer.bias.len()],
             };
-            let width = x.len() / self.rows;
-            outer(x, gradient, &mut kernel[..width * columns], width, columns);
-            column_sums(gradient, bias);
+            layer_gradient(layer, x, gradient);
         });
     }
 }
 
-/// Records that are used again: fresh memory of this size would cost as much as the arithmetic.
-#[derive(Clone, Default)]
-pub(crate) struct Records(Arc<Mutex<Vec<Record>>>);
+/// A layer's gradient, from its input `rows × width` and the gradient before its activation, `rows × columns`. Rows of the
+/// kernel behind the first `width` are left to the caller.
+pub(crate) fn layer_gradient(layer: LayerMut<'_>, x: &[f32], gradient: &[f32]) {
+    let LayerMut { kernel, bias, .. } = layer;
+    let columns = bias.len();
+    let width = x.len() / (gradient.len() / columns);
+    outer(x, gradient, &mut kernel[..width * columns], width, columns);
+    column_sums(gradient, bias);
+}
 
-impl Records {
-    /// One that is lent until it is dropped.
-    pub fn lend(&self) -> Lent {
-        let record = self.0.lock().unwrap_or_else(PoisonError::into_inner).pop().unwrap_or_default();
-        Lent { record: Mutex::new(record), home: self.clone() }
+/// Memory that is used again: fresh memory of such sizes would cost as much as the arithmetic.
+pub(crate) struct Pool<T>(Arc<Mutex<Vec<T>>>);
+
+impl<T> Clone for Pool<T> {
+    fn clone(&self) -> Self {
+        Self(self.0.clone())
     }
 }
 
-/// A lent record.
-pub(crate) struct Lent {
-    pub record: Mutex<Record>,
-    home: Records,
+impl<T> Default for Pool<T> {
+    fn default() -> Self {
+        Self(Arc::default())
+    }
 }
 
-impl Drop for Lent {
+impl<T: Default> Pool<T> {
+    /// One that is lent until it is dropped.
+    pub fn lend(&self) -> Lent<T> {
+        let lent = self.0.lock().unwrap_or_else(PoisonError::into_inner).pop().unwrap_or_default();
+        Lent { lent: Mutex::new(lent), home: self.clone() }
+    }
+}
+
+/// What a pool has lent.
+pub(crate) struct Lent<T: Default> {
+    lent: Mutex<T>,
+    home: Pool<T>,
+}
+
+impl<T: Default> Lent<T> {
+    /// Access to it, of one at a time.
+    pub fn lock(&self) -> MutexGuard<'_, T> {
+        self.lent.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+}
+
+impl<T: Default> Drop for Lent<T> {
     fn drop(&mut self) {
-        let record = std::mem::take(self.record.get_mut().unwrap_or_else(PoisonError::into_inner));
-        self.home.0.lock().unwrap_or_else(PoisonError::into_inner).push(record);
+        let lent = std::mem::take(self.lent.get_mut().unwrap_or_else(PoisonError::into_inner));
+        self.home.0.lock().unwrap_or_else(PoisonError::into_inner).push(lent);
     }
 }
 
