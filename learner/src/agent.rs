@@ -1,6 +1,7 @@
 //! An algorithm at work in a run: counts its updates, hands over its policy, and saves and loads its whole state.
 
 use crate::algorithms::{Algorithm, AlgorithmError, Definition, Metric, Minibatch};
+use crate::pool::run_awake;
 use candle_core::Device;
 use quad_dataset::Batch;
 use quad_policy::{PolicyError, check_finite, read_tensors};
@@ -79,8 +80,10 @@ impl Agent {
     pub fn update(&mut self, batch: &Batch) -> Result<Vec<f32>, AlgorithmError> {
         let batch = Minibatch::new(batch, &self.device)?;
         let (algorithm, step) = (&mut self.algorithm, self.step);
-        // As a whole on a thread of the pool: else each of its parallel parts would wake one up and wait for it.
-        let values = rayon::scope(|_| algorithm.update(step, &batch))?;
+        let values = match self.device.is_cpu() {
+            true => run_awake(|| algorithm.update(step, &batch))?,
+            false => algorithm.update(step, &batch)?,
+        };
         self.step += 1;
         Ok(values)
     }

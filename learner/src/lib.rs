@@ -8,7 +8,7 @@
 //! - [`threads`] starts the threads that do the work: [`train`] (nothing but gradient steps, by an [`agent`] on a
 //!   [`device`]), [`publisher`] (publishes and saves snapshots) and [`hub`] (hands out jobs, takes scores in).
 //! - [`agent`] runs one of the [`algorithms`], each a file to be read beside its paper, with an [`optimiser`] and the
-//!   [`random`] numbers of its seed.
+//!   [`random`] numbers of its seed, on a thread pool that is kept awake (`pool`).
 //! - [`scoreboard`] is the hub's state without any I/O; [`seeds`] says which episodes an evaluation has.
 //! - [`wire`] declares everything on Zenoh; its callbacks fill an [`inbox`]; [`notice`] is what threads tell the main loop.
 //! - [`run_dir`] is the folder of a run, [`metrics`] are for Prometheus, [`display`] shows progress on the terminal.
@@ -27,6 +27,7 @@ pub mod metrics;
 pub mod notice;
 pub mod optimiser;
 pub mod plot;
+mod pool;
 pub mod publisher;
 pub mod random;
 pub mod report;
