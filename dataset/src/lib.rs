@@ -8,6 +8,8 @@
 //!
 //! This crate knows nothing of networks, simulators or the wire.
 
+#![deny(unsafe_code)]
+
 pub mod environment;
 pub mod error;
 mod file;

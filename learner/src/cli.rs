@@ -35,7 +35,7 @@ pub struct Cli {
 pub enum Command {
     /// Train on a dataset, publish snapshots, hand out evaluations, keep the run in a folder
     #[command(after_help = TRAIN_EXAMPLES)]
-    Train(TrainArgs),
+    Train(Box<TrainArgs>),
     /// Print the evaluations of finished or running runs; several folders are summarised over seeds
     Report(ReportArgs),
 }

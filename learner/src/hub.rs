@@ -4,6 +4,7 @@
 use std::collections::{BTreeMap, BTreeSet};
 use std::time::{Duration, Instant};
 
+use anyhow::anyhow;
 use quad_protocol::{
     CodecError, Hash, JobReply, JobRequest, Message, Name, Progress, RecordedScores, ScoreReply, ScoreReport, decode,
     encode, keys,
@@ -207,6 +208,12 @@ impl Hub {
                 return Ok(ScoreReply::Refused { reason: refusal.to_string() });
             }
         };
+        if let Some(reason) = &report.cannot_act {
+            let (step, evaluator) = (report.step, &report.evaluator);
+            let broken = anyhow!("the policy of step {step} cannot act: {reason} (evaluator {evaluator})");
+            self.notices.send(Notice::Failed(broken)).ok();
+            return Ok(ScoreReply::Recorded { new: 0, duplicates: 0 });
+        }
         if !screened.new.is_empty() {
             let lines: Vec<_> = screened.new.iter().map(|score| ScoreLine::new(report, score)).collect();
             // If this fails nothing is counted, so the scores are new again when the evaluator delivers them once more.

@@ -14,6 +14,8 @@
 //! - [`run_dir`] is the folder of a run, [`metrics`] are for Prometheus, [`display`] shows progress on the terminal.
 //! - [`report`] and [`plot`] summarise the scores as tables and as a picture.
 
+#![deny(unsafe_code)]
+
 pub mod agent;
 pub mod algorithms;
 pub mod cli;

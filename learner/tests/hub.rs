@@ -174,11 +174,26 @@ fn report(job: &Job, evaluator: &str) -> ScoreReport {
         |&seed| EpisodeScore { seed, episode_return: 1000.0, length: 300, score: hopper.normalised_score(1000.0) };
     let Job { run, incarnation, step, weights, .. } = job.clone();
     let episodes = job.seeds.iter().map(episode).collect();
-    ScoreReport { evaluator: name(evaluator), run, incarnation, job: job.id, step, weights, episodes }
+    ScoreReport { evaluator: name(evaluator), run, incarnation, job: job.id, step, weights, episodes, cannot_act: None }
 }
 
 async fn deliver(session: &Session, report: &ScoreReport) -> ScoreReply {
     ask(session, keys::scores(&report.run), Some(encode(report).unwrap())).await.unwrap().unwrap()
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn a_policy_that_cannot_act_ends_the_run_with_the_reason() {
+    let mut bench = Bench::start().await;
+    let client = bench.client().await;
+    bench.snapshot(1000).await;
+    let job = claim_eventually(&client, &bench.run, "a").await;
+    let reason = Some("a value of a candidate is not a number (NaN)".to_owned());
+    let broken = ScoreReport { episodes: Vec::new(), cannot_act: reason, ..report(&job, "a") };
+    let stranger = ScoreReport { evaluator: name("b"), ..broken.clone() };
+    assert!(matches!(deliver(&client, &stranger).await, ScoreReply::Refused { .. }), "it has no such job");
+    deliver(&client, &broken).await;
+    bench.until(|notice| matches!(notice, Notice::Failed(error) if error.to_string().contains("step 1000 cannot act: a value")))
+        .await;
 }
 
 #[tokio::test(flavor = "multi_thread")]

@@ -29,7 +29,7 @@ fn score(seed: u64, episode_return: f64) -> EpisodeScore {
 
 fn report(job: &Job, evaluator: &str, episodes: Vec<EpisodeScore>) -> ScoreReport {
     let Job { run, incarnation, step, weights, .. } = job.clone();
-    ScoreReport { evaluator: name(evaluator), run, incarnation, job: job.id, step, weights, episodes }
+    ScoreReport { evaluator: name(evaluator), run, incarnation, job: job.id, step, weights, episodes, cannot_act: None }
 }
 
 fn full_report(job: &Job, evaluator: &str) -> ScoreReport {

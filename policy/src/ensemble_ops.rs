@@ -40,7 +40,7 @@ impl Networks {
         work: impl Fn(usize, Network<'a>, &'a [f32], &'a [f32], &mut [f32]) + Sync,
     ) {
         let EnsembleShape { members, observation_dim, action_dim, .. } = self.shape;
-        let rows = if action_dim == 0 { observations.len() / observation_dim } else { actions.len() / action_dim };
+        let rows = actions.len().checked_div(action_dim).unwrap_or(observations.len() / observation_dim);
         let repeat = rows * observation_dim / observations.len();
         let states = (TILE / repeat).max(1);
         let (tile, width) = (states * repeat, out.len() / (members * rows));

@@ -5,7 +5,9 @@
 mod reader;
 
 use crate::diffusion::DiffusionPolicy;
-use crate::{DiffusionShape, NoisePredictor, Precision, Weights};
+use crate::{
+    ActionNoise, Description, DiffusionShape, Ensemble, Layout, NoisePredictor, Policy, Precision, Weights, load_policy,
+};
 use candle_core::{Device, Tensor};
 use reader::{Golden, goldens};
 
@@ -56,5 +58,31 @@ fn golden_choices() {
         golden.close("select.actions", &tensor(actions));
         let index: Vec<i64> = golden.expected["select.index"].to_vec1().unwrap();
         assert!(chosen.iter().zip(&index).all(|(found, expected)| *found as i64 == *expected), "{chosen:?} {index:?}");
+    }
+}
+
+/// Finite weights so large that values overflow: the error says what is not a number, and nothing is chosen.
+#[test]
+fn a_candidate_without_a_value_is_an_error() {
+    let shape = DiffusionShape { observation_dim: 4, action_dim: 2, hidden: 8, critics: 3, diffusion_steps: 2 };
+    let constant = |layout: Layout, value: f32| {
+        let values = Tensor::full(value, layout.count(), &Device::Cpu).unwrap();
+        Weights::constant(layout, values)
+    };
+    let policy = |actor: f32, critics: f32| {
+        let actor = NoisePredictor::new(shape.actor(), constant(shape.actor().layout(), actor), Precision::F32);
+        let critics = Ensemble::new(shape.critics(), constant(shape.critics().layout(), critics), Precision::F32);
+        let tensors = DiffusionPolicy::tensors(&actor, &critics).unwrap();
+        let bytes = Description::Diffusion(shape).to_safetensors(&tensors).unwrap();
+        load_policy(&bytes, Precision::F32).unwrap()
+    };
+    let act = |policy: &dyn Policy, observations: &[f32]| {
+        let mut actions = vec![0.0; 2];
+        policy.act(observations, 5, &mut [ActionNoise::new(0)], &mut actions).map(|()| actions)
+    };
+    assert!(act(&*policy(0.1, 0.1), &[1.0; 4]).is_ok());
+    for observations in [[1.0, -1.0, 1e30, 1.0], [f32::NAN, 0.0, 0.0, 0.0]] {
+        let error = act(&*policy(0.1, 1e38), &observations).unwrap_err().to_string();
+        assert!(error.contains("not a number"), "{error}");
     }
 }

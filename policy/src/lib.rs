@@ -16,6 +16,8 @@
 //!
 //! Everything that draws random numbers takes them as an argument or from a seeded generator.
 
+#![deny(unsafe_code)]
+
 #[cfg(test)]
 #[allow(clippy::unwrap_used)]
 mod bodies;

@@ -311,7 +311,9 @@ impl Parts {
 
 fn check_shapes(shape: &NoiseShape, observations: &[usize], actions: &[usize]) -> Result<()> {
     let fits = |dims: &[usize], width| dims.len() == 2 && dims[0] > 0 && dims[1] == width;
-    if fits(observations, shape.observation_dim) && fits(actions, shape.action_dim) && actions[0] % observations[0] == 0
+    if fits(observations, shape.observation_dim)
+        && fits(actions, shape.action_dim)
+        && actions[0].is_multiple_of(observations[0])
     {
         return Ok(());
     }

@@ -14,6 +14,8 @@
 //!
 //! Nothing here knows what the weights mean or how episodes are simulated.
 
+#![deny(unsafe_code)]
+
 mod codec;
 mod hash;
 mod job;

@@ -33,6 +33,9 @@ pub struct ScoreReport {
     pub weights: Hash,
     /// The episodes.
     pub episodes: Vec<EpisodeScore>,
+    /// Why there are none: the policy cannot act, because something on the way to an action is not a number. No other
+    /// evaluator would fare better.
+    pub cannot_act: Option<String>,
 }
 
 /// The learner's answer to a [`ScoreReport`].

@@ -88,6 +88,7 @@ fn claimed_lengths_are_not_believed() {
         step: 3,
         weights: hash,
         episodes: episodes.clone(),
+        cannot_act: Some(environment()),
     });
     claim_too_much(&ScoreReply::Refused { reason: environment() });
     claim_too_much(&RecordedScores { run: name(), step: 1, weights: hash, evaluator: name(), episodes });

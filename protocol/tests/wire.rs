@@ -87,8 +87,8 @@ fn job_reply() -> impl Strategy<Value = JobReply> {
 }
 
 fn score_report() -> impl Strategy<Value = ScoreReport> {
-    (name(), name(), any::<[u64; 3]>(), hash(), episodes()).prop_map(
-        |(evaluator, run, [incarnation, job, step], weights, episodes)| ScoreReport {
+    (name(), name(), any::<[u64; 3]>(), hash(), episodes(), prop::option::of(text())).prop_map(
+        |(evaluator, run, [incarnation, job, step], weights, episodes, cannot_act)| ScoreReport {
             evaluator,
             run,
             incarnation,
@@ -96,6 +96,7 @@ fn score_report() -> impl Strategy<Value = ScoreReport> {
             step,
             weights,
             episodes,
+            cannot_act,
         },
     )
 }

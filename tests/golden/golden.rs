@@ -3,9 +3,13 @@
 use candle_core::{DType, Device, Tensor};
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
+use std::process::Command;
 
 /// Largest error, relative to the number itself or, for numbers near zero, to their tensor's root mean square.
 const TOLERANCE: f32 = 1e-4;
+/// The same for numbers of a fresh seed, some of which may happen to lie close to zero.
+#[allow(dead_code)] // not every crate makes some
+const FRESH_TOLERANCE: f32 = 1e-3;
 
 /// A golden folder.
 pub struct Golden {
@@ -15,6 +19,41 @@ pub struct Golden {
     pub state: BTreeMap<String, Tensor>,
     pub inputs: BTreeMap<String, Tensor>,
     pub expected: BTreeMap<String, Tensor>,
+    tolerance: f32,
+}
+
+/// Runs tests/golden/make.py. Without the Python that deploy/setup.sh --tests sets up it is skipped, unless
+/// QUAD_REQUIRE_PEERS asks for it; says whether it ran.
+#[allow(clippy::print_stderr)] // what is skipped is said
+pub fn make(arguments: &[&str]) -> bool {
+    let home = Path::new(env!("CARGO_MANIFEST_DIR")).join("..");
+    let python = std::env::var_os("QUAD_PYTHON").map_or(home.join(".deps/venv/bin/python"), PathBuf::from);
+    let has_jax = Command::new(&python).args(["-c", "import jax, safetensors"]).output();
+    if !has_jax.is_ok_and(|output| output.status.success()) {
+        let remedy = "deploy/setup.sh --tests installs it";
+        assert!(std::env::var_os("QUAD_REQUIRE_PEERS").is_none(), "{} has no jax; {remedy}", python.display());
+        eprintln!("skipped, because {} has no jax; {remedy}", python.display());
+        return false;
+    }
+    let output = Command::new(python).arg(home.join("tests/golden/make.py")).args(arguments).output().unwrap();
+    let text = String::from_utf8_lossy(&output.stdout) + String::from_utf8_lossy(&output.stderr);
+    assert!(output.status.success(), "make.py {}: {text}", arguments.join(" "));
+    true
+}
+
+/// A folder of a variant that nobody has seen before; `None` where make.py cannot run.
+#[allow(dead_code)] // not every crate makes some
+#[allow(clippy::print_stderr)] // the seed is said, so that a failure can be repeated
+pub fn fresh(variant: &str) -> Option<Golden> {
+    let seed = std::time::UNIX_EPOCH.elapsed().unwrap().subsec_nanos().to_string();
+    eprintln!("make.py --seed {seed} --variant {variant}");
+    let folder = std::env::temp_dir().join(format!("golden-{variant}-{seed}-{}", std::process::id()));
+    if !make(&["--seed", &seed, "--variant", variant, "--out", folder.to_str().unwrap()]) {
+        return None;
+    }
+    let golden = Golden::open(folder);
+    std::fs::remove_dir_all(&golden.folder).unwrap();
+    Some(Golden { tolerance: FRESH_TOLERANCE, ..golden })
 }
 
 /// The folders of one algorithm: the committed ones, or the one that GOLDEN_DIR names.
@@ -47,6 +86,7 @@ impl Golden {
             state: tensors("state.safetensors"),
             inputs: tensors("inputs.safetensors"),
             expected: tensors("expected.safetensors"),
+            tolerance: TOLERANCE,
             folder,
         }
     }
@@ -73,7 +113,7 @@ impl Golden {
         for (i, (found, expected)) in found.iter().zip(&expected).enumerate() {
             let error = (found - expected).abs() / expected.abs().max(size).max(1e-30);
             let place = self.folder.display();
-            assert!(error <= TOLERANCE, "{name} at {i} in {place}: {found}, but expected is {expected}");
+            assert!(error <= self.tolerance, "{name} at {i} in {place}: {found}, but expected is {expected}");
         }
     }
 }

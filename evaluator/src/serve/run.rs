@@ -144,6 +144,7 @@ impl RunClient {
             ask(&self.session, keys::scores(&self.run), encode(report)?, ANSWER_TIMEOUT, &self.metrics).await?;
         let (run, step) = (&self.run, report.step);
         match answer {
+            ScoreReply::Recorded { .. } if report.cannot_act.is_some() => {}
             ScoreReply::Recorded { new, duplicates } => {
                 let scores = report.episodes.iter().map(|episode| episode.score);
                 let mean = scores.clone().sum::<f64>() / report.episodes.len().max(1) as f64;

@@ -6,7 +6,7 @@ use std::time::{Duration, Instant};
 
 use anyhow::Context;
 use quad_dataset::environment::EnvironmentSpec;
-use quad_policy::{Policy, Precision};
+use quad_policy::{Policy, PolicyError, Precision};
 use quad_protocol::{EpisodeScore, Hash, Job, Name, Progress, ScoreReport};
 use tokio::sync::{Notify, watch};
 use tracing::{info, warn};
@@ -151,15 +151,23 @@ impl Worker {
         }
         let environments = ENVIRONMENTS.iter().map(|&name| name.to_owned()).collect();
         let Some(job) = run.claim(environments).await? else { return Ok(()) };
-        let episodes = match self.measure(name, &job, run).await {
-            Ok(episodes) => episodes,
+        let (episodes, cannot_act) = match self.measure(name, &job, run).await {
+            Ok(episodes) => (episodes, None),
             Err(error) => {
                 self.metrics.job(JobOutcome::Failed);
-                return Err(error.context(format!("job {} of step {} failed", job.id, job.step)));
+                let broken = matches!(error.downcast_ref(), Some(PolicyError::NotANumber(_)));
+                let error = error.context(format!("job {} of step {} failed", job.id, job.step));
+                if !broken {
+                    return Err(error);
+                }
+                // The learner must know, or it would hand the job out again and again.
+                warn!(run = %name, "{error:#}");
+                (Vec::new(), Some(format!("{:#}", error.root_cause())))
             }
         };
         let Job { id, run: of, incarnation, step, weights, .. } = job;
-        run.keep(ScoreReport { evaluator: self.name.clone(), run: of, incarnation, job: id, step, weights, episodes });
+        let evaluator = self.name.clone();
+        run.keep(ScoreReport { evaluator, run: of, incarnation, job: id, step, weights, episodes, cannot_act });
         run.deliver().await
     }
 

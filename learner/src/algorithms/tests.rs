@@ -8,7 +8,7 @@ use crate::agent::Agent;
 use crate::config::{Overrides, resolve};
 use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
-pub(super) use reader::{Golden, goldens};
+pub(super) use reader::{Golden, fresh, goldens};
 
 const DIMS: (usize, usize) = (11, 3);
 const STEPS: u64 = 50;
@@ -255,6 +255,13 @@ fn metrics_are_documented() {
     if std::env::var_os("UPDATE_DOCS").is_some() {
         std::fs::write(&path, text).unwrap();
     }
+}
+
+/// The script that makes the golden folders checks its gradients against finite differences, and the committed folders
+/// against what it makes now.
+#[test]
+fn golden_folders_are_what_their_script_makes() {
+    reader::make(&["--check"]);
 }
 
 /// Checks that an update gave what a golden folder expects: each metric and each tensor of the state.

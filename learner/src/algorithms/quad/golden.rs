@@ -1,6 +1,6 @@
 //! Tests: the update against an independent implementation (docs/golden.md).
 
-use super::super::tests::{Golden, check_update, devices, golden_batch, golden_setting, golden_table, goldens};
+use super::super::tests::{Golden, check_update, devices, fresh, golden_batch, golden_setting, golden_table, goldens};
 use super::*;
 
 fn start(golden: &Golden, device: &Device) -> Quad {
@@ -27,22 +27,32 @@ fn noise(golden: &Golden, device: &Device) -> Noise {
     }
 }
 
+fn check(golden: &Golden, device: &Device) {
+    let mut quad = start(golden, device);
+    let (batch, noise) = (golden_batch(golden, device), noise(golden, device));
+    let eta: f32 = quad.eta.to_scalar().unwrap();
+    let values = quad.step(golden.count("/step") as u64, &batch, &noise).unwrap();
+    check_update(golden, METRICS, &values, quad.state().unwrap());
+    let value = |name: &str| values[METRICS.iter().position(|metric| metric.name == name).unwrap()];
+    let guidance_loss = value("actor_loss") - eta * value("bc_loss");
+    // A difference of two larger numbers, so relative to these.
+    let expected = golden.expected["guidance_loss"].to_vec1::<f32>().unwrap()[0];
+    let size = value("actor_loss").abs().max(eta * value("bc_loss"));
+    assert!((guidance_loss - expected).abs() < 1e-4 * size, "{guidance_loss} for {expected}");
+}
+
 #[test]
 fn golden_update() {
     for golden in goldens("quad") {
-        for device in devices() {
-            let mut quad = start(&golden, &device);
-            let (batch, noise) = (golden_batch(&golden, &device), noise(&golden, &device));
-            let eta: f32 = quad.eta.to_scalar().unwrap();
-            let values = quad.step(golden.count("/step") as u64, &batch, &noise).unwrap();
-            check_update(&golden, METRICS, &values, quad.state().unwrap());
-            let value = |name: &str| values[METRICS.iter().position(|metric| metric.name == name).unwrap()];
-            let guidance_loss = value("actor_loss") - eta * value("bc_loss");
-            // A difference of two larger numbers, so relative to these.
-            let expected = golden.expected["guidance_loss"].to_vec1::<f32>().unwrap()[0];
-            let size = value("actor_loss").abs().max(eta * value("bc_loss"));
-            assert!((guidance_loss - expected).abs() < 1e-4 * size, "{guidance_loss} for {expected}");
-        }
+        devices().iter().for_each(|device| check(&golden, device));
+    }
+}
+
+#[test]
+fn golden_update_of_a_fresh_seed() {
+    for variant in ["quad", "dac", "maxq", "none", "one-sample", "ten-critics"] {
+        let Some(golden) = fresh(variant) else { return };
+        devices().iter().for_each(|device| check(&golden, device));
     }
 }
 
