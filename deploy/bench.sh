@@ -1,7 +1,8 @@
 #!/usr/bin/env bash
-# How fast this machine trains and evaluates, beside its own peaks and beside JAX: prints the tables of docs/performance.md.
+# How fast this machine trains and evaluates, beside its own peaks and beside JAX, and each kernel beside a library's:
+# prints the tables of docs/performance.md.
 #
-#   deploy/bench.sh [ROUNDS]     five rounds if not said otherwise, of about a minute and a half each; on an idle machine
+#   deploy/bench.sh [ROUNDS]     five rounds if not said otherwise, of two or three minutes each; on an idle machine
 #
 # Criterion's own reports are in target/criterion afterwards, every figure in target/bench.json.
 set -euo pipefail
@@ -12,5 +13,7 @@ deploy/setup.sh --tests
 cargo bench --locked --workspace --no-run
 cargo build --release --locked --workspace
 [ -e data/hopper-demo.hdf5 ] || target/release/evaluator collect --env hopper --out data/hopper-demo.hdf5
+# The peer must compute what the learner does.
+"$DEPS/venv/bin/python" -W ignore learner/benches/jax_step.py --check >&2
 python3 deploy/bench/bench.py "${1:-5}"
 python3 deploy/bench/service.py

@@ -1,5 +1,5 @@
-"""Runs the benchmarks of learner and evaluator and of their peers in JAX in turns, and prints what docs/performance.md
-shows. To be started by deploy/bench.sh.
+"""Runs the benchmarks of learner, evaluator and kernels and of their peers in turns, and prints what
+docs/performance.md shows. To be started by deploy/bench.sh.
 
     bench.py ROUNDS
 
@@ -14,6 +14,7 @@ import platform
 import statistics
 import subprocess
 import sys
+import time
 from pathlib import Path
 
 # Shapes, as in learner/benches/update.rs and evaluator/benches/rollout.rs.
@@ -23,9 +24,14 @@ CONFIGURATIONS = {
     "paper, 1 sample": {"hidden": 256, "critics": 10, "samples": 1, "predictions": 1},
     "demo": {"hidden": 128, "critics": 5, "samples": 1, "predictions": 0},
 }
+# Timed alone: no arithmetic is counted here, and there is no peer.
+ALONE = ["demo, IQL"]
 EPISODES = CANDIDATES = 10
 ROLLOUT_STEPS = 4
 PEAK_CALLS, PEAK_ROWS, PEAK_WIDTH = 1000, 128, 256
+# In kernels/benches/kernels.rs: which to run, ours, and what a library does in its place.
+KERNELS, OURS = "/20 in turn$|/mish", ("ours", "mish_in_place")
+LIBRARIES = {"gemm": "gemm", "gemm in f32": "gemm, f32", "mish by std's exp": "std's exp"}
 PYTHON = ".deps/venv/bin/python"
 
 
@@ -70,17 +76,32 @@ def parts(hidden, critics, samples, predictions):
     }
 
 
-def criterion(bench, names):
-    """Runs those of a bench whose names match; {name: median seconds}, also of what ran before."""
+def results(bench, names):
+    """Runs those of a bench whose names match; yields what criterion calls each, and its median in seconds."""
     command = ["cargo", "bench", "--locked", "--workspace", "--quiet", "--bench", bench, "--", "--noplot", "--quiet"]
     quick = ["--warm-up-time", "0.3", "--measurement-time", "1", "--sample-size", "10", "--nresamples", "1000"]
+    began = time.time()
     subprocess.run([*command, *quick, names], check=True, capture_output=True)
-    medians = {}
     for folder in Path("target/criterion").rglob("new"):
-        name = json.loads((folder / "benchmark.json").read_text())["full_id"]
-        estimates = json.loads((folder / "estimates.json").read_text())
-        medians[name] = estimates["median"]["point_estimate"] / 1e9
-    return medians
+        estimates = folder / "estimates.json"
+        # What is older ran before, perhaps under a name that there is no more.
+        if estimates.stat().st_mtime >= began - 1:
+            median = json.loads(estimates.read_text())["median"]["point_estimate"] / 1e9
+            yield json.loads((folder / "benchmark.json").read_text()), median
+
+
+def criterion(bench, names):
+    """{name: median seconds}"""
+    return {benchmark["full_id"]: seconds for benchmark, seconds in results(bench, names)}
+
+
+def kernels():
+    """{kernel: {whose: G/s}}: floating-point operations of products, elements of activations."""
+    rates = {}
+    for benchmark, seconds in results("kernels", KERNELS):
+        rate = benchmark["throughput"]["Elements"] / seconds / 1e9
+        rates.setdefault(benchmark["group_id"], {})[benchmark["function_id"]] = rate
+    return rates
 
 
 class Peer:
@@ -114,16 +135,19 @@ def moment(jax, *benches):
 
 
 def measure(count):
-    """{configuration: its rounds}, and those of the evaluation as `rollout`."""
+    """{configuration: its rounds}, those of the evaluation as `rollout` and of the kernels as `kernels`."""
     plain, tuned = Peer("learner/benches/jax_step.py"), Peer("learner/benches/jax_step.py", "--tuned")
     rollout = Peer("evaluator/benches/jax_rollout.py")
-    rounds = {name: [] for name in [*CONFIGURATIONS, "rollout"]}
+    rounds = {name: [] for name in [*CONFIGURATIONS, *ALONE, "rollout", "kernels"]}
     for i in range(count):
         print(f"bench: round {i + 1} of {count}", file=sys.stderr)
         for name in CONFIGURATIONS:
             jax = {"plain": plain.measure(name), "tuned": tuned.measure(name)}
             rounds[name].append(moment(jax, ("update", f"^(peak/|update(, bf16)?/{name}$|{name}/)")))
+        for name in ALONE:
+            rounds[name].append(moment({}, ("update", f"^(peak/|update(, bf16)?/{name}$)")))
         rounds["rollout"].append(moment(rollout.measure(), ("update", "^peak/"), ("rollout", "")))
+        rounds["kernels"].append(kernels())
     return rounds
 
 
@@ -138,7 +162,7 @@ def table(*rows):
     print()
 
 
-def machine(rounds):
+def machine(rounds, count):
     info = Path("/proc/cpuinfo")
     lines = info.read_text().splitlines() if info.exists() else []
     model = next((line.split(": ")[1] for line in lines if line.startswith("model name")), platform.machine())
@@ -146,25 +170,28 @@ def machine(rounds):
     can = ", ".join(flag for flag in ("avx512f", "avx512_bf16", "amx_bf16") if flag in flags) or "no AVX-512"
     product, mish, slope = (median(rounds, lambda x: x["peak"][name]) / 1e9 for name in ("flop", "mish", "slope"))
     print(f"{model} ({can}), {rounds[0]['threads']} threads; the `gemm` crate does {product:.0f} GFLOP/s, a Mish loop")
-    print(f"{mish:.1f} G elements/s, with the slope {slope:.1f}. Medians of {len(rounds) // 4} rounds.\n")
+    print(f"{mish:.1f} G elements/s, with the slope {slope:.1f}. Medians of {count} rounds.\n")
 
 
 def updates(all_rounds):
     head = "gradient step | bound | f32 | of the bound | JAX, plain | ratio | JAX, tuned | ratio | bf16 | over best JAX"
     rows = [head.split(" | ")]
+    ms = lambda of: f"{1e3 * median(rounds, of):.1f} ms"
+    ours = lambda x: x["seconds"][f"update/{name}"]
+    bf16 = lambda x: x["seconds"][f"update, bf16/{name}"]
     for name, shapes in CONFIGURATIONS.items():
         work, rounds = sum(parts(**shapes).values(), Work()), all_rounds[name]
-        ours = lambda x: x["seconds"][f"update/{name}"]
-        bf16 = lambda x: x["seconds"][f"update, bf16/{name}"]
         plain, tuned = (lambda x, kind=kind: min(x["jax"][kind].values()) for kind in ("plain", "tuned"))
         best = lambda x: min(plain(x), tuned(x))
-        ms = lambda of: f"{1e3 * median(rounds, of):.1f} ms"
         ratio = lambda over, under: f"{median(rounds, lambda x: over(x) / under(x)):.2f} ×"
         share = median(rounds, lambda x: work.bound(x["peak"]) / ours(x))
         rows.append(
             [name, ms(lambda x: work.bound(x["peak"])), ms(ours), f"{100 * share:.0f} %", ms(plain), ratio(plain, ours)]
             + [ms(tuned), ratio(tuned, ours), ms(bf16), ratio(best, bf16)]
         )
+    for name in ALONE:
+        rounds = all_rounds[name]
+        rows.append([name, "", ms(ours), "", "", "", "", "", ms(bf16), ""])
     table(*rows)
 
 
@@ -183,7 +210,8 @@ def step_parts(all_rounds):
             )
         whole = median(rounds, lambda x: x["seconds"][f"update/{name}"])
         bound = median(rounds, lambda x: total.bound(x["peak"]))
-        rows.append(["noise, targets, weights λ, waiting", "", "", "", f"{1e3 * (whole - spent):.2f} ms", ""])
+        rest = f"{1e3 * (whole - spent):.2f} ms"
+        rows.append(["noise, targets, weights λ, candle's bookkeeping, waiting", "", "", "", rest, ""])
         figures = [f"{total.flop / 1e9:.2f}", f"{(total.mish + total.slope) / 1e6:.1f}", f"{1e3 * bound:.2f} ms"]
         rows.append(["the step", *figures, f"{1e3 * whole:.2f} ms", f"{100 * bound / whole:.0f} %"])
         table(*rows)
@@ -210,13 +238,27 @@ def rollouts(rounds):
     table(*rows)
 
 
+def kernel_rates(rounds):
+    rows = [["kernel, one thread", "ours", "library", "its rate", "ours over it"]]
+    for kernel, rates in rounds[0].items():
+        mine = next((whose for whose in OURS if whose in rates), None)
+        for library in [whose for whose in LIBRARIES if mine and whose in rates]:
+            ours, theirs = (lambda x, whose=whose: x[kernel][whose] for whose in (mine, library))
+            unit = "GFLOP/s" if mine == "ours" else "G elements/s"
+            mine_rate, its_rate = (f"{median(rounds, of):.3g} {unit}" for of in (ours, theirs))
+            ratio = f"{median(rounds, lambda x: ours(x) / theirs(x)):.2f} ×"
+            rows.append([kernel, mine_rate, LIBRARIES[library], its_rate, ratio])
+    table(*rows)
+
+
 def main():
-    rounds = measure(int(sys.argv[1]))
+    rounds = measure(count := int(sys.argv[1]))
     Path("target/bench.json").write_text(json.dumps(rounds, indent=1))
-    machine([moment for moments in rounds.values() for moment in moments])
+    machine([moment for name, moments in rounds.items() for moment in moments if name != "kernels"], count)
     updates(rounds)
     step_parts(rounds)
     rollouts(rounds["rollout"])
+    kernel_rates(rounds["kernels"])
 
 
 if __name__ == "__main__":
