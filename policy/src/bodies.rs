@@ -190,7 +190,8 @@ fn rounding_changes_little_and_follows_the_weights() {
     let values = |ensemble: &Ensemble| numbers(&ensemble.values(&observations, &actions).unwrap());
     let (a, b) = (values(&exact), values(&rounded));
     let difference = a.iter().zip(&b).map(|(x, y)| (x - y).abs()).fold(0.0, f32::max);
-    assert_eq!(difference > 0.0, Precision::Bf16.is_available(), "rounding is seen where there is any");
+    let rounds = Precision::Bf16.is_available() && has_fast_body(&Device::Cpu);
+    assert_eq!(difference > 0.0, rounds, "rounding is seen where there is any");
     assert!(difference < 0.02, "values differ by {difference}");
     rounded.weights_mut().change(|values| modify(values, |x| x.fill(0.0))).unwrap();
     assert!(values(&rounded).iter().all(|q| *q == 0.0), "kernels rounded before the change were used");

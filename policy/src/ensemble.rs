@@ -5,6 +5,7 @@
 use crate::Precision;
 use crate::ensemble_ops::{ActionGradients, Networks, Outputs, SquaredError};
 use crate::layers::Layers;
+use crate::operation::OnCpu;
 use crate::plain;
 use crate::record::{Pool, Record};
 use crate::rounded::RoundedOnce;
@@ -97,7 +98,7 @@ impl Ensemble {
         };
         let rounds = self.precision == Precision::Bf16 && record.is_none();
         let rounded = if rounds { Some(self.rounded()?) } else { None };
-        let operation = Outputs { networks: self.networks.clone(), rounded, record };
+        let operation = OnCpu(Outputs { networks: self.networks.clone(), rounded, record });
         weights.apply_op3(&observations.contiguous()?, &actions.contiguous()?, operation)
     }
 
@@ -128,7 +129,7 @@ impl Ensemble {
             Some(kept) if has_fast_body(weights.device()) && !actions.track_op() && self.shape.outputs == 1 => {
                 let targets = read(targets, <[f32]>::to_vec)?;
                 let of_tiles = self.gradients.lend();
-                let operation = SquaredError { networks: self.networks.clone(), targets, kept, of_tiles };
+                let operation = OnCpu(SquaredError { networks: self.networks.clone(), targets, kept, of_tiles });
                 weights.apply_op3(&observations.contiguous()?, &actions.contiguous()?, operation)
             }
             _ => self.plain_squared_error(observations, actions, targets),
@@ -142,7 +143,7 @@ impl Ensemble {
         if !has_fast_body(weights.device()) || self.shape.outputs != 1 {
             return self.plain_action_gradients(observations, actions);
         }
-        let operation = ActionGradients { networks: self.networks.clone() };
+        let operation = OnCpu(ActionGradients { networks: self.networks.clone() });
         weights.apply_op3_no_bwd(&observations.contiguous()?, &actions.contiguous()?, &operation)
     }
 

@@ -6,17 +6,14 @@
 use crate::EnsembleShape;
 use crate::layers::{LayerMut, Layers};
 use crate::network::{Input, Network, TILE, part, with_workspace};
+use crate::operation::{Arguments, Operation};
 use crate::record::{Lent, Record, concatenate, layer_gradient};
-use crate::slices::{read, slice};
 use crate::weights::KeptGradient;
-use candle_core::{CpuStorage, CustomOp3, Layout, Result, Shape, Tensor};
+use candle_core::{Result, Shape};
 use quad_kernels::optimiser::weighted_sum;
 use quad_kernels::product::Rounded;
 use rayon::prelude::*;
 use std::sync::Arc;
-
-/// The gradients of a custom operation's three arguments.
-type Gradients = (Option<Tensor>, Option<Tensor>, Option<Tensor>);
 
 /// Where an ensemble's networks lie in its vector of weights.
 pub(crate) struct Networks {
@@ -30,37 +27,34 @@ impl Networks {
     }
 
     /// Cuts `out`, `K × rows × width`, into tiles of rows that do not part the actions of a state, and has `work` fill
-    /// them in parallel: it gets the member, its input but for the state's part, the observations, and the tile.
-    fn for_each_tile<'a>(
-        &'a self,
-        weights: &'a [f32],
-        observations: &'a [f32],
-        actions: &'a [f32],
+    /// them in parallel: it gets the member's number and network, the tile's observations and actions, and the tile.
+    fn for_each_tile(
+        &self,
+        given: Arguments<'_>,
         out: &mut [f32],
-        work: impl Fn(usize, Network<'a>, &'a [f32], &'a [f32], &mut [f32]) + Sync,
+        work: impl Fn(usize, Network<'_>, &[f32], &[f32], &mut [f32]) + Sync,
     ) {
         let EnsembleShape { members, observation_dim, action_dim, .. } = self.shape;
-        let rows = actions.len().checked_div(action_dim).unwrap_or(observations.len() / observation_dim);
-        let repeat = rows * observation_dim / observations.len();
+        let repeat = given.rows / given.states;
         let states = (TILE / repeat).max(1);
-        let (tile, width) = (states * repeat, out.len() / (members * rows));
-        out.par_chunks_mut(rows * width).enumerate().for_each(|(k, out)| {
-            let network = self.member(weights, k);
+        let (tile, width) = (states * repeat, out.len() / (members * given.rows));
+        out.par_chunks_mut(given.rows * width).enumerate().for_each(|(k, out)| {
+            let network = self.member(given.weights, k);
             out.par_chunks_mut(tile * width).enumerate().for_each(|(i, out)| {
-                let observations = part(observations, i * states, states, observation_dim);
-                work(k, network, observations, part(actions, i * tile, tile, action_dim), out);
+                let observations = part(given.observations, i * states, states, observation_dim);
+                work(k, network, observations, part(given.actions, i * tile, tile, action_dim), out);
             });
         });
     }
 
     /// Runs all members forward, tile by tile, and keeps what the way back needs.
-    fn record(&self, weights: &[f32], observations: &[f32], actions: &[f32], record: &mut Record, out: &mut [f32]) {
-        let EnsembleShape { members, observation_dim, action_dim, hidden, outputs } = self.shape;
-        record.resize(members, out.len() / (members * outputs), hidden);
+    fn record(&self, given: Arguments<'_>, record: &mut Record, out: &mut [f32]) {
+        let EnsembleShape { members, observation_dim, action_dim, hidden, .. } = self.shape;
+        record.resize(members, given.rows, hidden);
         record.tiles(out).into_par_iter().for_each(|mut tile| {
-            let network = self.member(weights, tile.member);
-            let observations = part(observations, tile.index * TILE, TILE, observation_dim);
-            let actions = part(actions, tile.index * TILE, TILE, action_dim);
+            let network = self.member(given.weights, tile.member);
+            let observations = part(given.observations, tile.index * TILE, TILE, observation_dim);
+            let actions = part(given.actions, tile.index * TILE, TILE, action_dim);
             with_workspace(|work| {
                 work.with_base(observations.len() / observation_dim * hidden, 0, |base, _, work| {
                     network.state_part(observations, base);
@@ -78,12 +72,6 @@ impl Networks {
             with_workspace(|work| network.backward(tile.out, &mut tile.activations.slope, work.scratch()));
         });
     }
-
-    /// `[s, a]`, row by row.
-    fn input(&self, observations: &Tensor, actions: &Tensor) -> Result<Vec<f32>> {
-        let dims = (self.shape.observation_dim, self.shape.action_dim);
-        read(observations, |s: &[f32]| read(actions, |a: &[f32]| concatenate(s, a, dims)))?
-    }
 }
 
 /// What comes out of the networks: `K × rows × outputs`.
@@ -94,67 +82,38 @@ pub(crate) struct Outputs {
     pub record: Option<(Arc<KeptGradient>, Lent<Record>)>,
 }
 
-impl CustomOp3 for Outputs {
-    fn name(&self) -> &'static str {
-        "ensemble"
-    }
+impl Operation for Outputs {
+    const NAME: &'static str = "ensemble";
 
-    fn cpu_fwd(
-        &self,
-        weights: &CpuStorage,
-        weights_layout: &Layout,
-        observations: &CpuStorage,
-        observations_layout: &Layout,
-        actions: &CpuStorage,
-        actions_layout: &Layout,
-    ) -> Result<(CpuStorage, Shape)> {
+    fn forward(&self, given: Arguments<'_>) -> Result<(Vec<f32>, Shape)> {
         let EnsembleShape { members, observation_dim, hidden, outputs, .. } = self.networks.shape;
-        let weights = slice(weights, weights_layout)?;
-        let (observations, actions) = (slice(observations, observations_layout)?, slice(actions, actions_layout)?);
-        let (states, rows) = (observations_layout.dims()[0], actions_layout.dims()[0]);
-        let mut out = vec![0.0; members * rows * outputs];
+        let mut out = vec![0.0; members * given.rows * outputs];
         if let Some((_, lent)) = &self.record {
-            let mut record = lent.lock();
-            self.networks.record(weights, observations, actions, &mut record, &mut out);
+            self.networks.record(given, &mut lent.lock(), &mut out);
         } else {
-            let repeat = rows / states;
-            self.networks.for_each_tile(
-                weights,
-                observations,
-                actions,
-                &mut out,
-                |k, network, states, actions, out| {
-                    let rounded = self.rounded.as_ref().and_then(|rounded| rounded.get(k));
-                    with_workspace(|work| {
-                        work.with_base(states.len() / observation_dim * hidden, 0, |base, _, work| {
-                            network.state_part(states, base);
-                            let input = Input { base, repeat, shift: network.bias(0), actions };
-                            network.with_rounded(rounded).forward(input, work, out);
-                        });
+            let repeat = given.rows / given.states;
+            self.networks.for_each_tile(given, &mut out, |k, network, states, actions, out| {
+                let rounded = self.rounded.as_ref().and_then(|rounded| rounded.get(k));
+                with_workspace(|work| {
+                    work.with_base(states.len() / observation_dim * hidden, 0, |base, _, work| {
+                        network.state_part(states, base);
+                        let input = Input { base, repeat, shift: network.bias(0), actions };
+                        network.with_rounded(rounded).forward(input, work, out);
                     });
-                },
-            );
+                });
+            });
         }
-        Ok((CpuStorage::F32(out), (members, rows, outputs).into()))
+        Ok((out, (members, given.rows, outputs).into()))
     }
 
-    fn bwd(
-        &self,
-        weights: &Tensor,
-        observations: &Tensor,
-        actions: &Tensor,
-        _: &Tensor,
-        gradient: &Tensor,
-    ) -> Result<Gradients> {
-        if let Some((kept, lent)) = &self.record {
-            let input = self.networks.input(observations, actions)?;
-            let gradient = read(&gradient.contiguous()?, <[f32]>::to_vec)?;
-            let mut record = lent.lock();
-            // The copy is cut up; the other is read as a whole.
-            read(weights, |weights: &[f32]| self.networks.back(weights, &mut record, &mut gradient.clone()))?;
-            kept.write(|out| record.weight_gradients(self.networks.layers.split_mut(out), &input, &gradient))?;
-        }
-        Ok((None, None, None))
+    fn backward(&self, given: Arguments<'_>, gradient: &[f32]) -> Result<()> {
+        let Some((kept, lent)) = &self.record else { return Ok(()) };
+        let EnsembleShape { observation_dim, action_dim, .. } = self.networks.shape;
+        let input = concatenate(given.observations, given.actions, (observation_dim, action_dim));
+        let mut record = lent.lock();
+        // The copy is cut up; the other is read as a whole.
+        self.networks.back(given.weights, &mut record, &mut gradient.to_vec());
+        kept.write(|out| record.weight_gradients(self.networks.layers.split_mut(out), &input, gradient))
     }
 }
 
@@ -201,48 +160,35 @@ impl SquaredError {
     }
 }
 
-impl CustomOp3 for SquaredError {
-    fn name(&self) -> &'static str {
-        "squared-error"
-    }
+impl Operation for SquaredError {
+    const NAME: &'static str = "squared-error";
 
-    fn cpu_fwd(
-        &self,
-        weights: &CpuStorage,
-        weights_layout: &Layout,
-        observations: &CpuStorage,
-        observations_layout: &Layout,
-        actions: &CpuStorage,
-        actions_layout: &Layout,
-    ) -> Result<(CpuStorage, Shape)> {
+    fn forward(&self, given: Arguments<'_>) -> Result<(Vec<f32>, Shape)> {
         let EnsembleShape { members, observation_dim, action_dim, .. } = self.networks.shape;
-        let rows = actions_layout.dims()[0];
-        if [observations_layout.dims()[0], self.targets.len()] != [rows; 2] {
-            candle_core::bail!("{rows} actions need as many observations and targets");
+        if [given.states, self.targets.len()] != [given.rows; 2] {
+            candle_core::bail!("{} actions need as many observations and targets", given.rows);
         }
-        let weights = slice(weights, weights_layout)?;
-        let (observations, actions) = (slice(observations, observations_layout)?, slice(actions, actions_layout)?);
         let mut of_tiles = self.of_tiles.lock();
-        of_tiles.resize(rows.div_ceil(TILE) * weights.len(), 0.0);
+        of_tiles.resize(given.rows.div_ceil(TILE) * given.weights.len(), 0.0);
         let of_members = |(i, gradient)| {
             let mut of_members: Vec<Vec<_>> = (0..members).map(|_| Vec::new()).collect();
             self.networks.layers.split_mut(gradient).into_iter().for_each(|layer| of_members[layer.member].push(layer));
             of_members.into_iter().enumerate().map(move |(k, layers)| (i, k, layers))
         };
-        let tiles: Vec<_> = of_tiles.chunks_exact_mut(weights.len()).enumerate().flat_map(of_members).collect();
+        let tiles: Vec<_> = of_tiles.chunks_exact_mut(given.weights.len()).enumerate().flat_map(of_members).collect();
+        let scale = 1.0 / (members * given.rows) as f32;
         let tile = |(i, k, layers)| {
             let part = |matrix, width| part(matrix, i * TILE, TILE, width);
-            let rows = (part(observations, observation_dim), part(actions, action_dim), part(&self.targets, 1));
-            self.tile(self.networks.member(weights, k), rows, 1.0 / (members * self.targets.len()) as f32, layers)
+            let rows =
+                (part(given.observations, observation_dim), part(given.actions, action_dim), part(&self.targets, 1));
+            self.tile(self.networks.member(given.weights, k), rows, scale, layers)
         };
         let losses: Vec<f32> = tiles.into_par_iter().map(tile).collect();
-        Ok((CpuStorage::F32(vec![losses.iter().sum()]), ().into()))
+        Ok((vec![losses.iter().sum()], ().into()))
     }
 
-    fn bwd(&self, _: &Tensor, _: &Tensor, _: &Tensor, _: &Tensor, gradient: &Tensor) -> Result<Gradients> {
-        let factor = gradient.to_scalar()?;
-        self.kept.write(|sum| weighted_sum(&self.of_tiles.lock(), factor, sum))?;
-        Ok((None, None, None))
+    fn backward(&self, _: Arguments<'_>, gradient: &[f32]) -> Result<()> {
+        self.kept.write(|sum| weighted_sum(&self.of_tiles.lock(), gradient[0], sum))
     }
 }
 
@@ -251,26 +197,13 @@ pub(crate) struct ActionGradients {
     pub networks: Arc<Networks>,
 }
 
-impl CustomOp3 for ActionGradients {
-    fn name(&self) -> &'static str {
-        "action-gradients"
-    }
+impl Operation for ActionGradients {
+    const NAME: &'static str = "action-gradients";
 
-    fn cpu_fwd(
-        &self,
-        weights: &CpuStorage,
-        weights_layout: &Layout,
-        observations: &CpuStorage,
-        observations_layout: &Layout,
-        actions: &CpuStorage,
-        actions_layout: &Layout,
-    ) -> Result<(CpuStorage, Shape)> {
+    fn forward(&self, given: Arguments<'_>) -> Result<(Vec<f32>, Shape)> {
         let EnsembleShape { members, observation_dim, action_dim, hidden, .. } = self.networks.shape;
-        let weights = slice(weights, weights_layout)?;
-        let (observations, actions) = (slice(observations, observations_layout)?, slice(actions, actions_layout)?);
-        let (states, rows) = (observations_layout.dims()[0], actions_layout.dims()[0]);
-        let (mut out, repeat) = (vec![0.0; members * rows * action_dim], rows / states);
-        self.networks.for_each_tile(weights, observations, actions, &mut out, |_, network, states, actions, out| {
+        let (mut out, repeat) = (vec![0.0; members * given.rows * action_dim], given.rows / given.states);
+        self.networks.for_each_tile(given, &mut out, |_, network, states, actions, out| {
             let rows = out.len() / action_dim;
             with_workspace(|work| {
                 work.with_base(states.len() / observation_dim * hidden, rows, |base, values, work| {
@@ -285,6 +218,6 @@ impl CustomOp3 for ActionGradients {
                 });
             });
         });
-        Ok((CpuStorage::F32(out), (members, rows, action_dim).into()))
+        Ok((out, (members, given.rows, action_dim).into()))
     }
 }

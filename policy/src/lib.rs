@@ -10,9 +10,10 @@
 //! - [`Policy`] (`kind`): any policy, read from a file that says what kind it is: [`DiffusionPolicy`] (`diffusion`, the
 //!   best of N_a samples) or [`GaussianPolicy`] (`gaussian`, a mean).
 //! - [`Precision`] (`precision`): how exactly networks are evaluated that no gradient is taken of.
-//! - Below the custom operations: `layers` (where each layer lies in the vector), `network` (one network on one tile of
-//!   rows, over the crate `kernels`), `record` (what is kept for the way back), `rounded` (what is made once of
-//!   weights), `slices` (candle's tensors as slices). `statistics` has the mean and the variance over an ensemble.
+//! - Below: `ensemble_ops` and `noise_ops` (those custom operations, which `operation` gives to candle), `layers` (where
+//!   each layer lies in the vector), `network` (one network on one tile of rows, over the crate `kernels`), `record` (what
+//!   is kept for the way back), `rounded` (what is made once of weights), `slices` (candle's tensors as slices),
+//!   `statistics` (mean and variance over an ensemble).
 //!
 //! Everything that draws random numbers takes them as an argument or from a seeded generator.
 
@@ -32,7 +33,9 @@ mod golden;
 mod kind;
 mod layers;
 mod network;
+mod noise_ops;
 mod noise_predictor;
+mod operation;
 mod plain;
 mod precision;
 mod record;

@@ -15,11 +15,18 @@ pub(crate) fn slice<'a, T: candle_core::WithDType>(storage: &'a CpuStorage, layo
     Ok(&storage.as_slice()?[from..to])
 }
 
+/// The numbers of a contiguous tensor on the CPU.
+pub(crate) fn on_cpu<'a, T: candle_core::WithDType>(storage: &'a Storage, layout: &Layout) -> Result<&'a [T]> {
+    match storage {
+        Storage::Cpu(storage) => slice(storage, layout),
+        _ => candle_core::bail!("a tensor is not on the CPU"),
+    }
+}
+
 /// Hands the numbers of a contiguous tensor on the CPU to `work`.
 pub fn read<T: candle_core::WithDType, R>(tensor: &Tensor, work: impl FnOnce(&[T]) -> R) -> Result<R> {
     let (storage, layout) = tensor.storage_and_layout();
-    let Storage::Cpu(storage) = &*storage else { candle_core::bail!("a tensor is not on the CPU") };
-    Ok(work(slice(storage, layout)?))
+    Ok(work(on_cpu(&storage, layout)?))
 }
 
 /// Has `work` change the numbers of a contiguous tensor on the CPU in place.
