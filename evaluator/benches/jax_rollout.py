@@ -3,7 +3,7 @@
     jax_rollout.py [--seconds S] [--serve]
 
 As is usual, and as DAC does it: one environment, and for each of its steps one call of a compiled function that draws
-ten candidates and returns the one that the critics like best. Networks of the paper's sizes from tests/golden/make.py,
+ten candidates and returns the one that the critics like best. Networks of the paper's sizes from tests/golden,
 float32, weights random. Prints a line of JSON: seconds per environment step, as a median. With --serve it waits for
 lines on standard input, and prints one for each.
 """
@@ -15,15 +15,16 @@ import sys
 import time
 from pathlib import Path
 
-sys.path.insert(0, str(Path(__file__).parents[2] / "tests" / "golden"))
+for folder in "tests/golden", "learner/benches":
+    sys.path.insert(0, str(Path(__file__).parents[2] / folder))
 
 import gymnasium
 import jax
 import jax.numpy as jnp
-import make
+import networks
 import numpy as np
-
-jax.config.update("jax_enable_x64", False)
+import quad
+from jax_step import sample, single  # also has JAX compute in float32 and optimise
 
 
 def main():
@@ -32,18 +33,15 @@ def main():
     parser.add_argument("--serve", action="store_true")
     arguments = parser.parse_args()
 
-    config = make.make_config("quad", "hopper")
+    config = quad.make_config("quad", "hopper")
     steps, candidates, a = config["agent"]["diffusion_steps"], config["candidates"], config["action_dim"]
-    state = make.random_state(config, np.random.default_rng(0))
-    actor, critics = jax.tree.map(
-        lambda x: jnp.asarray(x, jnp.float32), (state["target_actor"], state["target_critic"])
-    )
+    state = quad.random_state(config, np.random.default_rng(0))
+    actor, critics = single((state["target_actor"], state["target_critic"]))
 
     @jax.jit
     def act(actor, critics, observation, key):
-        actions = make.sample(actor, observation[None], jax.random.normal(key, (steps, 1, candidates, a)))[0]
-        states = jnp.broadcast_to(observation, (candidates, len(observation)))
-        return actions[make.values(critics, states, actions).mean(0).argmax()]
+        actions, states = sample(actor, observation[None], jax.random.normal(key, (steps, 1, candidates, a)))
+        return actions[0, networks.values(critics, states, actions).mean(0)[0].argmax()]
 
     environment, key = gymnasium.make("Hopper-v4"), jax.random.key(0)
     observation, _ = environment.reset(seed=0)

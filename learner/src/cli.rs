@@ -49,7 +49,7 @@ pub struct TrainArgs {
     /// HDF5 file in D4RL's layout (`evaluator collect` records one)
     #[arg(long, value_name = "FILE")]
     pub dataset: PathBuf,
-    /// Folder of this run; its last part names the run [default: runs/PRESET-GUIDANCE-seedSEED]
+    /// Folder of this run; its last part names the run [default: runs/PRESET-VARIANT-seedSEED]
     #[arg(long, value_name = "DIR")]
     pub run_dir: Option<PathBuf>,
     /// Listen for evaluators here, e.g. tcp/127.0.0.1:7447, or tcp/0.0.0.0:7447 for other machines

@@ -169,7 +169,7 @@ impl Policy for DiffusionPolicy {
         }
         actions.copy_from_slice(&self.choose(observations, candidates, draws)?.0);
         match actions.iter().any(|x| x.is_nan()) {
-            true => Err(PolicyError::NotANumber("sampled action")),
+            true => Err(PolicyError::NotANumber("a sampled action")),
             false => Ok(()),
         }
     }
@@ -180,7 +180,7 @@ fn best(values: &[f32]) -> Result<usize, PolicyError> {
     let mut best = 0;
     for (i, value) in values.iter().enumerate() {
         if value.is_nan() {
-            return Err(PolicyError::NotANumber("value of a candidate"));
+            return Err(PolicyError::NotANumber("the value of a candidate"));
         }
         if *value > values[best] {
             best = i;

@@ -125,8 +125,9 @@ impl Ensemble {
     pub fn squared_error(&self, observations: &Tensor, actions: &Tensor, targets: &Tensor) -> Result<Tensor> {
         self.check(observations, actions)?;
         let weights = self.weights.values();
+        let follows = observations.track_op() || actions.track_op();
         match self.weights.kept_gradient() {
-            Some(kept) if has_fast_body(weights.device()) && !actions.track_op() && self.shape.outputs == 1 => {
+            Some(kept) if has_fast_body(weights.device()) && !follows && self.shape.outputs == 1 => {
                 let targets = read(targets, <[f32]>::to_vec)?;
                 let of_tiles = self.gradients.lend();
                 let operation = OnCpu(SquaredError { networks: self.networks.clone(), targets, kept, of_tiles });

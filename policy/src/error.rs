@@ -48,7 +48,7 @@ pub enum PolicyError {
     #[error("tensor {0:?} holds a number that is not finite")]
     NotFinite(String),
     /// A NaN on the way to an action.
-    #[error("a {0} is not a number (NaN)")]
+    #[error("{0} is not a number (NaN)")]
     NotANumber(&'static str),
     /// A tensor cannot be computed or moved.
     #[error("candle failed")]

@@ -83,7 +83,7 @@ impl Policy for GaussianPolicy {
         let means = gaussian_mean(&self.actor, &observations)?;
         read(&means, |means: &[f32]| actions.copy_from_slice(means))?;
         if actions.iter().any(|x| x.is_nan()) {
-            return Err(PolicyError::NotANumber("action"));
+            return Err(PolicyError::NotANumber("an action"));
         }
         Ok(())
     }

@@ -169,11 +169,13 @@ impl Weights {
     /// # Errors
     /// If the loss does not depend on these weights.
     pub fn gradient(&self, gradients: &GradStore) -> Result<Tensor> {
-        if let Some(gradient) = self.kept.as_ref().and_then(|kept| kept.take()) {
-            return Ok(gradient);
+        // A loss may reach the weights through custom operations, plain ones, or both.
+        match (self.kept.as_ref().and_then(|kept| kept.take()), gradients.get(&self.values)) {
+            (Some(kept), Some(returned)) => kept + returned,
+            (Some(gradient), None) => Ok(gradient),
+            (None, Some(gradient)) => Ok(gradient.clone()),
+            (None, None) => candle_core::bail!("the loss does not depend on the weights that it is to train"),
         }
-        let missing = || candle_core::Error::Msg("the loss does not depend on the weights that it is to train".into());
-        gradients.get(&self.values).cloned().ok_or_else(missing)
     }
 }
 

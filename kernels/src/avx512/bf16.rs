@@ -141,7 +141,7 @@ mod tests {
     use rand::{Rng, SeedableRng};
     use rand_chacha::ChaCha8Rng;
 
-    /// The dispatched product is tested beside the others in `matmul`; this is about the one that is not chosen there.
+    /// The dispatched product is tested beside the others in `product`; this is about the one that is not chosen there.
     #[test]
     fn tiles_add_up_what_registers_do() {
         if !amx::available() {
