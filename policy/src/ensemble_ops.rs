@@ -5,7 +5,7 @@
 
 use crate::EnsembleShape;
 use crate::layers::{LayerMut, Layers};
-use crate::network::{Input, Network, TILE, part, with_workspace};
+use crate::network::{Input, Network, TILE, rows_of, with_workspace};
 use crate::operation::{Arguments, Operation};
 use crate::record::{Lent, Record, concatenate, layer_gradient};
 use crate::weights::KeptGradient;
@@ -41,8 +41,8 @@ impl Networks {
         out.par_chunks_mut(given.rows * width).enumerate().for_each(|(k, out)| {
             let network = self.member(given.weights, k);
             out.par_chunks_mut(tile * width).enumerate().for_each(|(i, out)| {
-                let observations = part(given.observations, i * states, states, observation_dim);
-                work(k, network, observations, part(given.actions, i * tile, tile, action_dim), out);
+                let observations = rows_of(given.observations, i * states, states, observation_dim);
+                work(k, network, observations, rows_of(given.actions, i * tile, tile, action_dim), out);
             });
         });
     }
@@ -53,8 +53,8 @@ impl Networks {
         record.resize(members, given.rows, hidden);
         record.tiles(out).into_par_iter().for_each(|mut tile| {
             let network = self.member(given.weights, tile.member);
-            let observations = part(given.observations, tile.index * TILE, TILE, observation_dim);
-            let actions = part(given.actions, tile.index * TILE, TILE, action_dim);
+            let observations = rows_of(given.observations, tile.index * TILE, TILE, observation_dim);
+            let actions = rows_of(given.actions, tile.index * TILE, TILE, action_dim);
             with_workspace(|work| {
                 work.with_base(observations.len() / observation_dim * hidden, 0, |base, _, work| {
                     network.state_part(observations, base);
@@ -178,9 +178,9 @@ impl Operation for SquaredError {
         let tiles: Vec<_> = of_tiles.chunks_exact_mut(given.weights.len()).enumerate().flat_map(of_members).collect();
         let scale = 1.0 / (members * given.rows) as f32;
         let tile = |(i, k, layers)| {
-            let part = |matrix, width| part(matrix, i * TILE, TILE, width);
+            let mine = |matrix, width| rows_of(matrix, i * TILE, TILE, width);
             let rows =
-                (part(given.observations, observation_dim), part(given.actions, action_dim), part(&self.targets, 1));
+                (mine(given.observations, observation_dim), mine(given.actions, action_dim), mine(&self.targets, 1));
             self.tile(self.networks.member(given.weights, k), rows, scale, layers)
         };
         let losses: Vec<f32> = tiles.into_par_iter().map(tile).collect();

@@ -243,7 +243,7 @@ impl<'a> Network<'a> {
 }
 
 /// Rows `from .. from + count` (or fewer, at the end) of a matrix with `width` columns.
-pub(crate) fn part(matrix: &[f32], from: usize, count: usize, width: usize) -> &[f32] {
+pub(crate) fn rows_of(matrix: &[f32], from: usize, count: usize, width: usize) -> &[f32] {
     let end = ((from + count) * width).min(matrix.len());
     &matrix[from * width..end]
 }

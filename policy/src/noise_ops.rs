@@ -2,7 +2,7 @@
 //! run in parallel. The sampler runs the whole reverse process for a tile, so that activations stay in a core's cache.
 
 use crate::layers::{LayerMut, Layers};
-use crate::network::{Input, Network, TILE, Workspace, part, with_workspace};
+use crate::network::{Input, Network, TILE, Workspace, rows_of, with_workspace};
 use crate::noise_predictor::TIME_EMBEDDING;
 use crate::operation::{Arguments, Operation};
 use crate::record::{Lent, Record, concatenate};
@@ -76,7 +76,7 @@ impl Parts {
         let states = (share / repeat).max(1);
         let tile = states * repeat * a;
         actions.par_chunks_mut(tile).enumerate().for_each(|(i, actions)| {
-            let observations = part(observations, i * states, states, observation_dim);
+            let observations = rows_of(observations, i * states, states, observation_dim);
             let len = observations.len() / observation_dim * hidden;
             with_workspace(|work| {
                 work.with_base(len, actions.len(), |base, epsilon, work| {
@@ -166,7 +166,7 @@ impl Predict {
     fn tile<'a>(&'a self, observations: &'a [f32], actions: &'a [f32], i: usize) -> (&'a [f32], &'a [f32], &'a [u32]) {
         let NoiseShape { observation_dim, action_dim, .. } = self.parts.shape;
         let t = &self.t[i * TILE..((i + 1) * TILE).min(self.t.len())];
-        (part(observations, i * TILE, TILE, observation_dim), part(actions, i * TILE, TILE, action_dim), t)
+        (rows_of(observations, i * TILE, TILE, observation_dim), rows_of(actions, i * TILE, TILE, action_dim), t)
     }
 
     /// The network and its time embedding, which the way forward leaves for the way back.
