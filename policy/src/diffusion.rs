@@ -12,6 +12,8 @@ use serde::{Deserialize, Serialize};
 
 /// The stream, among those of an episode's seed, that action noise is drawn from.
 const ACTION_STREAM: u64 = 2;
+/// Most denoising steps that are believed; the tensors' shapes do not bound them.
+const MOST_STEPS: usize = 1000;
 /// Before the names of the two networks' tensors.
 const ACTOR: &str = "actor.";
 const CRITIC: &str = "critic.";
@@ -66,8 +68,10 @@ impl DiffusionShape {
         check_range("action_dim", self.action_dim)?;
         check_range("hidden", self.hidden)?;
         check_range("critics", self.critics)?;
-        // The tensors' shapes do not bound it.
-        check_range("diffusion_steps", self.diffusion_steps * 64)
+        if self.diffusion_steps > MOST_STEPS {
+            return Err(PolicyError::Range { field: "diffusion_steps", value: self.diffusion_steps });
+        }
+        check_range("diffusion_steps", self.diffusion_steps)
     }
 }
 

@@ -6,7 +6,8 @@ mod reader;
 
 use crate::diffusion::DiffusionPolicy;
 use crate::{
-    ActionNoise, Description, DiffusionShape, Ensemble, Layout, NoisePredictor, Policy, Precision, Weights, load_policy,
+    ActionNoise, Description, DiffusionShape, Ensemble, Layout, NoisePredictor, Policy, PolicyError, Precision,
+    Tensors, Weights, load_policy,
 };
 use candle_core::{Device, Tensor};
 use reader::{Golden, goldens};
@@ -86,4 +87,19 @@ fn a_candidate_without_a_value_is_an_error() {
     assert!(value.contains("value of a candidate is not a number"), "{value}");
     let action = act(&*policy(0.1, 0.1), &[f32::NAN, 0.0, 0.0, 0.0]).unwrap_err().to_string();
     assert!(action.contains("not a number"), "{action}");
+}
+
+/// Shapes come from strangers: none may ask for unbounded memory, whatever it wraps around to.
+#[test]
+fn a_shape_that_nobody_can_mean_is_refused() {
+    let good = DiffusionShape { observation_dim: 4, action_dim: 2, hidden: 8, critics: 3, diffusion_steps: 2 };
+    let refused = |shape| {
+        let bytes = Description::Diffusion(shape).to_safetensors(&Tensors::new()).unwrap();
+        matches!(load_policy(&bytes, Precision::F32), Err(PolicyError::Range { .. }))
+    };
+    for steps in [0, 1001, (1 << 58) + 1, usize::MAX] {
+        assert!(refused(DiffusionShape { diffusion_steps: steps, ..good }), "{steps} denoising steps");
+    }
+    assert!(refused(DiffusionShape { hidden: usize::MAX, ..good }) && refused(DiffusionShape { critics: 0, ..good }));
+    assert!(!refused(good), "it lacks its tensors, but its shape is one");
 }
