@@ -1,10 +1,19 @@
-//! What is known of an environment without simulating it: sizes, time limit, and the returns that score 0 and 100.
+//! What is known of an environment without simulating it: the table `environments.toml`.
 
-/// Sizes and reference returns of one environment (D4RL's locomotion-v2 semantics).
-#[derive(Debug, PartialEq)]
+use std::sync::LazyLock;
+
+use serde::Deserialize;
+
+use crate::RewardRule;
+
+/// Sizes, limits and reference returns of one environment.
+#[derive(Debug, PartialEq, Deserialize)]
+#[serde(deny_unknown_fields)]
 pub struct EnvironmentSpec {
     /// Name used on command lines, in presets and on the wire.
-    pub name: &'static str,
+    pub name: String,
+    #[serde(default)]
+    simulation: Option<String>,
     /// Numbers in an observation.
     pub observation_dim: usize,
     /// Numbers in an action, each within ±1.
@@ -15,49 +24,91 @@ pub struct EnvironmentSpec {
     pub qvel_dim: usize,
     /// Steps after which an episode is cut off (a timeout, not a termination).
     pub max_episode_steps: usize,
-    /// Undiscounted return that scores 0 (D4RL's random policy).
-    pub min_return: f64,
-    /// Undiscounted return that scores 100 (D4RL's expert).
-    pub max_return: f64,
+    /// Undiscounted returns that score 0 (D4RL's random policy) and 100 (D4RL's expert).
+    reference_returns: (f64, f64),
+    /// How a dataset's rewards are scaled before training, unless a preset says otherwise.
+    pub reward: RewardRule,
+    /// When the goal is drawn, if there is one.
+    #[serde(default)]
+    pub goal: Option<Goal>,
 }
 
-static ENVIRONMENTS: [EnvironmentSpec; 1] = [EnvironmentSpec {
-    name: "hopper",
-    observation_dim: 11,
-    action_dim: 3,
-    qpos_dim: 6,
-    qvel_dim: 6,
-    max_episode_steps: 1000,
-    min_return: -20.272305,
-    max_return: 3234.3,
-}];
+/// When an environment with a goal draws it anew.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Deserialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum Goal {
+    /// Once, when the environment is made (D4RL's AntMaze v0 and v1).
+    EachInstance,
+    /// At each reset (D4RL's AntMaze v2).
+    EachEpisode,
+}
+
+#[derive(Deserialize)]
+#[serde(deny_unknown_fields)]
+struct Table {
+    environment: Vec<EnvironmentSpec>,
+}
+
+#[allow(clippy::expect_used)] // The table is part of the program; the first test here reads it.
+static ENVIRONMENTS: LazyLock<Vec<EnvironmentSpec>> = LazyLock::new(|| {
+    let table: Table = toml::from_str(include_str!("../environments.toml")).expect("the embedded table is valid");
+    table.environment
+});
+
+/// All environments of the table.
+pub fn all() -> &'static [EnvironmentSpec] {
+    &ENVIRONMENTS
+}
 
 /// The name of no environment.
 #[derive(Debug, PartialEq, thiserror::Error)]
-#[error("unknown environment `{name}`; known: {}", ENVIRONMENTS.iter().map(|e| e.name).collect::<Vec<_>>().join(", "))]
+#[error("unknown environment `{name}`; known: {}", names().join(", "))]
 pub struct UnknownEnvironment {
     /// What was asked for.
     pub name: String,
 }
 
+/// The names of all environments, in the order of the table.
+pub fn names() -> Vec<&'static str> {
+    all().iter().map(|environment| environment.name.as_str()).collect()
+}
+
 /// The environment of that name.
 pub fn find(name: &str) -> Result<&'static EnvironmentSpec, UnknownEnvironment> {
-    ENVIRONMENTS
+    all()
         .iter()
         .find(|environment| environment.name == name)
         .ok_or_else(|| UnknownEnvironment { name: name.to_owned() })
 }
 
 impl EnvironmentSpec {
+    /// Whose physics it has: a name that several environments may share.
+    pub fn simulation(&self) -> &str {
+        self.simulation.as_deref().unwrap_or(&self.name)
+    }
+
     /// D4RL's normalised score of an undiscounted return: `100 · (R - min) / (max - min)`.
     pub fn normalised_score(&self, episode_return: f64) -> f64 {
-        100.0 * (episode_return - self.min_return) / (self.max_return - self.min_return)
+        let (min, max) = self.reference_returns;
+        100.0 * (episode_return - min) / (max - min)
     }
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn the_table_is_consistent() {
+        assert!(all().len() >= 6);
+        for spec in all() {
+            assert_eq!(find(&spec.name), Ok(spec), "names are unique");
+            let physics = find(spec.simulation()).unwrap();
+            let sizes = |spec: &EnvironmentSpec| (spec.observation_dim, spec.action_dim, spec.qpos_dim, spec.qvel_dim);
+            assert_eq!(sizes(spec), sizes(physics), "{}", spec.name);
+            assert!(spec.reference_returns.1 > spec.reference_returns.0, "{}", spec.name);
+        }
+    }
 
     #[test]
     fn references_score_zero_and_a_hundred() {
@@ -70,6 +121,9 @@ mod tests {
     #[test]
     fn an_unknown_name_is_answered_with_the_known_ones() {
         let error = find("Hopper-v2").unwrap_err();
-        assert_eq!(error.to_string(), "unknown environment `Hopper-v2`; known: hopper");
+        assert!(
+            error.to_string().starts_with("unknown environment `Hopper-v2`; known: hopper, halfcheetah"),
+            "{error}"
+        );
     }
 }

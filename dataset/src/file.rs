@@ -51,6 +51,18 @@ impl DatasetFile {
         self.file.link_exists(array)
     }
 
+    /// Numbers in a row of an array.
+    pub(crate) fn width(&self, array: &'static str) -> Result<usize, DatasetError> {
+        match self.array(array)?.shape()[..] {
+            [_] => Ok(1),
+            [_, width] if width > 0 => Ok(width),
+            ref found => {
+                let (path, found) = (self.path.clone(), found.to_vec());
+                Err(DatasetError::Shape { path, array, found, expected: vec![self.rows, 1] })
+            }
+        }
+    }
+
     /// An array of `rows × width` numbers, row by row. A width of 1 may also be written without its axis.
     pub(crate) fn numbers<T: H5Type + Copy + Into<f64>>(
         &self,

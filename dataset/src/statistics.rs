@@ -15,12 +15,12 @@ pub struct Statistics {
     pub return_min: f64,
     /// Largest return.
     pub return_max: f64,
-    /// Mean normalised score of the episodes ([`EnvironmentSpec::normalised_score`]).
-    pub score_mean: f64,
+    /// Mean normalised score of the episodes ([`EnvironmentSpec::normalised_score`]), where there are reference returns.
+    pub score_mean: Option<f64>,
 }
 
 impl Statistics {
-    pub(crate) fn new(environment: &EnvironmentSpec, transitions: usize, returns: &[f64]) -> Self {
+    pub(crate) fn new(environment: Option<&EnvironmentSpec>, transitions: usize, returns: &[f64]) -> Self {
         let return_mean = returns.iter().sum::<f64>() / returns.len() as f64;
         Self {
             transitions,
@@ -29,7 +29,7 @@ impl Statistics {
             return_min: returns.iter().copied().fold(f64::INFINITY, f64::min),
             return_max: returns.iter().copied().fold(f64::NEG_INFINITY, f64::max),
             // The score is linear in the return, so this is the mean of the scores too.
-            score_mean: environment.normalised_score(return_mean),
+            score_mean: environment.map(|environment| environment.normalised_score(return_mean)),
         }
     }
 }

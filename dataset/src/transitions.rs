@@ -15,8 +15,9 @@ const SAME_OBSERVATION: f64 = 1e-6;
 /// How a file is to be read.
 #[derive(Clone, Copy, Debug)]
 pub struct ReadOptions {
-    /// The environment it was recorded in.
-    pub environment: &'static EnvironmentSpec,
+    /// The environment it was recorded in, if it is known: sizes, time limit and reference returns come from there. Else
+    /// the file's own sizes count, and without timeouts nothing is cut off.
+    pub environment: Option<&'static EnvironmentSpec>,
     /// What happens to its rewards.
     pub reward: RewardRule,
 }
@@ -48,13 +49,19 @@ impl Transitions {
     pub fn read(path: impl AsRef<Path>, options: &ReadOptions) -> Result<Self, DatasetError> {
         let ReadOptions { environment, reward } = *options;
         let file = DatasetFile::open(path.as_ref())?;
-        let observations = file.numbers::<f32>("observations", environment.observation_dim)?;
-        let mut actions = file.numbers::<f32>("actions", environment.action_dim)?;
+        let (observation_dim, action_dim) = match environment {
+            Some(environment) => (environment.observation_dim, environment.action_dim),
+            None => (file.width("observations")?, file.width("actions")?),
+        };
+        let observations = file.numbers::<f32>("observations", observation_dim)?;
+        let mut actions = file.numbers::<f32>("actions", action_dim)?;
         let mut rewards = file.numbers::<f32>("rewards", 1)?;
         let terminals = file.flags("terminals")?;
         let timeouts = match file.has("timeouts") {
             true => file.flags("timeouts")?,
-            false => derive_timeouts(&terminals, environment.max_episode_steps),
+            false => {
+                derive_timeouts(&terminals, environment.map_or(usize::MAX, |environment| environment.max_episode_steps))
+            }
         };
 
         let transitions = file.rows().saturating_sub(1);
@@ -62,7 +69,7 @@ impl Transitions {
         if rows.is_empty() {
             return Err(DatasetError::NoTransitions { path: file.path().into(), rows: file.rows() });
         }
-        let ends = trajectory_ends(&rows, &terminals, &observations, environment.observation_dim);
+        let ends = trajectory_ends(&rows, &terminals, &observations, observation_dim);
         let trajectory_returns = returns(rows.iter().map(|&row| rewards[row as usize]).zip(ends));
         let scale =
             reward.scale(&trajectory_returns).ok_or_else(|| DatasetError::SameReturns { path: file.path().into() })?;
@@ -72,16 +79,7 @@ impl Transitions {
 
         actions.iter_mut().for_each(|action| *action = action.clamp(-ACTION_LIMIT, ACTION_LIMIT));
         rewards.iter_mut().for_each(|reward| *reward = (f64::from(*reward) * scale) as f32);
-        Ok(Self {
-            observation_dim: environment.observation_dim,
-            action_dim: environment.action_dim,
-            observations,
-            actions,
-            rewards,
-            terminals,
-            rows,
-            statistics,
-        })
+        Ok(Self { observation_dim, action_dim, observations, actions, rewards, terminals, rows, statistics })
     }
 
     /// Number of transitions, at least 1.

@@ -129,7 +129,7 @@ impl D4rlWriter {
         let text = |value: &str| VarLenUnicode::from_str(value).map_err(|error| error.to_string());
         let group = self.file.create_group("metadata")?;
         group.new_dataset::<VarLenUnicode>().create("algorithm")?.write_scalar(&text(metadata.algorithm)?)?;
-        group.new_dataset::<VarLenUnicode>().create("environment")?.write_scalar(&text(self.environment.name)?)?;
+        group.new_dataset::<VarLenUnicode>().create("environment")?.write_scalar(&text(&self.environment.name)?)?;
         group.new_dataset::<i64>().create("iteration")?.write_scalar(&metadata.iteration)?;
         group.new_dataset::<u64>().create("seed")?.write_scalar(&metadata.seed)
     }

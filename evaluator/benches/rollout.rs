@@ -45,7 +45,7 @@ fn steps(criterion: &mut Criterion) {
         let policy = policy(precision);
         group.bench_function(format!("{STEPS} steps, {name}"), |bencher| {
             bencher.iter_batched_ref(
-                || Rollout::new(spec, &seeds, ActionNoise::new).expect("MuJoCo compiles the embedded model"),
+                || Rollout::new(spec, 0, &seeds, ActionNoise::new).expect("MuJoCo compiles the embedded model"),
                 |rollout| {
                     rayon::scope(|_| {
                         for _ in 0..STEPS {
@@ -85,7 +85,7 @@ fn select(criterion: &mut Criterion) {
 /// Control periods of one Hopper on one thread, actions uniform at random.
 fn hopper(criterion: &mut Criterion) {
     let mut environment =
-        make(find("hopper").expect("a known environment")).expect("MuJoCo compiles the embedded model");
+        make(find("hopper").expect("a known environment"), 0).expect("MuJoCo compiles the embedded model");
     let mut random = ChaCha8Rng::seed_from_u64(0);
     let mut seed = 0;
     environment.reset(seed);

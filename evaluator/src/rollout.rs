@@ -52,15 +52,16 @@ pub struct EpisodeOutcome {
 }
 
 impl<N> Rollout<N> {
-    /// Resets one environment per seed; `noise` makes each episode's noise out of its seed.
+    /// Makes one environment per seed, each with what the seed `instance` gives once for all, and resets it; `noise` makes each episode's noise out of its seed.
     pub fn new(
         spec: &'static EnvironmentSpec,
+        instance: u64,
         seeds: &[u64],
         noise: impl FnMut(u64) -> N,
     ) -> Result<Self, EnvironmentError> {
         let mut live = Vec::with_capacity(seeds.len());
         for (index, &seed) in seeds.iter().enumerate() {
-            let mut environment = environment::make(spec)?;
+            let mut environment = environment::make(spec, instance)?;
             environment.reset(seed);
             live.push(Episode { environment, index, seed, episode_return: 0.0, length: 0, ended: false });
         }

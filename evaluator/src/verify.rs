@@ -71,7 +71,7 @@ pub fn verify(path: &Path, spec: &'static EnvironmentSpec) -> Result<Report, Ver
     let threads = rayon::current_num_threads();
     let share = rows.len().div_ceil(threads);
     let mut environments =
-        (0..threads).map(|_| environment::make(spec)).collect::<Result<Vec<_>, EnvironmentError>>()?;
+        (0..threads).map(|_| environment::make(spec, 0)).collect::<Result<Vec<_>, EnvironmentError>>()?;
     let errors: Vec<RowError> = environments
         .par_iter_mut()
         .enumerate()

@@ -76,7 +76,7 @@ struct RecordedStep {
 fn steps_from_random_states_are_gymnasiums() {
     let Some(recording) = reference::<Recording>(&["steps"]) else { return };
     assert!(recording.sequences.len() >= 1000);
-    let mut hopper = make(find("hopper").unwrap()).unwrap();
+    let mut hopper = make(find("hopper").unwrap(), 0).unwrap();
     let (mut worst, mut steps, mut terminated) = (0.0_f64, 0, 0);
     for (number, sequence) in recording.sequences.iter().enumerate() {
         hopper.set_state(&sequence.qpos, &sequence.qvel);

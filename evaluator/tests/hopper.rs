@@ -5,7 +5,7 @@ use quad_dataset::environment::find;
 use quad_evaluator::environment::{Environment, Step, make};
 
 fn hopper() -> Box<dyn Environment> {
-    make(find("hopper").unwrap()).unwrap()
+    make(find("hopper").unwrap(), 0).unwrap()
 }
 
 const STANDING: [f64; 6] = [0.0, 1.25, 0.0, 0.0, 0.0, 0.0];

@@ -26,7 +26,7 @@ fn select(observations: &[f32], noise: &mut [ChaCha8Rng], actions: &mut [f32]) -
 }
 
 fn run(seeds: &[u64]) -> Vec<EpisodeOutcome> {
-    let mut rollout = Rollout::new(find("hopper").unwrap(), seeds, ChaCha8Rng::seed_from_u64).unwrap();
+    let mut rollout = Rollout::new(find("hopper").unwrap(), 0, seeds, ChaCha8Rng::seed_from_u64).unwrap();
     let mut steps = 0;
     while !rollout.is_done() {
         rollout.step(select).unwrap();
@@ -56,7 +56,7 @@ fn an_outcome_depends_on_its_seed_alone() {
 #[test]
 fn an_outcome_is_what_stepping_by_hand_gives() {
     let spec = find("hopper").unwrap();
-    let mut hopper = make(spec).unwrap();
+    let mut hopper = make(spec, 0).unwrap();
     for outcome in run(&[5, 6]) {
         let mut noise = ChaCha8Rng::seed_from_u64(outcome.seed);
         let (mut episode_return, mut length) = (0.0, 0);
@@ -84,7 +84,7 @@ fn no_seeds_are_done_at_once() {
 
 #[test]
 fn a_policy_that_fails_stops_the_batch_where_it_is() {
-    let mut rollout = Rollout::new(find("hopper").unwrap(), &[1, 2], ChaCha8Rng::seed_from_u64).unwrap();
+    let mut rollout = Rollout::new(find("hopper").unwrap(), 0, &[1, 2], ChaCha8Rng::seed_from_u64).unwrap();
     rollout.step(select).unwrap();
     assert_eq!(rollout.step(|_, _, _| Err("no action")), Err("no action"));
     assert_eq!((rollout.environment_steps(), rollout.episodes_done()), (2, 0));

@@ -110,8 +110,18 @@ pub struct DatasetInfo {
     pub mean_return: f64,
     /// See `min_return`.
     pub max_return: f64,
-    /// Mean D4RL-normalised score of the trajectories.
-    pub mean_score: f64,
+    /// Mean D4RL-normalised score of the trajectories, where the environment has reference returns.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub mean_score: Option<f64>,
+}
+
+impl DatasetInfo {
+    /// How much it holds and how good it is, in one line.
+    pub fn summary(&self) -> String {
+        let Self { transitions, episodes, mean_return, mean_score, .. } = self;
+        let score = mean_score.map(|score| format!(", mean score {score:.2}")).unwrap_or_default();
+        format!("{transitions} transitions of {episodes} episodes, mean return {mean_return:.2}{score}")
+    }
 }
 
 /// A preset that cannot be used.

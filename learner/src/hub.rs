@@ -7,7 +7,7 @@ use std::time::{Duration, Instant};
 use anyhow::anyhow;
 use quad_protocol::{
     CodecError, Hash, JobReply, JobRequest, Message, Name, Progress, RecordedScores, ScoreReply, ScoreReport, decode,
-    encode, keys,
+    encode, episode_seeds, keys,
 };
 use tokio::sync::mpsc::UnboundedSender;
 use tracing::{debug, error};
@@ -22,7 +22,6 @@ use crate::metrics::Metrics;
 use crate::notice::Notice;
 use crate::run_dir::{Log, RunDirError, ScoreLine};
 use crate::scoreboard::{Refusal, Scoreboard};
-use crate::seeds::episode_seeds;
 
 /// How often expired leases are looked for.
 const TICK: Duration = Duration::from_millis(250);

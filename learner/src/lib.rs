@@ -9,7 +9,7 @@
 //!   [`device`]), [`publisher`] (publishes and saves snapshots) and [`hub`] (hands out jobs, takes scores in).
 //! - [`agent`] runs one of the [`algorithms`], each a file to be read beside its paper, with an [`optimiser`] and the
 //!   [`random`] numbers of its seed, on a thread pool that is kept awake (`pool`).
-//! - [`scoreboard`] is the hub's state without any I/O; [`seeds`] says which episodes an evaluation has.
+//! - [`scoreboard`] is the hub's state without any I/O.
 //! - [`wire`] declares everything on Zenoh; its callbacks fill an [`inbox`]; [`notice`] is what threads tell the main loop.
 //! - [`run_dir`] is the folder of a run, [`metrics`] are for Prometheus, [`display`] shows progress on the terminal.
 //! - [`report`] and [`plot`] summarise the scores as tables and as a picture.
@@ -36,7 +36,6 @@ pub mod report;
 pub mod run;
 pub mod run_dir;
 pub mod scoreboard;
-pub mod seeds;
 pub mod threads;
 pub mod train;
 pub mod wire;

@@ -5,7 +5,7 @@ use std::collections::BTreeMap;
 use std::time::Duration;
 
 use anyhow::Context;
-use quad_dataset::EnvironmentSpec;
+use quad_dataset::Task;
 use quad_protocol::{Hash, Name, Schema, Snapshot, encode, keys};
 use tokio::sync::mpsc::UnboundedSender;
 use tracing::debug;
@@ -48,7 +48,7 @@ pub struct Identity {
     /// Which start of the learner this is.
     pub incarnation: u64,
     /// Environment that the policy acts in.
-    pub environment: &'static EnvironmentSpec,
+    pub task: Task,
 }
 
 /// State of the thread.
@@ -125,11 +125,11 @@ impl SnapshotPublisher {
     }
 
     fn message(&self, step: u64, hash: Hash, tensors: Vec<u8>) -> Snapshot {
-        let Identity { run, incarnation, environment } = self.identity.clone();
+        let Identity { run, incarnation, task } = self.identity.clone();
         let schema = Schema {
-            environment: environment.name.to_owned(),
-            observation_dim: environment.observation_dim as u32,
-            action_dim: environment.action_dim as u32,
+            environment: task.environment,
+            observation_dim: task.observation_dim as u32,
+            action_dim: task.action_dim as u32,
             policy: self.kind.to_owned(),
         };
         Snapshot { run, incarnation, step, schema, hash, tensors }

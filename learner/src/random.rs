@@ -11,8 +11,6 @@ pub enum Purpose {
     Weights,
     /// The noise of an update; counted by gradient step.
     Noise,
-    /// The seeds of an evaluation's episodes; counted by gradient step.
-    Episodes,
 }
 
 impl Purpose {
@@ -20,7 +18,6 @@ impl Purpose {
         u64::from_be_bytes(match self {
             Self::Weights => *b"weights ",
             Self::Noise => *b"noise   ",
-            Self::Episodes => *b"episodes",
         })
     }
 }

@@ -70,7 +70,7 @@ pub struct RunReport {
     pub seed: u64,
     /// Gradient steps.
     pub steps: u64,
-    /// Mean normalised score of the dataset's trajectories.
+    /// Mean normalised score of the dataset's trajectories; without reference returns, their mean return.
     pub dataset_score: f64,
     /// Its evaluations by step.
     pub evaluations: Vec<EvaluationReport>,
@@ -159,7 +159,7 @@ impl RunReport {
             candidates: experiment.candidates,
             seed: experiment.seed,
             steps: experiment.steps,
-            dataset_score: config.dataset.mean_score,
+            dataset_score: config.dataset.mean_score.unwrap_or(config.dataset.mean_return),
             evaluations,
             mean_last_3,
             mean_last_5,

@@ -5,7 +5,7 @@ use std::path::{Path, PathBuf};
 use std::time::{SystemTime, UNIX_EPOCH};
 
 use anyhow::{Context, anyhow};
-use quad_dataset::{EnvironmentSpec, ReadOptions, Transitions};
+use quad_dataset::{ReadOptions, Transitions};
 use quad_policy::Precision;
 use quad_protocol::Name;
 use quad_service::{Endpoints, Hint};
@@ -67,14 +67,15 @@ fn train(args: &TrainArgs) -> anyhow::Result<()> {
 
     args.device.check(experiment.precision)?;
 
-    let environment = quad_dataset::environment::find(&experiment.environment)?;
-    let options = ReadOptions { environment, reward: experiment.reward };
+    let options = ReadOptions {
+        environment: quad_dataset::environment::find(&experiment.environment).ok(),
+        reward: experiment.reward,
+    };
     let transitions = Transitions::read(&args.dataset, &options)
         .with_context(|| format!("cannot learn from {}", args.dataset.display()))
-        .hint(format!("record a dataset with `evaluator collect --env {} --out FILE`", environment.name))?;
+        .hint(format!("record a dataset with `evaluator collect --env {} --out FILE`", experiment.environment))?;
     let config = run_config(args, &name, experiment, &transitions)?;
-    let DatasetInfo { transitions: count, episodes, mean_score, .. } = &config.dataset;
-    info!("{count} transitions of {episodes} episodes, mean score {mean_score:.2}");
+    info!("{}", config.dataset.summary());
     info!("{}", config.experiment.summary()?);
     if !config.experiment.precision.is_available() {
         warn!("{}", Precision::UNAVAILABLE);
@@ -83,7 +84,7 @@ fn train(args: &TrainArgs) -> anyhow::Result<()> {
 
     // Zenoh and the training thread have threads of their own; this runtime serves the metrics and the main loop.
     let runtime = tokio::runtime::Builder::new_multi_thread().worker_threads(2).enable_all().build()?;
-    let (run_dir, ending) = runtime.block_on(conduct(args, &path, name, &config, environment, transitions))?;
+    let (run_dir, ending) = runtime.block_on(conduct(args, &path, name, &config, transitions))?;
     conclude(&run_dir, &config, ending)
 }
 
@@ -92,7 +93,6 @@ async fn conduct(
     path: &Path,
     run: Name,
     config: &RunConfig,
-    environment: &'static EnvironmentSpec,
     transitions: Transitions,
 ) -> anyhow::Result<(RunDir, Ending)> {
     let steps = config.experiment.steps;
@@ -106,7 +106,7 @@ async fn conduct(
     // From here on nothing outside can be wrong any more, so a refused start leaves no folder behind.
     let run_dir = RunDir::create(path, config)?;
     let (notify, notices) = mpsc::unbounded_channel();
-    let threads = Threads::start(&run, config, environment, transitions, &run_dir, &metrics, &notify)?;
+    let threads = Threads::start(&run, config, transitions, &run_dir, &metrics, &notify)?;
     let display = Display::start(metrics.clone(), steps);
     let metrics_address = server.address.to_string();
     let conductor = Conductor {

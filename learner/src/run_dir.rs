@@ -71,6 +71,9 @@ pub struct ScoreLine {
     pub score: f64,
     /// BLAKE3 of the snapshot's file.
     pub weights: String,
+    /// Arithmetic that the policy was computed in; lines from before there was a choice do not say.
+    #[serde(default)]
+    pub precision: String,
     /// Who measured it.
     pub evaluator: String,
 }
@@ -85,6 +88,7 @@ impl ScoreLine {
             length: score.length,
             score: score.score,
             weights: report.weights.to_string(),
+            precision: report.precision.to_string(),
             evaluator: report.evaluator.to_string(),
         }
     }

@@ -7,7 +7,7 @@
 use std::collections::BTreeMap;
 use std::time::{Duration, Instant};
 
-use quad_dataset::EnvironmentSpec;
+use quad_dataset::Task;
 use quad_protocol::{EpisodeScore, Hash, Job, JobReply, JobRequest, Name, Progress, ScoreReport};
 
 /// After this time an evaluator asks again when there was no job for it.
@@ -25,7 +25,9 @@ pub struct Rules {
     /// Which start of the learner this is.
     pub incarnation: u64,
     /// Where policies are evaluated.
-    pub environment: &'static EnvironmentSpec,
+    pub task: Task,
+    /// Seed of what the environment draws once for the whole run.
+    pub instance: u64,
     /// Actions sampled per state.
     pub candidates: u32,
     /// Most episodes in one job.
@@ -157,7 +159,7 @@ impl Scoreboard {
     pub fn claim(&mut self, request: &JobRequest, now: Instant) -> JobReply {
         let wait = |time: Duration| JobReply::Wait { milliseconds: time.as_millis() as u64 };
         let rules = &self.rules;
-        if !request.environments.iter().any(|name| name == rules.environment.name) {
+        if !request.environments.iter().any(|name| *name == rules.task.environment) {
             return wait(NOT_FOR_YOU);
         }
         let id = self.jobs.keys().next_back().map_or(1, |newest| newest + 1);
@@ -180,7 +182,8 @@ impl Scoreboard {
                 incarnation: rules.incarnation,
                 step,
                 weights: evaluation.weights,
-                environment: rules.environment.name.to_owned(),
+                environment: rules.task.environment.clone(),
+                instance: rules.instance,
                 seeds,
                 candidates: rules.candidates,
                 lease_milliseconds: rules.lease.as_millis() as u64,
@@ -225,10 +228,13 @@ impl Scoreboard {
     }
 
     fn is_possible(&self, score: &EpisodeScore) -> bool {
-        let environment = self.rules.environment;
-        let expected = environment.normalised_score(score.episode_return);
-        let length_fits = (1..=environment.max_episode_steps).contains(&(score.length as usize));
-        length_fits && (score.score - expected).abs() <= SCORE_TOLERANCE * expected.abs().max(1.0)
+        let task = &self.rules.task;
+        let expected = task.score(score.episode_return);
+        let longest = task.max_episode_steps().unwrap_or(usize::MAX);
+        let length_fits = (1..=longest).contains(&(score.length as usize));
+        length_fits
+            && expected.is_finite()
+            && (score.score - expected).abs() <= SCORE_TOLERANCE * expected.abs().max(1.0)
     }
 
     /// Counts the new scores of a report that [`screen`](Self::screen) let pass.

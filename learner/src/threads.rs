@@ -7,7 +7,7 @@ use std::thread::{self, JoinHandle};
 use std::time::Duration;
 
 use anyhow::anyhow;
-use quad_dataset::{BatchSampler, EnvironmentSpec, Transitions};
+use quad_dataset::{BatchSampler, Task, Transitions};
 use quad_protocol::Name;
 use tokio::sync::mpsc::UnboundedSender;
 use tokio::sync::oneshot;
@@ -56,17 +56,18 @@ impl Threads {
     pub fn start(
         run: &Name,
         config: &RunConfig,
-        environment: &'static EnvironmentSpec,
         transitions: Transitions,
         run_dir: &RunDir,
         metrics: &Metrics,
         notices: &UnboundedSender<Notice>,
     ) -> anyhow::Result<Self> {
         let experiment = &config.experiment;
+        let task = Task::new(&experiment.environment, transitions.observation_dim(), transitions.action_dim());
         let rules = Rules {
             run: run.clone(),
             incarnation: config.run.incarnation,
-            environment,
+            task: task.clone(),
+            instance: experiment.seed,
             candidates: experiment.candidates,
             job_episodes: JOB_EPISODES,
             lease: LEASE,
@@ -77,7 +78,7 @@ impl Threads {
         let (hub, hub_messages) = inbox();
         let hub_thread = spawn("hub", move || state.run(&hub_messages))?;
 
-        let identity = Identity { run: run.clone(), incarnation: config.run.incarnation, environment };
+        let identity = Identity { run: run.clone(), incarnation: config.run.incarnation, task };
         let state = SnapshotPublisher::new(identity, run_dir.clone(), metrics.clone(), hub.clone(), notices.clone());
         let (publisher, publisher_messages) = inbox();
         let publisher_thread = spawn("publisher", move || state.run(&publisher_messages))?;
@@ -91,7 +92,6 @@ impl Threads {
         let trainer = Trainer {
             experiment: experiment.clone(),
             device: config.run.device,
-            environment,
             transitions,
             metrics: metrics.training.clone(),
             rows: row_sender,
@@ -133,7 +133,6 @@ fn finish(name: &str, thread: JoinHandle<()>) -> anyhow::Result<()> {
 struct Trainer {
     experiment: Experiment,
     device: Device,
-    environment: &'static EnvironmentSpec,
     transitions: Transitions,
     metrics: TrainingMetrics,
     rows: SyncSender<Row>,
@@ -145,8 +144,8 @@ impl Trainer {
     fn run(self) -> TrainingResult {
         let experiment = &self.experiment;
         let setting = Setting {
-            observation_dim: self.environment.observation_dim,
-            action_dim: self.environment.action_dim,
+            observation_dim: self.transitions.observation_dim(),
+            action_dim: self.transitions.action_dim(),
             batch_size: experiment.batch_size as usize,
             total_steps: experiment.steps,
             seed: experiment.seed,

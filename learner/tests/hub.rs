@@ -55,11 +55,12 @@ impl Bench {
         let run_dir = RunDir::create(&folder.path().join("bench"), &config()).unwrap();
         let (metrics, _) = Metrics::new(&run, 100, &[]).unwrap();
         let (notify, notices) = tokio::sync::mpsc::unbounded_channel();
-        let environment = quad_dataset::environment::find("hopper").unwrap();
+        let task = quad_dataset::Task::from(quad_dataset::environment::find("hopper").unwrap());
         let rules = Rules {
             run: run.clone(),
             incarnation: INCARNATION,
-            environment,
+            task: task.clone(),
+            instance: 1,
             candidates: 3,
             job_episodes: 2,
             lease: LEASE,
@@ -69,7 +70,7 @@ impl Bench {
         let state = Hub::new(run.clone(), plan, Scoreboard::new(rules), log, metrics.clone(), notify.clone());
         let (hub, messages) = inbox();
         std::thread::spawn(move || state.run(&messages));
-        let identity = Identity { run: run.clone(), incarnation: INCARNATION, environment };
+        let identity = Identity { run: run.clone(), incarnation: INCARNATION, task };
         let state = SnapshotPublisher::new(identity, run_dir.clone(), metrics.clone(), hub.clone(), notify);
         let (publisher, messages) = inbox();
         std::thread::spawn(move || state.run(&messages));
@@ -174,7 +175,17 @@ fn report(job: &Job, evaluator: &str) -> ScoreReport {
         |&seed| EpisodeScore { seed, episode_return: 1000.0, length: 300, score: hopper.normalised_score(1000.0) };
     let Job { run, incarnation, step, weights, .. } = job.clone();
     let episodes = job.seeds.iter().map(episode).collect();
-    ScoreReport { evaluator: name(evaluator), run, incarnation, job: job.id, step, weights, episodes, cannot_act: None }
+    ScoreReport {
+        evaluator: name(evaluator),
+        run,
+        incarnation,
+        job: job.id,
+        step,
+        weights,
+        precision: name("f32"),
+        episodes,
+        cannot_act: None,
+    }
 }
 
 async fn deliver(session: &Session, report: &ScoreReport) -> ScoreReply {

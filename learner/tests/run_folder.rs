@@ -26,7 +26,7 @@ fn config(name: &str, seed: u64) -> RunConfig {
             min_return: 10.0,
             mean_return: 20.0,
             max_return: 30.0,
-            mean_score: 10.7,
+            mean_score: Some(10.7),
         },
         experiment: resolve("hopper-demo", &overrides).unwrap(),
     }
@@ -40,6 +40,7 @@ fn line(step: u64, seed: u64, score: f64) -> ScoreLine {
         length: 5,
         score,
         weights: "00".into(),
+        precision: "f32".into(),
         evaluator: "e".into(),
     }
 }

@@ -29,7 +29,17 @@ fn score(seed: u64, episode_return: f64) -> EpisodeScore {
 
 fn report(job: &Job, evaluator: &str, episodes: Vec<EpisodeScore>) -> ScoreReport {
     let Job { run, incarnation, step, weights, .. } = job.clone();
-    ScoreReport { evaluator: name(evaluator), run, incarnation, job: job.id, step, weights, episodes, cannot_act: None }
+    ScoreReport {
+        evaluator: name(evaluator),
+        run,
+        incarnation,
+        job: job.id,
+        step,
+        weights,
+        precision: name("f32"),
+        episodes,
+        cannot_act: None,
+    }
 }
 
 fn full_report(job: &Job, evaluator: &str) -> ScoreReport {
@@ -42,7 +52,8 @@ impl Bench {
         let rules = Rules {
             run: name("run"),
             incarnation: INCARNATION,
-            environment: quad_dataset::environment::find("hopper").unwrap(),
+            task: quad_dataset::environment::find("hopper").unwrap().into(),
+            instance: 5,
             candidates: 10,
             job_episodes: 5,
             lease: LEASE,

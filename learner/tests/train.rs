@@ -43,7 +43,7 @@ fn transitions() -> Transitions {
         writer.push(&row).unwrap();
     }
     writer.finish(&Metadata { algorithm: "made up", iteration: 0, seed: 0 }).unwrap();
-    Transitions::read(&path, &ReadOptions { environment: hopper, reward: RewardRule::Locomotion }).unwrap()
+    Transitions::read(&path, &ReadOptions { environment: Some(hopper), reward: RewardRule::Locomotion }).unwrap()
 }
 
 /// Hyper-parameters of a preset with small networks.

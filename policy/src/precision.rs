@@ -20,6 +20,19 @@ impl Precision {
     pub const UNAVAILABLE: &str =
         "this CPU is no faster in bf16, which takes AMX or AMD's AVX512-BF16: it computes in f32";
 
+    /// What it is called on command lines, in files and on the wire.
+    pub fn name(self) -> &'static str {
+        match self {
+            Precision::F32 => "f32",
+            Precision::Bf16 => "bf16",
+        }
+    }
+
+    /// What this CPU computes with where it is asked for.
+    pub fn in_effect(self) -> Self {
+        if self.is_available() { self } else { Precision::F32 }
+    }
+
     /// Whether this CPU computes with it, rather than with f32 in its place.
     pub fn is_available(self) -> bool {
         match self {

@@ -20,7 +20,7 @@ pub(crate) use bincode::{Decode, Encode};
 use crate::{Hash, JobReply, JobRequest, Name, Progress, RecordedScores, Schema, ScoreReply, ScoreReport, Snapshot};
 
 /// Version of keys, messages and encoding. Frames of another version are refused.
-pub const PROTOCOL_VERSION: u16 = 2;
+pub const PROTOCOL_VERSION: u16 = 3;
 
 const MAGIC: &[u8; 4] = b"QUAD";
 const HEADER_LENGTH: usize = MAGIC.len() + size_of::<u16>() + size_of::<u8>();

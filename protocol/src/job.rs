@@ -39,6 +39,8 @@ pub struct Job {
     pub weights: Hash,
     /// Environment to act in.
     pub environment: String,
+    /// Seed of what an environment draws once and keeps over all episodes (AntMaze-v0: its goal); the same for a whole run.
+    pub instance: u64,
     /// One episode for each seed.
     pub seeds: Vec<u64>,
     /// Actions that the policy draws in each state before it takes the best (the paper's N_a).

@@ -7,7 +7,7 @@
 //! - `name`: what runs and evaluators may be called; `hash`: how weights are identified.
 //! - [`keys`]: where on Zenoh each message is found.
 //! - `snapshot`: weights, from the learner to evaluators.
-//! - `job`: an evaluator asks for work and gets some.
+//! - `seeds`: which episodes an evaluation has; `job`: an evaluator asks for work and gets some.
 //! - `progress`: an evaluator tells how far its job is.
 //! - `score`: an evaluator delivers scores, the learner acknowledges and publishes them.
 //! - `codec`: messages to bytes and back; the only place that knows the encoding.
@@ -23,6 +23,7 @@ pub mod keys;
 mod name;
 mod progress;
 mod score;
+mod seeds;
 mod snapshot;
 
 pub use codec::{CodecError, Message, PROTOCOL_VERSION, decode, decode_from, encode};
@@ -31,4 +32,5 @@ pub use job::{Job, JobReply, JobRequest};
 pub use name::{InvalidName, Name};
 pub use progress::Progress;
 pub use score::{EpisodeScore, RecordedScores, ScoreReply, ScoreReport};
+pub use seeds::episode_seeds;
 pub use snapshot::{Schema, Snapshot};

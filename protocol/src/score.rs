@@ -31,6 +31,8 @@ pub struct ScoreReport {
     pub step: u64,
     /// Hash of the snapshot's tensors.
     pub weights: Hash,
+    /// The arithmetic that the policy was computed in, e.g. `f32` or `bf16`.
+    pub precision: Name,
     /// The episodes.
     pub episodes: Vec<EpisodeScore>,
     /// Why there are none: the policy cannot act, because something on the way to an action is not a number. No other

@@ -73,6 +73,7 @@ fn claimed_lengths_are_not_believed() {
         step: 3,
         weights: hash,
         environment: environment(),
+        instance: 4,
         seeds: vec![1, 2, 3],
         candidates: 10,
         lease_milliseconds: 1000,
@@ -87,6 +88,7 @@ fn claimed_lengths_are_not_believed() {
         job: 2,
         step: 3,
         weights: hash,
+        precision: name(),
         episodes: episodes.clone(),
         cannot_act: Some(environment()),
     });

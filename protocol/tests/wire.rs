@@ -68,8 +68,8 @@ fn job_request() -> impl Strategy<Value = JobRequest> {
 }
 
 fn job_reply() -> impl Strategy<Value = JobReply> {
-    let job = (any::<[u64; 4]>(), name(), hash(), text(), vec(any::<u64>(), 0..100), any::<u32>()).prop_map(
-        |([id, incarnation, step, lease_milliseconds], run, weights, environment, seeds, candidates)| {
+    let job = (any::<[u64; 5]>(), name(), hash(), text(), vec(any::<u64>(), 0..100), any::<u32>()).prop_map(
+        |([id, incarnation, step, instance, lease_milliseconds], run, weights, environment, seeds, candidates)| {
             JobReply::Job(Job {
                 id,
                 run,
@@ -77,6 +77,7 @@ fn job_reply() -> impl Strategy<Value = JobReply> {
                 step,
                 weights,
                 environment,
+                instance,
                 seeds,
                 candidates,
                 lease_milliseconds,
@@ -87,14 +88,15 @@ fn job_reply() -> impl Strategy<Value = JobReply> {
 }
 
 fn score_report() -> impl Strategy<Value = ScoreReport> {
-    (name(), name(), any::<[u64; 3]>(), hash(), episodes(), prop::option::of(text())).prop_map(
-        |(evaluator, run, [incarnation, job, step], weights, episodes, cannot_act)| ScoreReport {
+    (name(), name(), any::<[u64; 3]>(), hash(), name(), episodes(), prop::option::of(text())).prop_map(
+        |(evaluator, run, [incarnation, job, step], weights, precision, episodes, cannot_act)| ScoreReport {
             evaluator,
             run,
             incarnation,
             job,
             step,
             weights,
+            precision,
             episodes,
             cannot_act,
         },

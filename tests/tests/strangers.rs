@@ -41,6 +41,7 @@ async fn haunt(session: &Session) -> impl Sized {
             step: 1,
             weights,
             environment,
+            instance: 1,
             seeds: vec![1, 2],
             candidates,
             lease_milliseconds: 1000,

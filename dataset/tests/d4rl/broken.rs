@@ -42,7 +42,7 @@ impl Subject {
     }
 
     fn read(&self, reward: RewardRule) -> Result<Transitions, DatasetError> {
-        Transitions::read(self.path(), &ReadOptions { environment: hopper(), reward })
+        Transitions::read(self.path(), &ReadOptions { environment: Some(hopper()), reward })
     }
 
     /// The error's text after the file's path, which every error starts with.
@@ -66,7 +66,8 @@ fn the_subject_itself_is_whole() {
 
 #[test]
 fn a_missing_file() {
-    let error = Transitions::read("/nowhere/x.hdf5", &ReadOptions { environment: hopper(), reward: RewardRule::AsIs });
+    let error =
+        Transitions::read("/nowhere/x.hdf5", &ReadOptions { environment: Some(hopper()), reward: RewardRule::AsIs });
     assert!(matches!(error.err(), Some(DatasetError::Io { path, .. }) if path == Path::new("/nowhere/x.hdf5")));
 }
 

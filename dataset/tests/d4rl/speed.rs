@@ -31,7 +31,7 @@ fn a_hundred_thousand_transitions_load_in_half_a_second() {
     }
     writer.finish(&Metadata { algorithm: "noise", iteration: 0, seed: 0 }).unwrap();
 
-    let options = ReadOptions { environment: hopper(), reward: RewardRule::Locomotion };
+    let options = ReadOptions { environment: Some(hopper()), reward: RewardRule::Locomotion };
     let timed = || {
         let start = Instant::now();
         assert_eq!(Transitions::read(&path, &options).unwrap().len(), 100_000);

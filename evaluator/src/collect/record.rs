@@ -99,7 +99,7 @@ impl Recorder {
     fn new(spec: &'static EnvironmentSpec) -> Result<Self, EnvironmentError> {
         Ok(Self {
             spec,
-            environment: environment::make(spec)?,
+            environment: environment::make(spec, 0)?,
             observations: Vec::new(),
             qpos: Vec::new(),
             qvel: Vec::new(),

@@ -89,7 +89,7 @@ impl Search {
         let policy = LinearPolicy::zero(spec.observation_dim, spec.action_dim);
         let trial = |_| {
             Ok(Trial {
-                environment: environment::make(spec)?,
+                environment: environment::make(spec, 0)?,
                 policy: policy.clone(),
                 action: vec![0.0; spec.action_dim],
                 moments: Moments::new(spec.observation_dim),

@@ -51,9 +51,11 @@ pub trait Environment: Send {
 /// The environments that [`make`] makes.
 pub const ENVIRONMENTS: [&str; 1] = ["hopper"];
 
-/// Makes an environment. Those of one name share one compiled model, so the second costs little.
-pub fn make(spec: &EnvironmentSpec) -> Result<Box<dyn Environment>, EnvironmentError> {
-    match spec.name {
+/// Makes an environment. Those of one simulation share one compiled model, so the second costs little.
+///
+/// `instance` is the seed of what it draws once and keeps over all episodes, if there is any such thing.
+pub fn make(spec: &EnvironmentSpec, _instance: u64) -> Result<Box<dyn Environment>, EnvironmentError> {
+    match spec.simulation() {
         "hopper" => Ok(Box::new(Hopper::new(spec.max_episode_steps)?)),
         other => Err(EnvironmentError::NotSimulated(other.to_owned())),
     }

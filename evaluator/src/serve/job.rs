@@ -77,10 +77,9 @@ impl Running {
     pub fn start(job: &Job, spec: &'static EnvironmentSpec, policy: Arc<dyn Policy>, metrics: Metrics) -> Running {
         let shared = Arc::new(Shared::default());
         let thread = tokio::task::spawn_blocking({
-            let (shared, metrics, seeds, candidates) =
-                (shared.clone(), metrics.clone(), job.seeds.clone(), job.candidates as usize);
+            let (shared, metrics, job) = (shared.clone(), metrics.clone(), job.clone());
             // On a thread of the pool: else each parallel part of each step would wake one up and wait for it.
-            move || rayon::scope(|_| roll_out(spec, &seeds, candidates, policy.as_ref(), &shared, &metrics))
+            move || rayon::scope(|_| roll_out(spec, &job, policy.as_ref(), &shared, &metrics))
         });
         Running { shared, metrics, started: Instant::now(), thread: Some(thread) }
     }
@@ -119,13 +118,13 @@ impl Drop for Running {
 /// Runs all episodes to their end, or gives `None` when cancelled. Fails if the policy cannot act.
 fn roll_out(
     spec: &'static EnvironmentSpec,
-    seeds: &[u64],
-    candidates: usize,
+    job: &Job,
     policy: &dyn Policy,
     shared: &Shared,
     metrics: &Metrics,
 ) -> anyhow::Result<Option<Vec<EpisodeOutcome>>> {
-    let mut rollout = Rollout::new(spec, seeds, ActionNoise::new)?;
+    let mut rollout = Rollout::new(spec, job.instance, &job.seeds, ActionNoise::new)?;
+    let candidates = job.candidates as usize;
     while !rollout.is_done() {
         if shared.cancelled.load(Relaxed) {
             return Ok(None);

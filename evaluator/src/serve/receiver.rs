@@ -207,6 +207,7 @@ mod tests {
             step: 100,
             weights,
             environment: "hopper".to_owned(),
+            instance: 1,
             seeds: vec![1],
             candidates: 1,
             lease_milliseconds: 1000,

@@ -166,8 +166,18 @@ impl Worker {
             }
         };
         let Job { id, run: of, incarnation, step, weights, .. } = job;
-        let evaluator = self.name.clone();
-        run.keep(ScoreReport { evaluator, run: of, incarnation, job: id, step, weights, episodes, cannot_act });
+        let (evaluator, precision) = (self.name.clone(), Name::new(self.precision.in_effect().name())?);
+        run.keep(ScoreReport {
+            evaluator,
+            run: of,
+            incarnation,
+            job: id,
+            step,
+            weights,
+            precision,
+            episodes,
+            cannot_act,
+        });
         run.deliver().await
     }
 
