@@ -2,26 +2,92 @@
 
 use serde::{Deserialize, Serialize};
 
-/// What happens to the rewards of a file.
+/// What happens to the rewards of a file. Statistics and scores are always of the rewards as they were recorded.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
-#[serde(rename_all = "kebab-case")]
 pub enum RewardRule {
-    /// `r · 1000 / (max - min trajectory return)`: IQL's and DAC's rule for locomotion.
+    /// `r · 1000 / (max - min trajectory return)`: IQL's and DAC's rule for locomotion. On returns of 0 and 1, as in
+    /// AntMaze, it is `r · 1000`.
+    #[serde(rename = "locomotion")]
     Locomotion,
-    /// The rewards as they were recorded.
+    /// `r`: the rewards as they were recorded.
+    #[serde(rename = "as-is")]
     AsIs,
+    /// `r - 1`: IQL's rule for AntMaze. Each step before the goal costs 1.
+    #[serde(rename = "subtract-1")]
+    Subtract1,
+    /// `(r - 0.5) · 4`: CQL's rule for AntMaze.
+    #[serde(rename = "subtract-0.5-times-4")]
+    SubtractHalfTimes4,
+    /// `r · 100`, in use for AntMaze.
+    #[serde(rename = "times-100")]
+    Times100,
+    /// `(r - 0.25) · 2`, in use for AntMaze.
+    #[serde(rename = "subtract-0.25-times-2")]
+    SubtractQuarterTimes2,
+}
+
+/// Training rewards as a function of recorded ones: `(r - subtract) · times`.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub(crate) struct Scaling {
+    subtract: f64,
+    times: f64,
+}
+
+impl Scaling {
+    pub(crate) fn apply(self, reward: f32) -> f32 {
+        ((f64::from(reward) - self.subtract) * self.times) as f32
+    }
 }
 
 impl RewardRule {
-    /// The factor on every reward, given the returns of the trajectories; none where their spread is zero but needed.
-    pub(crate) fn scale(self, returns: &[f64]) -> Option<f64> {
-        match self {
-            Self::AsIs => Some(1.0),
+    /// What it does, given the returns of the trajectories; none where their spread is zero but needed.
+    pub(crate) fn scaling(self, returns: &[f64]) -> Option<Scaling> {
+        let (subtract, times) = match self {
             Self::Locomotion => {
                 let max = returns.iter().copied().fold(f64::NEG_INFINITY, f64::max);
                 let min = returns.iter().copied().fold(f64::INFINITY, f64::min);
-                (max > min).then(|| 1000.0 / (max - min))
+                if max <= min {
+                    return None;
+                }
+                (0.0, 1000.0 / (max - min))
             }
+            Self::AsIs => (0.0, 1.0),
+            Self::Subtract1 => (1.0, 1.0),
+            Self::SubtractHalfTimes4 => (0.5, 4.0),
+            Self::Times100 => (0.0, 100.0),
+            Self::SubtractQuarterTimes2 => (0.25, 2.0),
+        };
+        Some(Scaling { subtract, times })
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn each_name_says_what_its_rule_does_to_rewards_of_0_and_1() {
+        #[derive(Deserialize)]
+        struct Preset {
+            reward: RewardRule,
         }
+        for (name, of_0, of_1) in [
+            ("locomotion", 0.0, 250.0), // returns from -1 to 3
+            ("as-is", 0.0, 1.0),
+            ("subtract-1", -1.0, 0.0),
+            ("subtract-0.5-times-4", -2.0, 2.0),
+            ("times-100", 0.0, 100.0),
+            ("subtract-0.25-times-2", -0.5, 1.5),
+        ] {
+            let preset: Preset = toml::from_str(&format!("reward = '{name}'")).unwrap();
+            let scaling = preset.reward.scaling(&[3.0, -1.0, 0.5]).unwrap();
+            assert_eq!((scaling.apply(0.0), scaling.apply(1.0)), (of_0, of_1), "{name}");
+        }
+    }
+
+    #[test]
+    fn only_the_locomotion_rule_needs_returns_that_differ() {
+        assert_eq!(RewardRule::Locomotion.scaling(&[2.0, 2.0]), None);
+        assert!(RewardRule::Subtract1.scaling(&[2.0, 2.0]).is_some());
     }
 }

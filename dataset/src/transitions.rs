@@ -71,14 +71,15 @@ impl Transitions {
         }
         let ends = trajectory_ends(&rows, &terminals, &observations, observation_dim);
         let trajectory_returns = returns(rows.iter().map(|&row| rewards[row as usize]).zip(ends));
-        let scale =
-            reward.scale(&trajectory_returns).ok_or_else(|| DatasetError::SameReturns { path: file.path().into() })?;
+        let scaling = reward
+            .scaling(&trajectory_returns)
+            .ok_or_else(|| DatasetError::SameReturns { path: file.path().into() })?;
         let episode_ends = terminals.iter().zip(&timeouts).map(|(&terminal, &timeout)| terminal || timeout);
         let episode_returns = returns(rewards.iter().copied().zip(episode_ends));
         let statistics = Statistics::new(environment, rows.len(), &episode_returns);
 
         actions.iter_mut().for_each(|action| *action = action.clamp(-ACTION_LIMIT, ACTION_LIMIT));
-        rewards.iter_mut().for_each(|reward| *reward = (f64::from(*reward) * scale) as f32);
+        rewards.iter_mut().for_each(|reward| *reward = scaling.apply(*reward));
         Ok(Self { observation_dim, action_dim, observations, actions, rewards, terminals, rows, statistics })
     }
 
