@@ -1,11 +1,11 @@
-//! Hopper against the real Gymnasium, which `gymnasium_reference.py` drives.
+//! The environments against the real Gymnasium, which `gymnasium_reference.py` drives.
 #![allow(clippy::unwrap_used, clippy::print_stdout)]
 
 use std::path::{Path, PathBuf};
 use std::process::{Command, Stdio};
 
 use quad_dataset::environment::find;
-use quad_evaluator::environment::make;
+use quad_evaluator::environment::{make, mjcf};
 use serde::Deserialize;
 use serde::de::DeserializeOwned;
 
@@ -28,6 +28,7 @@ fn reference<T: DeserializeOwned>(arguments: &[&str]) -> Option<T> {
     }
     let output = Command::new(python)
         .args(["-W", "ignore"])
+        .current_dir(env!("CARGO_TARGET_TMPDIR")) // MuJoCo logs its warnings to a file there.
         .arg(folder.join("tests/gymnasium_reference.py"))
         .args(arguments)
         .stderr(Stdio::inherit())
@@ -43,10 +44,10 @@ struct ModelComparison {
     differ: Vec<String>,
 }
 
-#[test]
-fn the_model_is_gymnasiums_number_by_number() {
-    let mjcf = concat!(env!("CARGO_MANIFEST_DIR"), "/assets/hopper.xml");
-    let Some(model) = reference::<ModelComparison>(&["model", mjcf]) else { return };
+fn the_model_is_gymnasiums(name: &str) {
+    let file = tempfile::NamedTempFile::new().unwrap();
+    std::fs::write(file.path(), mjcf(find(name).unwrap()).unwrap()).unwrap();
+    let Some(model) = reference::<ModelComparison>(&["model", name, file.path().to_str().unwrap()]) else { return };
     assert!(model.compared > 1000, "only {} numbers were compared", model.compared);
     assert!(model.differ.is_empty(), "{:#?}", model.differ);
 }
@@ -72,17 +73,18 @@ struct RecordedStep {
     terminated: bool,
 }
 
-#[test]
-fn steps_from_random_states_are_gymnasiums() {
-    let Some(recording) = reference::<Recording>(&["steps"]) else { return };
+/// Replays Gymnasium's steps; gives the share of them that terminated.
+fn steps_are_gymnasiums(name: &str) -> Option<f64> {
+    let recording = reference::<Recording>(&["steps", name])?;
     assert!(recording.sequences.len() >= 1000);
-    let mut hopper = make(find("hopper").unwrap(), 0).unwrap();
+    let mut environment = make(find(name).unwrap(), 0).unwrap();
     let (mut worst, mut steps, mut terminated) = (0.0_f64, 0, 0);
     for (number, sequence) in recording.sequences.iter().enumerate() {
-        hopper.set_state(&sequence.qpos, &sequence.qvel);
+        environment.set_state(&sequence.qpos, &sequence.qvel);
         for (place, expected) in sequence.steps.iter().enumerate() {
-            let step = hopper.step(&expected.action);
-            let observation = hopper.observation();
+            let step = environment.step(&expected.action);
+            let observation = environment.observation();
+            assert_eq!(observation.len(), expected.observation.len());
             let errors = observation.iter().zip(&expected.observation).map(|(ours, theirs)| (ours - theirs).abs());
             let error = errors.fold((step.reward - expected.reward).abs(), f64::max);
             assert!(error <= TOLERANCE, "sequence {number}, step {place}: {error:e} apart");
@@ -92,6 +94,27 @@ fn steps_from_random_states_are_gymnasiums() {
             terminated += usize::from(step.terminated);
         }
     }
-    assert!(terminated > steps / 10 && terminated < steps * 9 / 10, "{terminated} of {steps} steps terminated");
-    println!("{steps} steps, {terminated} of them terminated; the worst error is {worst:.1e}");
+    println!("{name}: {steps} steps, {terminated} of them terminated; the worst error is {worst:.1e}");
+    Some(terminated as f64 / steps as f64)
+}
+
+#[test]
+fn hopper_is_gymnasiums() {
+    the_model_is_gymnasiums("hopper");
+    let terminated = steps_are_gymnasiums("hopper");
+    assert!(terminated.is_none_or(|share| (0.1..0.9).contains(&share)), "{terminated:?}");
+}
+
+#[test]
+fn halfcheetah_is_gymnasiums() {
+    the_model_is_gymnasiums("halfcheetah");
+    let terminated = steps_are_gymnasiums("halfcheetah");
+    assert!(terminated.is_none_or(|share| share == 0.0), "{terminated:?}");
+}
+
+#[test]
+fn walker2d_is_gymnasiums() {
+    the_model_is_gymnasiums("walker2d");
+    let terminated = steps_are_gymnasiums("walker2d");
+    assert!(terminated.is_none_or(|share| (0.1..0.9).contains(&share)), "{terminated:?}");
 }

@@ -1,10 +1,11 @@
 //! Episodes do not depend on the batch they run in, and are what stepping an environment by hand gives.
 #![allow(clippy::unwrap_used)]
 
+use std::collections::BTreeMap;
 use std::convert::Infallible;
 
-use quad_dataset::environment::find;
-use quad_evaluator::environment::make;
+use quad_dataset::environment::{EnvironmentSpec, find};
+use quad_evaluator::environment::{make, simulated};
 use quad_evaluator::rollout::{EpisodeOutcome, Rollout};
 use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
@@ -74,6 +75,39 @@ fn an_outcome_is_what_stepping_by_hand_gives() {
         }
         assert_eq!((outcome.episode_return, outcome.length), (episode_return, length));
         assert_eq!(outcome.score, 100.0 * (episode_return + 20.272305) / (3234.3 + 20.272305));
+    }
+}
+
+/// What the policy saw of each seed's episode in the first steps of a batch.
+fn trajectories(spec: &'static EnvironmentSpec, seeds: &[u64]) -> BTreeMap<u64, Vec<f32>> {
+    let mut seen = BTreeMap::<u64, Vec<f32>>::new();
+    let mut rollout = Rollout::new(spec, 0, seeds, |seed| (seed, ChaCha8Rng::seed_from_u64(seed))).unwrap();
+    for _ in 0..40 {
+        let select = |observations: &[f32], noise: &mut [(u64, ChaCha8Rng)], actions: &mut [f32]| {
+            let observations = observations.chunks(spec.observation_dim);
+            for ((observation, (seed, noise)), action) in
+                observations.zip(noise).zip(actions.chunks_mut(spec.action_dim))
+            {
+                seen.entry(*seed).or_default().extend(observation);
+                action.fill_with(|| noise.random_range(-1.0..1.0));
+            }
+            Ok::<_, Infallible>(())
+        };
+        rollout.step(select).unwrap();
+    }
+    seen
+}
+
+#[test]
+fn in_every_environment_an_episode_depends_on_its_seed_alone() {
+    for spec in simulated() {
+        let together = trajectories(spec, &[3, 14, 15, 92]);
+        assert_eq!(together.len(), 4, "{}", spec.name);
+        assert_ne!(together[&3], together[&14], "{}", spec.name);
+        for (&seed, trajectory) in &together {
+            assert!(trajectory.len() > 5 * spec.observation_dim, "{}", spec.name);
+            assert_eq!(trajectories(spec, &[seed])[&seed], *trajectory, "{}, seed {seed}", spec.name);
+        }
     }
 }
 

@@ -1,13 +1,14 @@
 //! Environments: what a policy acts in.
 //!
-//! One file per task. A task's name, sizes, time limit and score references are the dataset crate's
-//! [`EnvironmentSpec`](quad_dataset::environment::EnvironmentSpec); here is how it moves.
+//! A task's name, sizes, time limit and score references are the dataset crate's
+//! [`EnvironmentSpec`](quad_dataset::environment::EnvironmentSpec); here is how it moves. Reading order: `locomotion`
+//! (Hopper, HalfCheetah, Walker2d), and `physics`, which drives MuJoCo.
 
-mod hopper;
+mod locomotion;
 mod physics;
 
-use hopper::Hopper;
-use quad_dataset::environment::EnvironmentSpec;
+use locomotion::{Locomotion, ROBOTS, Robot};
+use quad_dataset::environment::{self, EnvironmentSpec};
 use thiserror::Error;
 
 /// The stream that initial states are drawn from, among those of an episode's seed.
@@ -48,17 +49,46 @@ pub trait Environment: Send {
     fn qvel(&self) -> &[f64];
 }
 
-/// The environments that [`make`] makes.
-pub const ENVIRONMENTS: [&str; 1] = ["hopper"];
+/// How an environment moves.
+enum Simulation {
+    Locomotion(&'static Robot),
+}
+
+impl Simulation {
+    fn of(spec: &EnvironmentSpec) -> Result<Self, EnvironmentError> {
+        let name = spec.simulation();
+        let robot = ROBOTS.iter().find(|robot| robot.name == name).map(Self::Locomotion);
+        robot.ok_or_else(|| EnvironmentError::NotSimulated(name.to_owned()))
+    }
+}
+
+/// The environments of the table that [`make`] makes.
+pub fn simulated() -> impl Iterator<Item = &'static EnvironmentSpec> {
+    environment::all().iter().filter(|spec| Simulation::of(spec).is_ok())
+}
 
 /// Makes an environment. Those of one simulation share one compiled model, so the second costs little.
 ///
 /// `instance` is the seed of what it draws once and keeps over all episodes, if there is any such thing.
+///
+/// # Errors
+///
+/// There is no simulation of the environment, or MuJoCo fails.
 pub fn make(spec: &EnvironmentSpec, _instance: u64) -> Result<Box<dyn Environment>, EnvironmentError> {
-    match spec.simulation() {
-        "hopper" => Ok(Box::new(Hopper::new(spec.max_episode_steps)?)),
-        other => Err(EnvironmentError::NotSimulated(other.to_owned())),
-    }
+    Ok(match Simulation::of(spec)? {
+        Simulation::Locomotion(robot) => Box::new(Locomotion::new(robot, spec)?),
+    })
+}
+
+/// The MJCF text that an environment's model is compiled from.
+///
+/// # Errors
+///
+/// There is no simulation of the environment.
+pub fn mjcf(spec: &EnvironmentSpec) -> Result<String, EnvironmentError> {
+    Ok(match Simulation::of(spec)? {
+        Simulation::Locomotion(robot) => robot.mjcf.to_owned(),
+    })
 }
 
 /// Why an environment could not be made.
@@ -68,10 +98,10 @@ pub enum EnvironmentError {
     #[error("this evaluator cannot simulate the environment \"{0}\"")]
     NotSimulated(String),
     /// MuJoCo refused the embedded model: the library is not the version this was built for.
-    #[error("MuJoCo could not compile the model of \"{environment}\": {reason}")]
+    #[error("MuJoCo could not compile the model of \"{simulation}\": {reason}")]
     Model {
-        /// Which environment's model.
-        environment: &'static str,
+        /// Whose model.
+        simulation: &'static str,
         /// MuJoCo's own words.
         reason: String,
     },

@@ -1,27 +1,45 @@
 //! One MuJoCo simulation: state in, controls in, state out.
 
-use std::sync::{Arc, Once};
+use std::collections::BTreeMap;
+use std::sync::{Arc, Mutex, Once, PoisonError};
 
 use mujoco_rs::logging::set_log_handler;
 use mujoco_rs::wrappers::mj_data::{MjData, MjtWarning};
 use mujoco_rs::wrappers::mj_logging::MjLogMessage;
 use mujoco_rs::wrappers::mj_model::MjModel;
+use rand::{Rng, SeedableRng};
+use rand_chacha::ChaCha8Rng;
+use rand_distr::{Distribution, StandardNormal};
 
-use super::EnvironmentError;
+use super::{EnvironmentError, RESET_STREAM};
 
-/// Compiles an MJCF text.
-pub(super) fn compile(environment: &'static str, mjcf: &str) -> Result<Arc<MjModel>, EnvironmentError> {
+/// The model of a simulation, compiled from the text that `mjcf` writes if the process does not have it yet.
+pub(super) fn model(simulation: &'static str, mjcf: impl FnOnce() -> String) -> Result<Arc<MjModel>, EnvironmentError> {
+    static MODELS: Mutex<BTreeMap<&str, Arc<MjModel>>> = Mutex::new(BTreeMap::new());
     static LOGGING: Once = Once::new();
+    let mut models = MODELS.lock().unwrap_or_else(PoisonError::into_inner);
+    if let Some(model) = models.get(simulation) {
+        return Ok(Arc::clone(model));
+    }
     // SAFETY: every use of MuJoCo in this program starts with a compiled model, so none runs before this has.
     LOGGING.call_once(|| unsafe { set_log_handler(log) });
-    MjModel::from_xml_string(mjcf)
-        .map(Arc::new)
-        .map_err(|error| EnvironmentError::Model { environment, reason: error.to_string() })
+    let model = MjModel::from_xml_string(&mjcf())
+        .map_err(|error| EnvironmentError::Model { simulation, reason: error.to_string() })?;
+    Ok(Arc::clone(models.entry(simulation).or_insert(Arc::new(model))))
 }
 
 /// MuJoCo's messages go where ours go; left alone it appends to a `MUJOCO_LOG.TXT` in the working directory.
 fn log(message: &MjLogMessage) {
     tracing::debug!(target: "mujoco", "{}", message.subject());
+}
+
+/// What an episode's beginning differs in from the model's initial state: added to each position and velocity.
+#[derive(Clone, Copy)]
+pub(super) enum Noise {
+    /// Uniform within ± this.
+    Uniform(f64),
+    /// Positions: uniform within ± this; velocities: normal with this standard deviation.
+    NormalVelocities(f64),
 }
 
 /// The state of one simulation; many share a model.
@@ -50,11 +68,46 @@ impl Physics {
         self.data.qvel()
     }
 
+    /// The last step's controls, in the motors' own units.
+    pub(super) fn controls(&self) -> &[f64] {
+        self.data.ctrl()
+    }
+
+    /// Starts anew from the model's initial state and a noise drawn from `seed`.
+    pub(super) fn reset(&mut self, seed: u64, noise: Noise) {
+        let mut random = ChaCha8Rng::seed_from_u64(seed);
+        random.set_stream(RESET_STREAM);
+        self.start(|qpos, qvel| match noise {
+            Noise::Uniform(bound) => {
+                for value in qpos.iter_mut().chain(qvel) {
+                    *value += random.random_range(-bound..bound);
+                }
+            }
+            Noise::NormalVelocities(scale) => {
+                for value in qpos {
+                    *value += random.random_range(-scale..scale);
+                }
+                for value in qvel {
+                    let normal: f64 = StandardNormal.sample(&mut random);
+                    *value += scale * normal;
+                }
+            }
+        });
+    }
+
+    /// Starts anew from a given state.
+    pub(super) fn set_state(&mut self, qpos: &[f64], qvel: &[f64]) {
+        self.start(|positions, velocities| {
+            positions.copy_from_slice(qpos);
+            velocities.copy_from_slice(qvel);
+        });
+    }
+
     /// Starts anew from the state that `init` makes of the model's initial `(qpos, qvel)`.
     ///
     /// The accelerations are computed here as Gymnasium does after a reset: they warm-start the solver, so the first
     /// step depends on them, if by a hair.
-    pub(super) fn reset(&mut self, init: impl FnOnce(&mut [f64], &mut [f64])) {
+    fn start(&mut self, init: impl FnOnce(&mut [f64], &mut [f64])) {
         self.data.reset();
         // SAFETY: MuJoCo allocates both arrays, apart from each other and of these lengths, for the life of `data`.
         let (qpos, qvel) = unsafe {
@@ -66,11 +119,20 @@ impl Physics {
         self.data.forward();
     }
 
-    /// Holds `controls` for one control period. False when the simulation diverged: MuJoCo then puts its initial state
-    /// in the place of the one it could not integrate, and that is not to be taken for what the task did.
+    /// Holds `action` for one control period; ±1, to which it is clipped, are the ends of each motor's control range.
+    ///
+    /// False when that could not be done: an action that is not a number is not applied at all; and when a simulation
+    /// diverges, MuJoCo puts its initial state in the place of the one it could not integrate, which is not to be taken
+    /// for what the task did.
     #[must_use]
-    pub(super) fn step(&mut self, controls: &[f64]) -> bool {
-        self.data.ctrl_mut().copy_from_slice(controls);
+    pub(super) fn step(&mut self, action: &[f32]) -> bool {
+        if action.iter().any(|value| value.is_nan()) {
+            return false;
+        }
+        for (motor, &value) in action.iter().enumerate() {
+            let [_, strongest] = self.data.model().actuator_ctrlrange()[motor];
+            self.data.ctrl_mut()[motor] = strongest * f64::from(value).clamp(-1.0, 1.0);
+        }
         for _ in 0..self.frame_skip {
             self.data.step();
         }

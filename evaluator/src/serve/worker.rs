@@ -15,7 +15,7 @@ use super::discovery::{RunKey, Runs};
 use super::job::{self, Running};
 use super::receiver::policy_for;
 use super::run::RunClient;
-use crate::environment::ENVIRONMENTS;
+use crate::environment;
 use crate::metrics::{JobOutcome, Metrics};
 
 /// Progress is reported this often, or three times in a lease if that is more often.
@@ -149,7 +149,7 @@ impl Worker {
         if run.has_undelivered() {
             return run.deliver().await;
         }
-        let environments = ENVIRONMENTS.iter().map(|&name| name.to_owned()).collect();
+        let environments = environment::simulated().map(|spec| spec.name.clone()).collect();
         let Some(job) = run.claim(environments).await? else { return Ok(()) };
         let (episodes, cannot_act) = match self.measure(name, &job, run).await {
             Ok(episodes) => (episodes, None),
