@@ -9,6 +9,7 @@ use quad_dataset::environment;
 use quad_service::Hint;
 
 use crate::collect::{self, Summary};
+use crate::score::{self, ScoreArgs};
 use crate::serve::{self, ServeArgs};
 use crate::verify::{self, Report};
 
@@ -23,6 +24,7 @@ pub struct Cli {
 #[derive(Debug, Subcommand)]
 enum Command {
     Serve(ServeArgs),
+    Score(ScoreArgs),
     Collect(CollectArgs),
     VerifyDataset(VerifyArgs),
 }
@@ -70,6 +72,10 @@ impl Cli {
     pub fn run(self) -> anyhow::Result<()> {
         match self.command {
             Command::Serve(args) => serve::serve(args),
+            Command::Score(args) => {
+                print(&score::score(&args)?);
+                Ok(())
+            }
             Command::Collect(args) => {
                 let summary = collect::collect(args.env, &args.out, args.transitions.get(), args.seed)?;
                 print(&collected(&args, &summary));

@@ -8,6 +8,7 @@
 //! - [`rollout`]: many episodes as one batch, one policy call per step.
 //! - [`collect`]: trains behaviour from random to competent and records it as a dataset.
 //! - [`verify`]: replays a recorded dataset and measures how far the simulation is from it.
+//! - [`score`]: scores saved policies, on this machine alone.
 //! - [`serve`]: finds runs on the network, evaluates their snapshots; [`metrics`]: its Prometheus metrics.
 //! - [`cli`]: the command line.
 
@@ -16,5 +17,6 @@ pub mod collect;
 pub mod environment;
 pub mod metrics;
 pub mod rollout;
+pub mod score;
 pub mod serve;
 pub mod verify;

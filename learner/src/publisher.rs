@@ -6,7 +6,7 @@ use std::time::Duration;
 
 use anyhow::Context;
 use quad_dataset::Task;
-use quad_protocol::{Hash, Name, Schema, Snapshot, encode, keys};
+use quad_protocol::{Hash, Name, Origin, Schema, Snapshot, encode, keys};
 use tokio::sync::mpsc::UnboundedSender;
 use tracing::debug;
 use zenoh::Wait;
@@ -15,7 +15,7 @@ use zenoh::pubsub::Publisher;
 use zenoh::query::Query;
 
 use crate::agent::PolicyFile;
-use crate::hub;
+use crate::hub::{self, EvaluationPlan};
 use crate::inbox::{Inbox, Messages};
 use crate::metrics::Metrics;
 use crate::notice::Notice;
@@ -49,6 +49,10 @@ pub struct Identity {
     pub incarnation: u64,
     /// Environment that the policy acts in.
     pub task: Task,
+    /// Which episodes each snapshot is evaluated on.
+    pub plan: EvaluationPlan,
+    /// Actions sampled per state in an evaluation.
+    pub candidates: u32,
 }
 
 /// State of the thread.
@@ -99,7 +103,8 @@ impl SnapshotPublisher {
     }
 
     fn publish(&mut self, policy: TrainedPolicy) -> anyhow::Result<()> {
-        let TrainedPolicy { step, policy: PolicyFile { kind, bytes: tensors }, evaluate } = policy;
+        let TrainedPolicy { step, policy: PolicyFile { kind, bytes }, evaluate } = policy;
+        let tensors = self.origin(step).attach(&bytes)?;
         let hash = Hash::of(&tensors);
         self.metrics.evaluation.snapshot_bytes.set(tensors.len() as i64);
         if !evaluate {
@@ -124,8 +129,13 @@ impl SnapshotPublisher {
         Ok(())
     }
 
+    fn origin(&self, step: u64) -> Origin {
+        let Identity { task, plan: EvaluationPlan { seed, episodes }, candidates, .. } = self.identity.clone();
+        Origin { environment: task.environment, seed, step, episodes, candidates }
+    }
+
     fn message(&self, step: u64, hash: Hash, tensors: Vec<u8>) -> Snapshot {
-        let Identity { run, incarnation, task } = self.identity.clone();
+        let Identity { run, incarnation, task, .. } = self.identity.clone();
         let schema = Schema {
             environment: task.environment,
             observation_dim: task.observation_dim as u32,

@@ -78,7 +78,13 @@ impl Threads {
         let (hub, hub_messages) = inbox();
         let hub_thread = spawn("hub", move || state.run(&hub_messages))?;
 
-        let identity = Identity { run: run.clone(), incarnation: config.run.incarnation, task };
+        let identity = Identity {
+            run: run.clone(),
+            incarnation: config.run.incarnation,
+            task,
+            plan,
+            candidates: experiment.candidates,
+        };
         let state = SnapshotPublisher::new(identity, run_dir.clone(), metrics.clone(), hub.clone(), notices.clone());
         let (publisher, publisher_messages) = inbox();
         let publisher_thread = spawn("publisher", move || state.run(&publisher_messages))?;

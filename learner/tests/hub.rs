@@ -15,10 +15,12 @@ use quad_learner::scoreboard::{Rules, Scoreboard};
 use quad_learner::train::TrainedPolicy;
 use quad_learner::wire::Wire;
 use quad_protocol::{
-    EpisodeScore, Hash, Job, JobReply, JobRequest, Message, Name, Progress, RecordedScores, ScoreReply, ScoreReport,
-    Snapshot, decode, encode, keys,
+    EpisodeScore, Hash, Job, JobReply, JobRequest, Message, Name, Origin, Progress, RecordedScores, ScoreReply,
+    ScoreReport, Snapshot, decode, encode, keys,
 };
 use quad_service::{Endpoints, open_session};
+use safetensors::Dtype;
+use safetensors::tensor::TensorView;
 use tokio::sync::mpsc::UnboundedReceiver;
 use zenoh::Session;
 
@@ -44,7 +46,15 @@ fn name(text: &str) -> Name {
 }
 
 fn tensors(step: u64) -> Vec<u8> {
-    vec![step as u8; 200_000]
+    let bytes = vec![step as u8; 200_000];
+    let tensor = TensorView::new(Dtype::U8, vec![bytes.len()], &bytes).unwrap();
+    safetensors::serialize([("weights", tensor)], None).unwrap()
+}
+
+/// The file that is published of them.
+fn file(step: u64) -> Vec<u8> {
+    let origin = Origin { environment: "hopper".to_owned(), seed: 1, step, episodes: 4, candidates: 3 };
+    origin.attach(&tensors(step)).unwrap()
 }
 
 impl Bench {
@@ -70,7 +80,7 @@ impl Bench {
         let state = Hub::new(run.clone(), plan, Scoreboard::new(rules), log, metrics.clone(), notify.clone());
         let (hub, messages) = inbox();
         std::thread::spawn(move || state.run(&messages));
-        let identity = Identity { run: run.clone(), incarnation: INCARNATION, task };
+        let identity = Identity { run: run.clone(), incarnation: INCARNATION, task, plan, candidates: 3 };
         let state = SnapshotPublisher::new(identity, run_dir.clone(), metrics.clone(), hub.clone(), notify);
         let (publisher, messages) = inbox();
         std::thread::spawn(move || state.run(&messages));
@@ -216,7 +226,7 @@ async fn a_job_goes_out_and_its_scores_are_on_disk_before_the_thanks() {
 
     let job = claim_eventually(&client, &bench.run, "a").await;
     assert_eq!((job.step, job.incarnation, job.candidates, job.seeds.len()), (10, INCARNATION, 3, 2));
-    assert_eq!(job.weights, Hash::of(&tensors(10)));
+    assert_eq!(job.weights, Hash::of(&file(10)));
 
     let recorded = deliver(&client, &report(&job, "a")).await;
     assert_eq!(bench.lines(), 2);
@@ -253,7 +263,7 @@ async fn weights_are_published_and_older_ones_are_answered_from_the_disk() {
     bench.snapshot(20).await;
     for step in [10, 20] {
         let snapshot: Snapshot = ask(&client, keys::weights_at(&bench.run, step), None).await.unwrap().unwrap();
-        assert_eq!((snapshot.step, snapshot.hash, snapshot.tensors), (step, Hash::of(&tensors(step)), tensors(step)));
+        assert_eq!((snapshot.step, snapshot.hash, snapshot.tensors), (step, Hash::of(&file(step)), file(step)));
     }
     let missing = ask::<Snapshot>(&client, keys::weights_at(&bench.run, 11), None).await.unwrap();
     assert!(missing.unwrap_err().contains("no snapshot"));

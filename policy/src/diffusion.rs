@@ -156,6 +156,10 @@ impl Policy for DiffusionPolicy {
         self.shape.action_dim
     }
 
+    fn samples_candidates(&self) -> bool {
+        true
+    }
+
     fn act(
         &self,
         observations: &[f32],

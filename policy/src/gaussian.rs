@@ -72,6 +72,10 @@ impl Policy for GaussianPolicy {
         self.shape.action_dim
     }
 
+    fn samples_candidates(&self) -> bool {
+        false
+    }
+
     fn act(
         &self,
         observations: &[f32],

@@ -26,6 +26,9 @@ pub trait Policy: Send + Sync {
     /// Numbers in an action.
     fn action_dim(&self) -> usize;
 
+    /// Whether it samples candidate actions, of which it takes the best.
+    fn samples_candidates(&self) -> bool;
+
     /// Chooses an action for each of n states.
     ///
     /// `observations` is `n × observation_dim`, `actions` (written) `n × action_dim`; `noise` has the stream of each

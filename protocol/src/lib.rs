@@ -6,7 +6,7 @@
 //!
 //! - `name`: what runs and evaluators may be called; `hash`: how weights are identified.
 //! - [`keys`]: where on Zenoh each message is found.
-//! - `snapshot`: weights, from the learner to evaluators.
+//! - `snapshot`: weights, from the learner to evaluators; `origin`: what their file says of where it comes from.
 //! - `seeds`: which episodes an evaluation has; `job`: an evaluator asks for work and gets some.
 //! - `progress`: an evaluator tells how far its job is.
 //! - `score`: an evaluator delivers scores, the learner acknowledges and publishes them.
@@ -21,6 +21,7 @@ mod hash;
 mod job;
 pub mod keys;
 mod name;
+mod origin;
 mod progress;
 mod score;
 mod seeds;
@@ -30,6 +31,7 @@ pub use codec::{CodecError, Message, PROTOCOL_VERSION, decode, decode_from, enco
 pub use hash::Hash;
 pub use job::{Job, JobReply, JobRequest};
 pub use name::{InvalidName, Name};
+pub use origin::{Origin, OriginError};
 pub use progress::Progress;
 pub use score::{EpisodeScore, RecordedScores, ScoreReply, ScoreReport};
 pub use seeds::episode_seeds;

@@ -35,6 +35,7 @@ pub struct Snapshot {
     pub schema: Schema,
     /// BLAKE3 hash of exactly the bytes in `tensors`. Decoding verifies it.
     pub hash: Hash,
-    /// A whole safetensors file with the shapes of its networks in its metadata. It is not looked into here.
+    /// A whole safetensors file with the shapes of its networks and its [`Origin`](crate::Origin) in its metadata. It is
+    /// not looked into here.
     pub tensors: Vec<u8>,
 }

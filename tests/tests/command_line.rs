@@ -20,7 +20,7 @@ fn help_says_what_there_is() {
             &["train", "--help"],
             &["--preset", "--dataset", "--run-dir", "--guidance", "--listen", "--connect"],
         ),
-        ("evaluator", &["--help"], &["serve", "collect", "verify-dataset"]),
+        ("evaluator", &["--help"], &["serve", "score", "collect", "verify-dataset"]),
         ("evaluator", &["serve", "--help"], &["--connect", "--metrics", "tcp/127.0.0.1:7447"]),
     ] {
         let output = run(program, arguments);
@@ -44,6 +44,8 @@ fn a_wrong_command_line_exits_with_2() {
         ("evaluator", &["serve", "--metrics", "everywhere"]),
         ("evaluator", &["serve", "--connect", "127.0.0.1:7447"]),
         ("evaluator", &["collect", "--env", "hopper"]),
+        ("evaluator", &["score"]),
+        ("evaluator", &["score", "x", "--candidates", "1,0"]),
     ] {
         let output = run(program, arguments);
         let text = String::from_utf8_lossy(&output.stderr);

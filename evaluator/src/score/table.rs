@@ -1,0 +1,126 @@
+//! Scores as a table.
+
+use std::collections::BTreeSet;
+use std::fmt;
+
+use super::Scored;
+
+/// Mean and sample standard deviation (n - 1) of some values.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Spread {
+    /// The mean; NaN without any value.
+    pub mean: f64,
+    /// The standard deviation; absent for a single value.
+    pub std: Option<f64>,
+}
+
+impl Spread {
+    /// Of these values.
+    pub fn of(values: &[f64]) -> Self {
+        let count = values.len() as f64;
+        let mean = values.iter().sum::<f64>() / count;
+        let squares: f64 = values.iter().map(|value| (value - mean).powi(2)).sum();
+        Self { mean, std: (values.len() > 1).then(|| (squares / (count - 1.0)).sqrt()) }
+    }
+}
+
+impl fmt::Display for Spread {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match self.std {
+            Some(std) => write!(f, "{:.2} ± {std:.2}", self.mean),
+            None => write!(f, "{:.2}", self.mean),
+        }
+    }
+}
+
+/// A row for each snapshot, a column for each number of candidates; below, their means if they can be averaged.
+pub fn table(scored: &[Scored]) -> String {
+    let candidates: BTreeSet<u32> = scored.iter().map(|scored| scored.candidates).collect();
+    let title = |candidates: &u32| format!("{candidates} candidate{}", if *candidates == 1 { "" } else { "s" });
+    let head = ["snapshot", "step", "environment", "episodes"].map(str::to_owned);
+    let mut rows: Vec<Vec<String>> = vec![head.into_iter().chain(candidates.iter().map(title)).collect()];
+
+    let snapshots: Vec<&[Scored]> = scored.chunk_by(|one, next| one.snapshot == next.snapshot).collect();
+    for of_one in &snapshots {
+        let Scored { snapshot, step, environment, episodes, .. } = &of_one[0];
+        let step = step.map_or_else(|| "?".to_owned(), |step| step.to_string());
+        let head = [snapshot.display().to_string(), step, environment.clone(), episodes.len().to_string()];
+        let score = |candidates: &u32| {
+            let found = of_one.iter().find(|scored| scored.candidates == *candidates);
+            found.map(|scored| Spread::of(&scored.scores()).to_string()).unwrap_or_default()
+        };
+        rows.push(head.into_iter().chain(candidates.iter().map(score)).collect());
+    }
+    let precision = scored.first().map_or("", |scored| scored.precision.name());
+    let mut note = format!("normalised score in {precision}, mean ± standard deviation over the episodes");
+    if snapshots.len() > 1 && scored.iter().all(|other| other.environment == scored[0].environment) {
+        let head = [format!("mean of {} snapshots", snapshots.len()), String::new(), String::new(), String::new()];
+        let mean = |candidates: &u32| {
+            let with_these = scored.iter().filter(|scored| scored.candidates == *candidates);
+            let means: Vec<f64> = with_these.map(|scored| Spread::of(&scored.scores()).mean).collect();
+            // Of fewer it would be something else than the row says.
+            if means.len() == snapshots.len() { Spread::of(&means).to_string() } else { String::new() }
+        };
+        rows.push(head.into_iter().chain(candidates.iter().map(mean)).collect());
+        note.push_str("; in the last row over the snapshots");
+    }
+    aligned(&rows) + &note
+}
+
+/// Columns as wide as they must be: text to the left, in all but the first, numbers to the right.
+fn aligned(rows: &[Vec<String>]) -> String {
+    let width = |column: usize| rows.iter().map(|row| row[column].chars().count()).max().unwrap_or(0);
+    let widths: Vec<usize> = (0..rows.first().map_or(0, Vec::len)).map(width).collect();
+    let line = |row: &Vec<String>| {
+        let cells = row.iter().zip(&widths).enumerate().map(|(column, (cell, &width))| match column {
+            0 => format!("{cell:<width$}"),
+            _ => format!("  {cell:>width$}"),
+        });
+        format!("{}\n", cells.collect::<String>().trim_end())
+    };
+    rows.iter().map(line).collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::score::Episode;
+    use quad_policy::Precision;
+    use std::path::Path;
+
+    fn scored(snapshot: &str, candidates: u32, scores: &[f64]) -> Scored {
+        let episode = |&score| Episode { seed: 1, episode_return: 0.0, length: 7, score };
+        Scored {
+            snapshot: Path::new(snapshot).to_owned(),
+            weights: String::new(),
+            environment: "hopper".to_owned(),
+            step: Some(20),
+            seed: 1,
+            candidates,
+            precision: Precision::F32,
+            episodes: scores.iter().map(episode).collect(),
+        }
+    }
+
+    #[test]
+    fn a_row_for_each_snapshot_and_a_column_for_each_number_of_candidates() {
+        let table =
+            table(&[scored("a", 1, &[1.0, 3.0]), scored("a", 10, &[10.0, 10.0]), scored("longer", 1, &[4.0, 4.0])]);
+        let lines: Vec<Vec<&str>> = table
+            .lines()
+            .map(|line| line.split("  ").filter(|cell| !cell.is_empty()).map(str::trim).collect())
+            .collect();
+        assert_eq!(lines[0], ["snapshot", "step", "environment", "episodes", "1 candidate", "10 candidates"]);
+        assert_eq!(lines[1], ["a", "20", "hopper", "2", "2.00 ± 1.41", "10.00 ± 0.00"]);
+        assert_eq!(lines[2], ["longer", "20", "hopper", "2", "4.00 ± 0.00"]);
+        assert_eq!(lines[3], ["mean of 2 snapshots", "3.00 ± 1.41"], "ten candidates were not tried for both");
+    }
+
+    #[test]
+    fn unlike_environments_have_no_mean() {
+        let other = Scored { environment: "walker2d".to_owned(), ..scored("b", 1, &[1.0]) };
+        let table = table(&[scored("a", 1, &[1.0]), other]);
+        assert!(!table.contains("mean of"), "{table}");
+        assert!(table.contains(" 1.00\n"), "a single episode has no spread: {table}");
+    }
+}
