@@ -11,7 +11,7 @@ use quad_dataset::Batch;
 use quad_kernels::activation::{mish_in_place, mish_slope};
 use quad_learner::agent::Agent;
 use quad_learner::algorithms::Setting;
-use quad_learner::config::{Experiment, Overrides, resolve};
+use quad_learner::config::{Experiment, resolve};
 use quad_learner::device::Device;
 use quad_learner::optimiser::{Adam, AdamStep, follow};
 use quad_policy::{DiffusionShape, Ensemble, Layout, NoisePredictor, Precision, Weights};
@@ -33,7 +33,9 @@ const CONFIGURATIONS: [(&str, &str, Option<u32>); 4] = [
 ];
 
 fn experiment(preset: &str, samples: Option<u32>) -> Experiment {
-    resolve(preset, &Overrides { samples, ..Overrides::default() }).expect("a preset")
+    let mut experiment = resolve(preset, &Default::default()).expect("a preset");
+    experiment.agent.extend(samples.map(|samples| ("samples".to_owned(), samples.into())));
+    experiment
 }
 
 fn setting(experiment: &Experiment, precision: Precision, device: Device) -> Setting {

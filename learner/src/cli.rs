@@ -6,9 +6,10 @@ use std::path::PathBuf;
 use clap::{Args, Parser, Subcommand};
 use quad_policy::Precision;
 use quad_service::parse_endpoint;
+use toml::{Table, Value};
 
-use crate::config::{self, Overrides};
 use crate::device::Device;
+use crate::presets;
 
 const TRAIN_EXAMPLES: &str = "\
 Examples:
@@ -36,6 +37,8 @@ pub enum Command {
     /// Train on a dataset, publish snapshots, hand out evaluations, keep the run in a folder
     #[command(after_help = TRAIN_EXAMPLES)]
     Train(Box<TrainArgs>),
+    /// List the presets, or print one with every value that it stands for
+    Presets(PresetsArgs),
     /// Print the evaluations of finished or running runs; several folders are summarised over seeds
     Report(ReportArgs),
 }
@@ -43,12 +46,12 @@ pub enum Command {
 /// Arguments of `learner train`.
 #[derive(Debug, Args)]
 pub struct TrainArgs {
-    /// Hyper-parameters: a preset's name, or the path of a file that ends in .toml
+    /// Hyper-parameters: a preset's name (`learner presets` lists them), or the path of a file that ends in .toml
     #[arg(long, value_name = "NAME", value_parser = parse_preset)]
     pub preset: String,
-    /// HDF5 file in D4RL's layout (`evaluator collect` records one)
+    /// HDF5 file in D4RL's layout (`evaluator collect` records one) [default: the preset's]
     #[arg(long, value_name = "FILE")]
-    pub dataset: PathBuf,
+    dataset: Option<String>,
     /// Folder of this run; its last part names the run [default: runs/PRESET-VARIANT-seedSEED]
     #[arg(long, value_name = "DIR")]
     pub run_dir: Option<PathBuf>,
@@ -65,6 +68,9 @@ pub struct TrainArgs {
     /// Train on the CPU, or on the first Nvidia GPU, with a learner that was built by deploy/cuda.sh
     #[arg(long, value_name = "cpu|cuda", value_enum, hide_possible_values = true, default_value_t)]
     pub device: Device,
+    /// Any other value of the preset, in TOML's notation: agent.tau=0.5, environment=my-robot; repeatable
+    #[arg(long, value_name = "KEY=VALUE", value_parser = presets::parse_assignment)]
+    set: Vec<Table>,
     #[command(flatten)]
     overrides: OverrideArgs,
 }
@@ -74,39 +80,69 @@ pub struct TrainArgs {
 #[command(next_help_heading = "Instead of the preset's value")]
 struct OverrideArgs {
     /// Gradient steps
-    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u64).range(1..))]
-    steps: Option<u64>,
+    #[arg(long, value_name = "N", value_parser = clap::value_parser!(i64).range(1..))]
+    steps: Option<i64>,
     /// Gradient steps between two evaluations; 0 trains without any evaluation
-    #[arg(long, value_name = "N")]
-    eval_interval: Option<u64>,
+    #[arg(long, value_name = "N", value_parser = clap::value_parser!(i64).range(0..))]
+    eval_interval: Option<i64>,
     /// Episodes per evaluation
-    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(1..))]
-    episodes: Option<u32>,
+    #[arg(long, value_name = "N", value_parser = clap::value_parser!(i64).range(1..))]
+    episodes: Option<i64>,
     /// Seed of initial weights, batches, noise and the evaluations' episodes
-    #[arg(long, value_name = "N")]
-    seed: Option<u64>,
+    #[arg(long, value_name = "N", value_parser = clap::value_parser!(i64).range(0..))]
+    seed: Option<i64>,
     /// What pulls the policy away from the data: quad (Q-gradients weighted by the critics' agreement),
     /// dac (Q-gradients as they are) or none (behaviour cloning)
     #[arg(long, value_name = "quad|dac|none")]
     guidance: Option<String>,
     /// Actions sampled per next state for the critics' target
-    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(1..))]
-    samples: Option<u32>,
+    #[arg(long, value_name = "N", value_parser = clap::value_parser!(i64).range(1..))]
+    samples: Option<i64>,
     /// Actions that an evaluated policy samples per state; the critics choose the best
-    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(1..))]
-    candidates: Option<u32>,
+    #[arg(long, value_name = "N", value_parser = clap::value_parser!(i64).range(1..))]
+    candidates: Option<i64>,
     /// Arithmetic of what no gradient is taken of, f32 or bf16: the latter is faster on CPUs with AMX or AMD's AVX512-BF16, and rounds
     #[arg(long, value_name = "NAME")]
     precision: Option<Precision>,
 }
 
 impl TrainArgs {
-    /// The flags that were given in place of the preset's values.
-    pub fn overrides(&self) -> Overrides {
-        let OverrideArgs { steps, eval_interval, episodes, seed, samples, candidates, precision, .. } = self.overrides;
-        let guidance = self.overrides.guidance.clone();
-        Overrides { steps, eval_interval, episodes, seed, guidance, samples, candidates, precision }
+    /// What the command line changes in the preset, where a flag of its own goes before `--set`.
+    pub fn changes(&self) -> Table {
+        let OverrideArgs { steps, eval_interval, episodes, seed, samples, candidates, .. } = self.overrides;
+        let numbers = [
+            ("steps", steps),
+            ("eval_interval", eval_interval),
+            ("episodes", episodes),
+            ("seed", seed),
+            ("candidates", candidates),
+        ];
+        let numbers = numbers.map(|(key, value)| (key, value.map(Value::from)));
+        let precision = self.overrides.precision.map(|precision| precision.name().into());
+        let words = [("dataset", self.dataset.clone().map(Value::from)), ("precision", precision)];
+        let guidance = self.overrides.guidance.clone().map(Value::from);
+        let agent = table([("guidance", guidance), ("samples", samples.map(Value::from))]);
+
+        let mut changes = Table::new();
+        let flags =
+            table(numbers.into_iter().chain(words).chain([("agent", (!agent.is_empty()).then(|| agent.into()))]));
+        for layer in self.set.iter().cloned().chain([flags]) {
+            presets::merge(&mut changes, layer);
+        }
+        changes
     }
+}
+
+fn table(entries: impl IntoIterator<Item = (&'static str, Option<Value>)>) -> Table {
+    entries.into_iter().filter_map(|(key, value)| Some((key.to_owned(), value?))).collect()
+}
+
+/// Arguments of `learner presets`.
+#[derive(Debug, Args)]
+pub struct PresetsArgs {
+    /// Print this preset as a file of your own could have it, all bases merged
+    #[arg(value_name = "NAME", value_parser = parse_preset)]
+    pub preset: Option<String>,
 }
 
 /// Arguments of `learner report`.
@@ -124,11 +160,14 @@ pub struct ReportArgs {
 }
 
 fn parse_preset(text: &str) -> Result<String, String> {
-    if text.ends_with(".toml") || config::embedded_preset(text).is_some() {
+    if presets::is_path(text) || presets::names().any(|name| name == text) {
         return Ok(text.to_owned());
     }
-    let known: Vec<_> = config::PRESETS.iter().map(|(name, _)| *name).collect();
-    Err(format!("presets are {}; a file of your own must end in .toml", known.join(", ")))
+    let nearest = match presets::nearest(text, presets::names())[..] {
+        [] => String::new(),
+        ref nearest => format!("did you mean {}? ", nearest.join(", ")),
+    };
+    Err(format!("{nearest}`learner presets` lists them all; a file of your own must end in .toml"))
 }
 
 #[cfg(test)]
@@ -148,20 +187,23 @@ mod tests {
     }
 
     #[test]
-    fn flags_become_overrides() {
-        let flags =
-            ["--steps", "7", "--eval-interval", "0", "--guidance", "dac", "--samples", "3", "--candidates", "4"];
+    fn flags_change_the_preset() {
+        let flags = ["--steps", "7", "--eval-interval", "0", "--guidance", "dac", "--set", "agent.samples=2"];
         let Command::Train(train) = parse(&flags).unwrap().command else { panic!("not train") };
-        let overrides = train.overrides();
-        assert_eq!((overrides.steps, overrides.eval_interval, overrides.samples), (Some(7), Some(0), Some(3)));
-        assert_eq!((overrides.guidance, overrides.candidates, overrides.seed), (Some("dac".to_owned()), Some(4), None));
+        let expected =
+            toml::toml! { dataset = "d.hdf5" steps = 7 eval_interval = 0 agent = { guidance = "dac", samples = 2 } };
+        assert_eq!(train.changes(), expected);
+        let Command::Train(train) = parse(&["--set", "seed=2", "--seed", "3"]).unwrap().command else { panic!() };
+        assert_eq!(train.changes(), toml::toml! { dataset = "d.hdf5" seed = 3 });
     }
 
     #[test]
     fn wrong_command_lines_exit_with_2() {
-        let wrong: [&[&str]; 7] = [
+        let wrong: [&[&str]; 9] = [
             &["--steps", "0"],
             &["--candidates", "0"],
+            &["--seed", "9223372036854775808"],
+            &["--set", "agent.tau"],
             &["--listen", "127.0.0.1:7447"],
             &["--listen", "tcp/127.0.0.1:1", "--connect", "tcp/127.0.0.1:2"],
             &["--metrics", "9090"],
@@ -172,6 +214,6 @@ mod tests {
             assert_eq!(parse(flags).unwrap_err().exit_code(), 2, "{flags:?}");
         }
         let unknown = Cli::try_parse_from(["learner", "train", "--preset", "walker", "--dataset", "d"]).unwrap_err();
-        assert!(unknown.to_string().contains("hopper-demo"), "{unknown}");
+        assert!(unknown.to_string().contains("walker2d-demo"), "{unknown}");
     }
 }

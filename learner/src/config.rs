@@ -1,20 +1,15 @@
 //! From a preset and flags to one validated experiment, and what a run saves of it.
 
-use std::path::{Path, PathBuf};
+use std::path::PathBuf;
 
-use quad_dataset::RewardRule;
+use quad_dataset::{RewardRule, environment};
 use quad_policy::Precision;
 use serde::{Deserialize, Serialize};
+use toml::{Table, Value};
 
 use crate::algorithms::{self, ALGORITHMS, AgentError, Definition, Hyperparameters};
 use crate::device::Device;
-
-/// The presets that the binary carries: name and TOML.
-pub const PRESETS: [(&str, &str); 3] = [
-    ("hopper-demo", include_str!("../../presets/hopper-demo.toml")),
-    ("hopper-demo-iql", include_str!("../../presets/hopper-demo-iql.toml")),
-    ("hopper-medium-replay-v2", include_str!("../../presets/hopper-medium-replay-v2.toml")),
-];
+use crate::presets;
 
 /// Most episodes in one evaluation, and most candidates per state: far above any use, low enough for evaluators' memory.
 const MOST_EPISODES: u32 = 10_000;
@@ -22,13 +17,16 @@ const MOST_CANDIDATES: u32 = 1_000;
 /// Most transitions in a batch: far above any use, too.
 const MOST_BATCH: u32 = 1 << 20;
 
-/// Everything that decides the outcome of a run, apart from the dataset: the contents of a preset.
+/// Everything that decides the outcome of a run, apart from the contents of the dataset: a preset, resolved.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Experiment {
     /// Environment that the data is from and the policy is evaluated in.
     pub environment: String,
-    /// How rewards are scaled before training.
+    /// What it learns from: a name, or a file. [`DatasetInfo`] says what was found there.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub dataset: Option<String>,
+    /// How rewards are scaled before training; a preset that does not say takes the environment's rule.
     pub reward: RewardRule,
     /// Gradient steps.
     pub steps: u64,
@@ -48,21 +46,7 @@ pub struct Experiment {
     /// Name of the learning algorithm.
     pub algorithm: String,
     /// Its hyper-parameters.
-    pub agent: toml::Table,
-}
-
-/// Values from the command line that take the place of a preset's.
-#[derive(Clone, Debug, Default)]
-#[allow(missing_docs)] // the fields of `Experiment` and of its `agent` of the same names
-pub struct Overrides {
-    pub steps: Option<u64>,
-    pub eval_interval: Option<u64>,
-    pub episodes: Option<u32>,
-    pub seed: Option<u64>,
-    pub guidance: Option<String>,
-    pub samples: Option<u32>,
-    pub precision: Option<Precision>,
-    pub candidates: Option<u32>,
+    pub agent: Table,
 }
 
 /// What a run folder says about itself in `config.toml`.
@@ -138,13 +122,24 @@ pub enum ConfigError {
     /// Neither embedded nor a path.
     #[error("there is no preset named {0}")]
     Unknown(String),
-    /// Not TOML, a field too many or too few, or a wrong type.
+    /// Good for others to build on, but nothing to train.
+    #[error("preset {0} names no environment: others build on it")]
+    Base(String),
+    /// Not TOML, a field too few, or a wrong type.
     #[error("preset {preset}: {source}")]
     Parse {
         /// Which preset.
         preset: String,
-        /// What is wrong, with the line.
+        /// What is wrong, with the line if it is not TOML.
         source: Box<toml::de::Error>,
+    },
+    /// A key that means nothing.
+    #[error("there is nothing to set by the name {key}")]
+    Key {
+        /// The key, dotted.
+        key: String,
+        /// Keys that are most like it.
+        nearest: Vec<String>,
     },
     /// An algorithm that nobody knows.
     #[error("there is no algorithm named {0:?}; there are {known}", known = ALGORITHMS.map(|known| known.name).join(", "))]
@@ -174,34 +169,44 @@ pub enum ConfigError {
     },
 }
 
-/// The TOML of an embedded preset.
-pub fn embedded_preset(name: &str) -> Option<&'static str> {
-    PRESETS.iter().find(|(known, _)| *known == name).map(|(_, toml)| *toml)
-}
-
-/// The short name of a preset: `hopper-demo`, also for a path like `my/hopper-demo.toml`.
-pub fn preset_label(preset: &str) -> String {
-    let stem = Path::new(preset).file_stem().and_then(|stem| stem.to_str());
-    if preset.ends_with(".toml") { stem.unwrap_or("preset").to_owned() } else { preset.to_owned() }
-}
-
-/// Reads a preset (an embedded name, or a path that ends in `.toml`), applies the flags, checks every range.
-pub fn resolve(preset: &str, overrides: &Overrides) -> Result<Experiment, ConfigError> {
-    if !preset.ends_with(".toml") {
-        let text = embedded_preset(preset).ok_or_else(|| ConfigError::Unknown(preset.to_owned()))?;
-        return parse(preset, text, overrides);
-    }
-    match std::fs::read_to_string(preset) {
-        Ok(text) => parse(preset, &text, overrides),
-        Err(source) => Err(ConfigError::Read { path: preset.into(), source }),
+impl ConfigError {
+    /// What to do about it.
+    pub fn hint(&self) -> Option<String> {
+        const LIST: &str = "`learner presets` lists them all";
+        match self {
+            Self::Unknown(preset) => match presets::nearest(preset, presets::names())[..] {
+                [] => Some(LIST.to_owned()),
+                ref nearest => Some(format!("did you mean {}? {LIST}", nearest.join(", "))),
+            },
+            Self::Base(_) => Some("`learner presets` lists those that can be trained".to_owned()),
+            Self::Key { nearest, .. } if nearest.is_empty() => {
+                Some("`learner presets NAME` shows every key of a preset".to_owned())
+            }
+            Self::Key { nearest, .. } => Some(format!("did you mean {}?", nearest.join(", "))),
+            _ => None,
+        }
     }
 }
 
-fn parse(preset: &str, text: &str, overrides: &Overrides) -> Result<Experiment, ConfigError> {
-    let parsed = toml::from_str::<Experiment>(text);
-    let mut experiment =
-        parsed.map_err(|source| ConfigError::Parse { preset: preset.to_owned(), source: Box::new(source) })?;
-    experiment.apply(overrides);
+/// Reads a preset (an embedded name, or a path that ends in `.toml`), lays changes over it, checks every range.
+///
+/// # Errors
+/// There is no such preset, or something in it or in the changes cannot be used.
+pub fn resolve(preset: &str, changes: &Table) -> Result<Experiment, ConfigError> {
+    let mut table = presets::load(preset)?;
+    presets::merge(&mut table, changes.clone());
+    if let Some((key, nearest)) = presets::unknown_key(&table) {
+        return Err(ConfigError::Key { key, nearest });
+    }
+    let unusable = |source| ConfigError::Parse { preset: preset.to_owned(), source: Box::new(source) };
+    let Some(environment) = table.get("environment") else { return Err(ConfigError::Base(preset.to_owned())) };
+    if !table.contains_key("reward") {
+        let known = environment.as_str().and_then(|name| environment::find(name).ok());
+        let rule = known.map_or(RewardRule::AsIs, |spec| spec.reward);
+        let rule = Value::try_from(rule).map_err(|error| unusable(serde::de::Error::custom(error)))?;
+        table.insert("reward".to_owned(), rule);
+    }
+    let experiment: Experiment = table.try_into().map_err(unusable)?;
     experiment.validate()?;
     if !experiment.hyperparameters()?.samples_candidates() && experiment.candidates != 1 {
         return Err(ConfigError::Candidates(experiment.candidates));
@@ -210,22 +215,6 @@ fn parse(preset: &str, text: &str, overrides: &Overrides) -> Result<Experiment, 
 }
 
 impl Experiment {
-    fn apply(&mut self, overrides: &Overrides) {
-        fn set<T: Copy>(field: &mut T, value: Option<T>) {
-            *field = value.unwrap_or(*field);
-        }
-        set(&mut self.steps, overrides.steps);
-        set(&mut self.eval_interval, overrides.eval_interval);
-        set(&mut self.episodes, overrides.episodes);
-        set(&mut self.seed, overrides.seed);
-        set(&mut self.candidates, overrides.candidates);
-        set(&mut self.precision, overrides.precision);
-        // An algorithm without such a hyper-parameter refuses it when it reads the table.
-        let guidance = overrides.guidance.clone().map(|guidance| ("guidance", guidance.into()));
-        let samples = overrides.samples.map(|samples| ("samples", samples.into()));
-        self.agent.extend([guidance, samples].into_iter().flatten().map(|(key, value)| (key.to_owned(), value)));
-    }
-
     /// The algorithm.
     ///
     /// # Errors
@@ -278,79 +267,87 @@ impl Experiment {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use toml::toml;
 
-    fn demo_with(change: impl Fn(&str) -> String) -> Result<Experiment, ConfigError> {
-        parse("test", &change(embedded_preset("hopper-demo").unwrap()), &Overrides::default())
+    fn refused(changes: Table) -> ConfigError {
+        resolve("hopper-demo", &changes).unwrap_err()
     }
 
     #[test]
-    fn every_embedded_preset_is_valid() {
-        for (name, _) in PRESETS {
-            let experiment = resolve(name, &Overrides::default()).unwrap();
-            let text = toml::to_string(&experiment).unwrap();
-            assert_eq!(toml::from_str::<Experiment>(&text).unwrap(), experiment, "{name} survives being saved");
+    fn changes_override_the_preset() {
+        let preset = resolve("hopper-demo", &Table::new()).unwrap();
+        let resolved = resolve("hopper-demo", &toml! { steps = 5 agent.guidance = "none" agent.tau = 1 }).unwrap();
+        assert_eq!((resolved.steps, resolved.eval_interval), (5, preset.eval_interval));
+        assert_eq!((&resolved.agent["guidance"], &resolved.agent["tau"]), (&"none".into(), &1.0.into()));
+    }
+
+    #[test]
+    fn a_reward_rule_that_is_not_given_is_the_environments() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("mine.toml");
+        let mut table = presets::load("hopper-demo").unwrap();
+        table.remove("reward");
+        std::fs::write(&path, table.to_string()).unwrap();
+        let reward = |environment: &str| {
+            let changes = Table::from_iter([("environment".to_owned(), environment.into())]);
+            resolve(path.to_str().unwrap(), &changes).unwrap().reward
+        };
+        assert_eq!(reward("walker2d"), environment::find("walker2d").unwrap().reward);
+        assert_eq!(reward("my-robot"), RewardRule::AsIs);
+    }
+
+    #[test]
+    fn unknown_and_missing_keys_are_errors() {
+        let error = refused(toml! { candidate = 3 });
+        assert_eq!(error.to_string(), "there is nothing to set by the name candidate");
+        assert_eq!(error.hint().unwrap(), "did you mean candidates?");
+        let error = refused(toml! { agent.learning_rate = 1.0 });
+        assert!(error.hint().unwrap().contains("agent.actor_learning_rate"), "{error}");
+        let error = refused(toml! { agent.eta.treshold = 1.0 });
+        assert!(error.hint().unwrap().contains("agent.eta.threshold"), "{error}");
+        let error = resolve("paper", &toml! { environment = "hopper" }).unwrap_err().to_string();
+        assert!(error.contains("missing field") && error.contains("preset paper"), "{error}");
+    }
+
+    /// What serde says of a field that no struct has: it lists those that there are.
+    #[test]
+    fn every_key_that_there_is_can_be_offered() {
+        for (preset, lists) in [("hopper-medium-v2", &["", "agent", "agent.eta"][..]), ("hopper-demo-iql", &["agent"])]
+        {
+            for list in lists {
+                let mut table = Table::try_from(resolve(preset, &Table::new()).unwrap()).unwrap();
+                let inner = list.split('.').filter(|key| !key.is_empty());
+                let inner = inner.fold(&mut table, |table, key| table[key].as_table_mut().unwrap());
+                inner.insert("no-such-key".to_owned(), 1.into());
+                let error = match table.try_into::<Experiment>() {
+                    Ok(experiment) => experiment.hyperparameters().err().unwrap().to_string(),
+                    Err(error) => error.to_string(),
+                };
+                let (_, fields) = error.split_once("expected one of").unwrap();
+                let fields: Vec<_> = fields.split('`').skip(1).step_by(2).take_while(|f| !list.ends_with(f)).collect();
+                assert!(fields.len() >= 5, "{error}");
+                for field in fields {
+                    let key = format!("{list}.{field}");
+                    let change = presets::parse_assignment(&format!("{}=1", key.trim_start_matches('.'))).unwrap();
+                    let mut table = presets::load(preset).unwrap();
+                    presets::merge(&mut table, change);
+                    assert_eq!(presets::unknown_key(&table), None, "{key}");
+                }
+            }
         }
     }
 
     #[test]
-    fn the_papers_preset_holds_the_papers_numbers() {
-        let paper = resolve("hopper-medium-replay-v2", &Overrides::default()).unwrap();
-        let number =
-            |key: &str| paper.agent[key].as_float().unwrap_or_else(|| paper.agent[key].as_integer().unwrap() as f64);
-        let keys =
-            ["diffusion_steps", "critics", "hidden", "rho", "tau", "actor_learning_rate", "critic_learning_rate"];
-        assert_eq!(keys.map(number), [5.0, 10.0, 256.0, 1.5, 0.1, 3e-4, 3e-4]);
-        assert_eq!(
-            (number("ema_rate"), paper.agent["eta"]["threshold"].as_float(), paper.batch_size),
-            (5e-3, Some(1.0), 256)
-        );
-        assert_eq!((paper.steps, paper.eval_interval, paper.episodes, paper.candidates), (2_000_000, 20_000, 10, 10));
-    }
-
-    #[test]
-    fn flags_override_the_preset() {
-        let overrides = Overrides {
-            steps: Some(5),
-            eval_interval: Some(0),
-            guidance: Some("none".to_owned()),
-            samples: Some(7),
-            ..Overrides::default()
-        };
-        let preset = resolve("hopper-demo", &Overrides::default()).unwrap();
-        let resolved = resolve("hopper-demo", &overrides).unwrap();
-        assert_eq!((resolved.steps, resolved.eval_interval, resolved.seed), (5, 0, preset.seed));
-        assert_eq!(
-            (resolved.agent["guidance"].as_str(), resolved.agent["samples"].as_integer()),
-            (Some("none"), Some(7))
-        );
-    }
-
-    #[test]
-    fn unknown_and_missing_fields_are_errors() {
-        let unknown = demo_with(|text| format!("candidate = 3\n{text}")).unwrap_err().to_string();
-        assert!(unknown.contains("candidate"), "{unknown}");
-        let nested = demo_with(|text| text.replace("[agent]", "[agent]\nlearning_rte = 1.0")).unwrap_err();
-        assert!(nested.to_string().contains("learning_rte"), "{nested}");
-        let missing = demo_with(|text| text.replace("episodes", "# episodes")).unwrap_err();
-        assert!(missing.to_string().contains("episodes"), "{missing}");
-    }
-
-    #[test]
     fn values_out_of_range_are_errors() {
-        let zero = Overrides { episodes: Some(0), ..Overrides::default() };
-        assert!(matches!(resolve("hopper-demo", &zero), Err(ConfigError::Range { field: "episodes", .. })));
-        let huge = Overrides { seed: Some(u64::MAX), ..Overrides::default() };
-        assert!(matches!(resolve("hopper-demo", &huge), Err(ConfigError::Range { field: "seed", .. })));
-        let samples = Overrides { samples: Some(0), ..Overrides::default() };
-        assert!(matches!(resolve("hopper-demo", &samples), Err(ConfigError::Agent { .. })));
-        let guidance = Overrides { guidance: Some("sac".to_owned()), ..Overrides::default() };
-        let error = resolve("hopper-demo", &guidance).unwrap_err().to_string();
+        assert!(matches!(refused(toml! { episodes = 0 }), ConfigError::Range { field: "episodes", .. }));
+        assert!(matches!(refused(toml! { agent.samples = 0 }), ConfigError::Agent { .. }));
+        let error = refused(toml! { agent.guidance = "sac" }).to_string();
         assert!(error.contains("sac") && error.contains("dac"), "the names that there are are offered: {error}");
-        let error = resolve("hopper-demo-iql", &samples).unwrap_err().to_string();
-        assert!(error.contains("iql") && error.contains("samples"), "{error}");
-        let many = Overrides { candidates: Some(10), ..Overrides::default() };
-        assert!(matches!(resolve("hopper-demo-iql", &many), Err(ConfigError::Candidates(10))));
-        let unknown = demo_with(|text| text.replace("algorithm = \"quad\"", "algorithm = \"sac\"")).unwrap_err();
+        let error = resolve("hopper-demo-iql", &toml! { agent.samples = 3 }).unwrap_err().to_string();
+        assert!(error.contains("agent.samples"), "{error}");
+        let error = resolve("hopper-demo-iql", &toml! { candidates = 10 }).unwrap_err();
+        assert!(matches!(error, ConfigError::Candidates(10)));
+        let unknown = refused(toml! { algorithm = "sac" });
         assert!(unknown.to_string().contains("quad, iql"), "{unknown}");
     }
 
@@ -358,11 +355,15 @@ mod tests {
     fn a_path_is_read_and_a_missing_one_is_named() {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("mine.toml");
-        std::fs::write(&path, embedded_preset("hopper-demo").unwrap()).unwrap();
+        std::fs::write(&path, "base = \"hopper-demo\"\nsteps = 7\n").unwrap();
         let path = path.to_str().unwrap();
-        assert_eq!(resolve(path, &Overrides::default()).unwrap(), demo_with(str::to_owned).unwrap());
-        assert_eq!(preset_label(path), "mine");
-        let missing = resolve("nowhere/x.toml", &Overrides::default()).unwrap_err();
+        let changed = resolve("hopper-demo", &toml! { steps = 7 }).unwrap();
+        assert_eq!(resolve(path, &Table::new()).unwrap(), changed);
+        assert_eq!(presets::label(path), "mine");
+        let missing = resolve("nowhere/x.toml", &Table::new()).unwrap_err();
         assert!(missing.to_string().contains("nowhere/x.toml"), "{missing}");
+        std::fs::write(path, "base = \"hoper-demo\"\n").unwrap();
+        let unknown = resolve(path, &Table::new()).unwrap_err();
+        assert!(unknown.hint().unwrap().contains("hopper-demo"), "{unknown}");
     }
 }

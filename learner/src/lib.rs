@@ -3,7 +3,8 @@
 //! # Layout
 //! In reading order:
 //!
-//! - [`cli`] is the command line; [`config`] the experiment that it describes, a preset with flags on top, validated once.
+//! - [`cli`] is the command line; [`config`] the experiment that it describes, one of the [`presets`] with flags on top,
+//!   validated once.
 //! - [`run`] goes from the command line to the exit; [`conduct`] is the main loop in between.
 //! - [`threads`] starts the threads that do the work: [`train`] (nothing but gradient steps, by an [`agent`] on a
 //!   [`device`]), [`publisher`] (publishes and saves snapshots) and [`hub`] (hands out jobs, takes scores in).
@@ -30,6 +31,7 @@ pub mod notice;
 pub mod optimiser;
 pub mod plot;
 mod pool;
+pub mod presets;
 pub mod publisher;
 pub mod random;
 pub mod report;

@@ -1,4 +1,4 @@
-//! `learner train` and `learner report`, from the command line to the exit.
+//! The learner's commands, from the command line to the exit.
 
 use std::io::{ErrorKind, Write};
 use std::path::{Path, PathBuf};
@@ -10,14 +10,16 @@ use quad_policy::Precision;
 use quad_protocol::Name;
 use quad_service::{Endpoints, Hint};
 use tokio::sync::mpsc;
+use toml::Table;
 use tracing::{debug, info, warn};
 
-use crate::cli::{Cli, Command, ReportArgs, TrainArgs};
+use crate::cli::{Cli, Command, PresetsArgs, ReportArgs, TrainArgs};
 use crate::conduct::{Conductor, Ending, open_network};
 use crate::config::{self, DatasetInfo, Experiment, RunConfig, RunInfo};
 use crate::display::Display;
 use crate::metrics::Metrics;
 use crate::plot;
+use crate::presets;
 use crate::report::{Report, RunReport};
 use crate::run_dir::RunDir;
 use crate::threads::Threads;
@@ -31,8 +33,24 @@ const ANY_ENDPOINT: &str = "tcp/127.0.0.1:0";
 pub fn run(cli: &Cli) -> anyhow::Result<()> {
     match &cli.command {
         Command::Train(args) => train(args),
+        Command::Presets(args) => list_presets(args),
         Command::Report(args) => report(args),
     }
+}
+
+fn list_presets(args: &PresetsArgs) -> anyhow::Result<()> {
+    let text = match &args.preset {
+        Some(preset) => toml::to_string(&resolve(preset, &Table::new())?)?,
+        None => presets::list()?,
+    };
+    Ok(print(text.trim_end())?)
+}
+
+fn resolve(preset: &str, changes: &Table) -> anyhow::Result<Experiment> {
+    config::resolve(preset, changes).or_else(|error| match error.hint() {
+        Some(hint) => Err(error).hint(hint),
+        None => Err(error.into()),
+    })
 }
 
 fn report(args: &ReportArgs) -> anyhow::Result<()> {
@@ -57,7 +75,9 @@ fn print(text: &str) -> std::io::Result<()> {
 }
 
 fn train(args: &TrainArgs) -> anyhow::Result<()> {
-    let experiment = config::resolve(&args.preset, &args.overrides())?;
+    let experiment = resolve(&args.preset, &args.changes())?;
+    let named = experiment.dataset.clone().ok_or_else(|| anyhow!("preset {} names no dataset", args.preset));
+    let dataset = named.map(PathBuf::from).hint(record_hint(&experiment))?;
     let path = match &args.run_dir {
         Some(path) => path.clone(),
         None => default_run_dir(&args.preset, &experiment)?,
@@ -71,10 +91,10 @@ fn train(args: &TrainArgs) -> anyhow::Result<()> {
         environment: quad_dataset::environment::find(&experiment.environment).ok(),
         reward: experiment.reward,
     };
-    let transitions = Transitions::read(&args.dataset, &options)
-        .with_context(|| format!("cannot learn from {}", args.dataset.display()))
-        .hint(format!("record a dataset with `evaluator collect --env {} --out FILE`", experiment.environment))?;
-    let config = run_config(args, &name, experiment, &transitions)?;
+    let transitions = Transitions::read(&dataset, &options)
+        .with_context(|| format!("cannot learn from {}", dataset.display()))
+        .hint(record_hint(&experiment))?;
+    let config = run_config(args, &name, experiment, dataset, &transitions)?;
     info!("{}", config.dataset.summary());
     info!("{}", config.experiment.summary()?);
     if !config.experiment.precision.is_available() {
@@ -86,6 +106,13 @@ fn train(args: &TrainArgs) -> anyhow::Result<()> {
     let runtime = tokio::runtime::Builder::new_multi_thread().worker_threads(2).enable_all().build()?;
     let (run_dir, ending) = runtime.block_on(conduct(args, &path, name, &config, transitions))?;
     conclude(&run_dir, &config, ending)
+}
+
+fn record_hint(experiment: &Experiment) -> String {
+    format!(
+        "give a file by --dataset FILE; `evaluator collect --env {} --out FILE` records one",
+        experiment.environment
+    )
 }
 
 async fn conduct(
@@ -157,7 +184,7 @@ fn conclude(run_dir: &RunDir, config: &RunConfig, ending: Ending) -> anyhow::Res
 
 fn default_run_dir(preset: &str, experiment: &Experiment) -> anyhow::Result<PathBuf> {
     let variant = experiment.hyperparameters()?.variant();
-    Ok(Path::new("runs").join(format!("{}-{variant}-seed{}", config::preset_label(preset), experiment.seed)))
+    Ok(Path::new("runs").join(format!("{}-{variant}-seed{}", presets::label(preset), experiment.seed)))
 }
 
 /// The folder's name, which is also the run's place in Zenoh's key space.
@@ -172,6 +199,7 @@ fn run_config(
     args: &TrainArgs,
     name: &Name,
     experiment: Experiment,
+    dataset: PathBuf,
     transitions: &Transitions,
 ) -> anyhow::Result<RunConfig> {
     let statistics = transitions.statistics();
@@ -179,12 +207,12 @@ fn run_config(
         run: RunInfo {
             name: name.to_string(),
             incarnation: SystemTime::now().duration_since(UNIX_EPOCH)?.as_millis() as u64,
-            preset: config::preset_label(&args.preset),
+            preset: presets::label(&args.preset),
             version: env!("CARGO_PKG_VERSION").to_owned(),
             device: args.device,
         },
         dataset: DatasetInfo {
-            path: args.dataset.clone(),
+            path: dataset,
             transitions: statistics.transitions as u64,
             episodes: statistics.episodes as u64,
             min_return: statistics.return_min,

@@ -3,14 +3,13 @@
 
 use std::path::Path;
 
-use quad_learner::config::{DatasetInfo, Overrides, RunConfig, RunInfo, resolve};
+use quad_learner::config::{DatasetInfo, RunConfig, RunInfo, resolve};
 use quad_learner::device::Device;
 use quad_learner::plot::learning_curves;
 use quad_learner::report::{Report, RunReport};
 use quad_learner::run_dir::{RunDir, RunDirError, ScoreLine};
 
 fn config(name: &str, seed: u64) -> RunConfig {
-    let overrides = Overrides { seed: Some(seed), episodes: Some(2), ..Overrides::default() };
     RunConfig {
         run: RunInfo {
             name: name.into(),
@@ -28,7 +27,11 @@ fn config(name: &str, seed: u64) -> RunConfig {
             max_return: 30.0,
             mean_score: Some(10.7),
         },
-        experiment: resolve("hopper-demo", &overrides).unwrap(),
+        experiment: resolve(
+            "hopper-demo",
+            &[("seed".to_owned(), (seed as i64).into()), ("episodes".to_owned(), 2.into())].into_iter().collect(),
+        )
+        .unwrap(),
     }
 }
 

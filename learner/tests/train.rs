@@ -9,7 +9,7 @@ use candle_core::Device;
 use quad_dataset::{BatchSampler, D4rlWriter, Metadata, ReadOptions, RewardRule, Row, Transitions, environment};
 use quad_learner::agent::Agent;
 use quad_learner::algorithms::{Setting, named};
-use quad_learner::config::{Overrides, resolve};
+use quad_learner::config::resolve;
 use quad_learner::metrics::Metrics;
 use quad_learner::train::{self, Outcome, Outlets, Plan, TrainError, train};
 use quad_policy::Precision;
@@ -48,7 +48,7 @@ fn transitions() -> Transitions {
 
 /// Hyper-parameters of a preset with small networks.
 fn small(preset: &str) -> toml::Table {
-    let mut table = resolve(preset, &Overrides::default()).unwrap().agent;
+    let mut table = resolve(preset, &toml::Table::new()).unwrap().agent;
     table.insert("hidden".to_owned(), 8.into());
     table
 }

@@ -14,11 +14,11 @@ fn run(program: &str, arguments: &[&str]) -> Output {
 #[test]
 fn help_says_what_there_is() {
     for (program, arguments, words) in [
-        ("learner", &["--help"][..], &["train", "report"][..]),
+        ("learner", &["--help"][..], &["train", "presets", "report"][..]),
         (
             "learner",
             &["train", "--help"],
-            &["--preset", "--dataset", "--run-dir", "--guidance", "--listen", "--connect"],
+            &["--preset", "--dataset", "--run-dir", "--guidance", "--set", "--listen", "--connect"],
         ),
         ("evaluator", &["--help"], &["serve", "score", "collect", "verify-dataset"]),
         ("evaluator", &["serve", "--help"], &["--connect", "--metrics", "tcp/127.0.0.1:7447"]),
@@ -39,6 +39,8 @@ fn a_wrong_command_line_exits_with_2() {
         ("learner", &["train"]),
         ("learner", &["train", "--preset", "nobody-has-this", "--dataset", "x"]),
         ("learner", &["train", "--preset", "hopper-demo", "--dataset", "x", "--samples", "0"]),
+        ("learner", &["train", "--preset", "hopper-demo", "--dataset", "x", "--set", "agent.tau"]),
+        ("learner", &["presets", "nobody-has-this"]),
         ("evaluator", &[]),
         ("evaluator", &["serve", "--name", "not a name"]),
         ("evaluator", &["serve", "--metrics", "everywhere"]),
@@ -73,7 +75,7 @@ fn a_missing_dataset_fails_with_a_hint() {
 fn an_algorithm_that_lacks_a_hyper_parameter_says_what_it_has() {
     for (preset, flags, words) in [
         ("hopper-demo", ["--guidance", "sac"], ["sac", "`dac`"]),
-        ("hopper-demo-iql", ["--guidance", "dac"], ["guidance", "`expectile`"]),
+        ("hopper-demo-iql", ["--guidance", "dac"], ["agent.guidance", "`learner presets NAME`"]),
         ("hopper-demo-iql", ["--candidates", "10"], ["candidates", "must be 1"]),
     ] {
         let output = run("learner", &[&["train", "--preset", preset, "--dataset", "x"][..], &flags].concat());
@@ -81,6 +83,54 @@ fn an_algorithm_that_lacks_a_hyper_parameter_says_what_it_has() {
         assert_eq!(output.status.code(), Some(1), "{preset} {flags:?}: {text}");
         assert!(words.iter().all(|word| text.contains(word)), "{preset} {flags:?}: {text}");
     }
+}
+
+#[test]
+fn a_wrong_name_is_answered_with_the_nearest() {
+    let folder = tempfile::tempdir().unwrap();
+    let own = folder.path().join("own.toml");
+    std::fs::write(&own, "base = \"hopper-demo\"\nbatchsize = 3\n").unwrap();
+    let own = own.to_str().unwrap();
+    for (arguments, code, words) in [
+        (&["--preset", "walker2d-medium-reply-v2"][..], 2, &["walker2d-medium-replay-v2"][..]),
+        (&["--preset", "hopper-demo", "--set", "agent.tua=0.5"], 1, &["agent.tua", "hint:", "agent.tau"]),
+        (&["--preset", "hopper-demo", "--set", "tau=0.5"], 1, &["name tau", "hint:", "agent.tau"]),
+        (&["--preset", own], 1, &["batchsize", "hint:", "batch_size"]),
+    ] {
+        let output = run("learner", &[&["train", "--dataset", "x"], arguments].concat());
+        let text = String::from_utf8_lossy(&output.stderr);
+        assert_eq!(output.status.code(), Some(code), "{arguments:?}: {text}");
+        assert!(words.iter().all(|word| text.contains(word)), "{arguments:?}: {text}");
+    }
+}
+
+#[test]
+fn presets_that_cannot_be_trained_as_they_are_say_what_is_missing() {
+    for (preset, words) in [
+        ("paper", ["paper names no environment", "`learner presets`"]),
+        ("hopper-demo", ["hopper-demo names no dataset", "--dataset FILE"]),
+    ] {
+        let output = run("learner", &["train", "--preset", preset]);
+        let text = String::from_utf8_lossy(&output.stderr);
+        assert_eq!(output.status.code(), Some(1), "{preset}: {text}");
+        assert!(text.contains("hint:") && words.iter().all(|word| text.contains(word)), "{preset}: {text}");
+    }
+}
+
+#[test]
+fn presets_are_listed_and_printed() {
+    let print = |arguments: &[&str]| {
+        let output = run("learner", &[&["presets"], arguments].concat());
+        assert_eq!(output.status.code(), Some(0), "{arguments:?}");
+        String::from_utf8(output.stdout).unwrap()
+    };
+    assert!(print(&[]).contains("\nantmaze-large-play-v0 "));
+    let folder = tempfile::tempdir().unwrap();
+    let own = folder.path().join("own.toml");
+    let text = print(&["walker2d-medium-replay-v2"]);
+    assert!(text.contains("\ntau = 100.0\n"), "{text}");
+    std::fs::write(&own, &text).unwrap();
+    assert_eq!(print(&[own.to_str().unwrap()]), text, "what is printed is a preset of one's own");
 }
 
 #[test]

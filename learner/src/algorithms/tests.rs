@@ -5,7 +5,7 @@ mod reader;
 
 use super::*;
 use crate::agent::Agent;
-use crate::config::{Overrides, resolve};
+use crate::config::resolve;
 use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 pub(super) use reader::{Golden, fresh, goldens};
@@ -53,10 +53,10 @@ fn variants() -> Vec<(Definition, toml::Table)> {
         ("hopper-demo", Some("none")),
         ("hopper-demo-iql", None),
     ] {
-        let overrides = Overrides { guidance: guidance.map(str::to_owned), ..Overrides::default() };
-        let mut experiment = resolve(preset, &overrides).unwrap();
+        let mut experiment = resolve(preset, &toml::Table::new()).unwrap();
         experiment.agent.insert("hidden".to_owned(), 24.into());
-        if guidance.is_some() {
+        if let Some(guidance) = guidance {
+            experiment.agent.insert("guidance".to_owned(), guidance.into());
             experiment.agent.insert("actor_ema_start".to_owned(), 0.into());
             experiment.agent.insert("samples".to_owned(), 3.into());
         }
