@@ -232,7 +232,7 @@ mod tests {
     fn every_file_of_the_folder_is_embedded() {
         let folder = Path::new(env!("CARGO_MANIFEST_DIR")).join("../presets");
         let mut files: Vec<_> = std::fs::read_dir(folder).unwrap().map(|file| file.unwrap().file_name()).collect();
-        let mut embedded: Vec<_> = names().map(|name| format!("{name}.toml").into()).collect();
+        let mut embedded: Vec<std::ffi::OsString> = names().map(|name| format!("{name}.toml").into()).collect();
         files.sort();
         embedded.sort();
         assert_eq!(files, embedded);
