@@ -5,12 +5,13 @@
 //! be unknown; `file` reads one array of
 //! an HDF5 file and checks everything about it; [`transitions`] turns arrays into transitions, with [`reward`] and
 //! [`statistics`] beside it; [`sampler`] draws mini-batches; [`recorded`] is a file as it was recorded, row by row;
-//! [`writer`] writes such a file; [`error`] is what can go wrong with any of them.
+//! [`writer`] writes such a file; [`catalogue`] lists the files that can be asked for by name; [`error`] is what can go wrong with any of them.
 //!
 //! This crate knows nothing of networks, simulators or the wire.
 
 #![deny(unsafe_code)]
 
+pub mod catalogue;
 pub mod environment;
 pub mod error;
 mod file;
@@ -22,6 +23,7 @@ pub mod task;
 pub mod transitions;
 pub mod writer;
 
+pub use catalogue::NamedDataset;
 pub use environment::{EnvironmentSpec, Goal, UnknownEnvironment};
 pub use error::DatasetError;
 pub use recorded::{RecordedRows, Row};
