@@ -22,6 +22,10 @@ Examples:
 
 Ctrl-C or SIGTERM stops early: snapshots and scores so far stay in the run folder, and the exit code is 1.";
 
+const FETCH_NOTE: &str = "\
+The file goes where D4RL keeps it: $D4RL_DATASET_DIR, or ~/.d4rl/datasets. $QUAD_DATASETS_URL, the address of a folder, is
+tried first. What a broken connection leaves is continued the next time.";
+
 /// Trains a diffusion policy and a critic ensemble from a file of transitions.
 #[derive(Debug, Parser)]
 #[command(name = "learner", version, arg_required_else_help = true)]
@@ -39,6 +43,9 @@ pub enum Command {
     Train(Box<TrainArgs>),
     /// List the presets, or print one with every value that it stands for
     Presets(PresetsArgs),
+    /// Datasets by name: list them, fetch one
+    #[command(subcommand)]
+    Datasets(DatasetsCommand),
     /// Print the evaluations of finished or running runs; several folders are summarised over seeds
     Report(ReportArgs),
 }
@@ -49,8 +56,9 @@ pub struct TrainArgs {
     /// Hyper-parameters: a preset's name (`learner presets` lists them), or the path of a file that ends in .toml
     #[arg(long, value_name = "NAME", value_parser = parse_preset)]
     pub preset: String,
-    /// HDF5 file in D4RL's layout (`evaluator collect` records one) [default: the preset's]
-    #[arg(long, value_name = "FILE")]
+    /// A file (`evaluator collect` records one), a name of `learner datasets list`, fetched if it is not there yet,
+    /// or minari:ID [default: the preset's]
+    #[arg(long, value_name = "FILE|NAME")]
     dataset: Option<String>,
     /// Folder of this run; its last part names the run [default: runs/PRESET-VARIANT-seedSEED]
     #[arg(long, value_name = "DIR")]
@@ -143,6 +151,19 @@ pub struct PresetsArgs {
     /// Print this preset as a file of your own could have it, all bases merged
     #[arg(value_name = "NAME", value_parser = parse_preset)]
     pub preset: Option<String>,
+}
+
+/// What can be done with datasets.
+#[derive(Debug, Subcommand)]
+pub enum DatasetsCommand {
+    /// Print the names that there are, and which of the files are on this machine
+    List,
+    /// Fetch a dataset unless it is there already, verify it, print its path
+    #[command(after_help = FETCH_NOTE)]
+    Fetch {
+        /// A name of `learner datasets list`
+        name: String,
+    },
 }
 
 /// Arguments of `learner report`.

@@ -84,6 +84,9 @@ pub struct RunInfo {
 pub struct DatasetInfo {
     /// The file.
     pub path: PathBuf,
+    /// SHA-256 of the file in hexadecimal, of a folder of Minari's that of its `main_data.hdf5`; older runs do not say.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub sha256: Option<String>,
     /// Transitions that are learnt from.
     pub transitions: u64,
     /// Trajectories in the file.

@@ -5,6 +5,7 @@
 //!
 //! - [`cli`] is the command line; [`config`] the experiment that it describes, one of the [`presets`] with flags on top,
 //!   validated once.
+//! - [`datasets`] finds or fetches the data that a run learns from.
 //! - [`run`] goes from the command line to the exit; [`conduct`] is the main loop in between.
 //! - [`threads`] starts the threads that do the work: [`train`] (nothing but gradient steps, by an [`agent`] on a
 //!   [`device`]), [`publisher`] (publishes and saves snapshots) and [`hub`] (hands out jobs, takes scores in).
@@ -22,6 +23,7 @@ pub mod algorithms;
 pub mod cli;
 pub mod conduct;
 pub mod config;
+pub mod datasets;
 pub mod device;
 pub mod display;
 pub mod hub;

@@ -13,9 +13,10 @@ use tokio::sync::mpsc;
 use toml::Table;
 use tracing::{debug, info, warn};
 
-use crate::cli::{Cli, Command, PresetsArgs, ReportArgs, TrainArgs};
+use crate::cli::{Cli, Command, DatasetsCommand, PresetsArgs, ReportArgs, TrainArgs};
 use crate::conduct::{Conductor, Ending, open_network};
 use crate::config::{self, DatasetInfo, Experiment, RunConfig, RunInfo};
+use crate::datasets::{self, LocalDataset, Source};
 use crate::display::Display;
 use crate::metrics::Metrics;
 use crate::plot;
@@ -34,6 +35,7 @@ pub fn run(cli: &Cli) -> anyhow::Result<()> {
     match &cli.command {
         Command::Train(args) => train(args),
         Command::Presets(args) => list_presets(args),
+        Command::Datasets(command) => datasets(command),
         Command::Report(args) => report(args),
     }
 }
@@ -66,6 +68,17 @@ fn report(args: &ReportArgs) -> anyhow::Result<()> {
     Ok(())
 }
 
+fn datasets(command: &DatasetsCommand) -> anyhow::Result<()> {
+    match command {
+        DatasetsCommand::List => print(&datasets::cache::table(&datasets::cache::folder()?))?,
+        DatasetsCommand::Fetch { name } => {
+            let dataset = Source::Named(datasets::source::named(name)?).obtain()?;
+            print(&dataset.path.display().to_string())?;
+        }
+    }
+    Ok(())
+}
+
 /// Results go to stdout, logs do not. Whoever reads may stop at any time, like `head` does.
 fn print(text: &str) -> std::io::Result<()> {
     match writeln!(std::io::stdout(), "{text}") {
@@ -77,7 +90,8 @@ fn print(text: &str) -> std::io::Result<()> {
 fn train(args: &TrainArgs) -> anyhow::Result<()> {
     let experiment = resolve(&args.preset, &args.changes())?;
     let named = experiment.dataset.clone().ok_or_else(|| anyhow!("preset {} names no dataset", args.preset));
-    let dataset = named.map(PathBuf::from).hint(record_hint(&experiment))?;
+    let source = Source::parse(&named.hint(record_hint(&experiment))?)?;
+    source.check_environment(&experiment.environment)?;
     let path = match &args.run_dir {
         Some(path) => path.clone(),
         None => default_run_dir(&args.preset, &experiment)?,
@@ -86,13 +100,14 @@ fn train(args: &TrainArgs) -> anyhow::Result<()> {
     RunDir::check_free(&path).hint("choose another --run-dir, or remove the folder if you do not need it")?;
 
     args.device.check(experiment.precision)?;
+    let dataset = source.obtain().hint(record_hint(&experiment))?;
 
     let options = ReadOptions {
         environment: quad_dataset::environment::find(&experiment.environment).ok(),
         reward: experiment.reward,
     };
-    let transitions = Transitions::read(&dataset, &options)
-        .with_context(|| format!("cannot learn from {}", dataset.display()))
+    let transitions = Transitions::read(&dataset.path, &options)
+        .with_context(|| format!("cannot learn from {}", dataset.path.display()))
         .hint(record_hint(&experiment))?;
     let config = run_config(args, &name, experiment, dataset, &transitions)?;
     info!("{}", config.dataset.summary());
@@ -199,7 +214,7 @@ fn run_config(
     args: &TrainArgs,
     name: &Name,
     experiment: Experiment,
-    dataset: PathBuf,
+    dataset: LocalDataset,
     transitions: &Transitions,
 ) -> anyhow::Result<RunConfig> {
     let statistics = transitions.statistics();
@@ -212,7 +227,8 @@ fn run_config(
             device: args.device,
         },
         dataset: DatasetInfo {
-            path: dataset,
+            path: dataset.path,
+            sha256: Some(dataset.sha256),
             transitions: statistics.transitions as u64,
             episodes: statistics.episodes as u64,
             min_return: statistics.return_min,

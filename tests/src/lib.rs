@@ -7,7 +7,7 @@
 //! - [`process`]: start a program, signal it, wait for it, read what it said.
 //! - [`system`]: a scratch folder with a tiny dataset and preset; learners and evaluators that use them.
 //! - [`router`]: a Zenoh router in the test's own process.
-//! - [`http`]: fetch a page, read a metric.
+//! - [`http`]: fetch a page, read a metric, serve a file.
 //! - [`peers`]: programs that are not ours; where one is missing, a test is skipped or fails.
 //! - [`prometheus`]: one to start, and what to ask any; [`dashboard`]: what Grafana's panels ask it.
 //!

@@ -112,6 +112,13 @@ impl Scratch {
         self.path().join("tiny.hdf5")
     }
 
+    /// Writes a preset of that name.
+    pub fn preset(&self, name: &str, setting: Setting) -> PathBuf {
+        let preset = self.path().join(format!("{name}.toml"));
+        fs::write(&preset, setting.to_toml()).expect("the scratch folder is writable");
+        preset
+    }
+
     /// Starts a learner on a port that the system chooses.
     pub fn learner(&self, run: &str, setting: Setting) -> Learner {
         self.learner_with(run, setting, &["--listen", "tcp/127.0.0.1:0"])
@@ -119,8 +126,7 @@ impl Scratch {
 
     /// Starts a learner with further arguments, among them where it listens or connects.
     pub fn learner_with(&self, run: &str, setting: Setting, arguments: &[&str]) -> Learner {
-        let preset = self.path().join(format!("{run}.toml"));
-        fs::write(&preset, setting.to_toml()).expect("the scratch folder is writable");
+        let preset = self.preset(run, setting);
         let run_dir = self.path().join(run);
         let mut command = Command::new(binary("learner"));
         command.arg("train").arg("--preset").arg(preset).arg("--dataset").arg(self.dataset());

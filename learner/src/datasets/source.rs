@@ -1,0 +1,195 @@
+//! What `--dataset` means: a path, a name of the catalogue, or `minari:` and an ID.
+
+use std::path::{Path, PathBuf};
+
+use anyhow::{Context, anyhow};
+use quad_dataset::{NamedDataset, catalogue, environment};
+use quad_service::Hint;
+
+use super::cache;
+use super::fetch::{FetchError, Fetcher};
+use super::verify::sha256;
+use crate::presets::nearest;
+
+/// A lab's own mirror: the address of a folder that is tried before the catalogue's.
+const MIRROR: &str = "QUAD_DATASETS_URL";
+/// What names a dataset of Minari's begin with.
+const MINARI: &str = "minari:";
+/// The file of a folder of Minari's that holds the data.
+const MINARI_DATA: &str = "main_data.hdf5";
+
+/// Where a run's data comes from.
+#[derive(Clone, Debug, PartialEq)]
+pub enum Source {
+    /// A file of the catalogue, in D4RL's cache folder or fetched into it.
+    Named(&'static NamedDataset),
+    /// A dataset that Minari's own client has fetched, by its ID.
+    Minari(String),
+    /// A file or folder.
+    Path(PathBuf),
+}
+
+/// A dataset on this machine.
+#[derive(Clone, Debug, PartialEq)]
+pub struct LocalDataset {
+    /// The file, or the folder if it is Minari's.
+    pub path: PathBuf,
+    /// SHA-256 of the file, or of the folder's `main_data.hdf5`.
+    pub sha256: String,
+}
+
+impl Source {
+    /// Understands what was typed. A name of the catalogue comes before a file of that name; `./NAME` is the file.
+    pub fn parse(text: &str) -> anyhow::Result<Self> {
+        if let Some(id) = text.strip_prefix(MINARI) {
+            return Ok(Self::Minari(id.to_owned()));
+        }
+        let path = Path::new(text);
+        let is_path = path.exists() || text.contains('/') || path.extension().is_some();
+        match named(text) {
+            Err(_) if is_path => Ok(Self::Path(path.to_owned())),
+            dataset => dataset.map(Self::Named),
+        }
+    }
+
+    /// The entry of the catalogue, for a path by the file's name.
+    pub fn entry(&self) -> Option<&'static NamedDataset> {
+        match self {
+            Self::Named(dataset) => Some(dataset),
+            Self::Minari(_) => None,
+            Self::Path(path) => catalogue::find_file(path.file_name()?.to_str()?),
+        }
+    }
+
+    /// Refuses data that the catalogue says is from another simulation than that of `environment`.
+    pub fn check_environment(&self, environment: &str) -> anyhow::Result<()> {
+        let simulation =
+            |name: &'_ str| environment::find(name).map_or(name.to_owned(), |spec| spec.simulation().to_owned());
+        match self.entry() {
+            Some(entry) if simulation(&entry.environment) != simulation(environment) => Err(anyhow!(
+                "{} is a dataset of {}, but the policy is for {environment}",
+                entry.name,
+                entry.environment
+            ))
+            .hint("choose a preset of the dataset's environment, or another --dataset"),
+            _ => Ok(()),
+        }
+    }
+
+    /// Finds it on this machine, or fetches it; its checksum is computed in any case.
+    pub fn obtain(&self) -> anyhow::Result<LocalDataset> {
+        match self {
+            Self::Named(dataset) => {
+                let mirror = std::env::var(MIRROR).ok().filter(|mirror| !mirror.is_empty());
+                let fetched = Fetcher::new(mirror).fetch(dataset, &cache::folder()?);
+                let (path, sha256) = fetched.or_else(|error: FetchError| {
+                    let hint = error.hint();
+                    Err(error).hint(hint)
+                })?;
+                Ok(LocalDataset { path, sha256 })
+            }
+            Self::Minari(id) => {
+                let path = minari_folder(id)?;
+                if !path.join(MINARI_DATA).exists() {
+                    return Err(anyhow!("the dataset {MINARI}{id} is not in {}", path.display())).hint(format!(
+                        "fetch it by Minari's own client: pip install minari, then: minari download {id}"
+                    ));
+                }
+                local(path)
+            }
+            Self::Path(path) => local(path.clone()),
+        }
+    }
+}
+
+/// The catalogue's dataset of that name.
+pub fn named(name: &str) -> anyhow::Result<&'static NamedDataset> {
+    let unknown = || {
+        let known = catalogue::all().iter().map(|dataset| dataset.name.as_str());
+        let offer = nearest(name, known).join(", ");
+        anyhow!("unknown dataset `{name}`{}", if offer.is_empty() { offer } else { format!("; perhaps {offer}") })
+    };
+    catalogue::find(name)
+        .ok_or_else(unknown)
+        .hint("`learner datasets list` prints all names; to train on a file, give its path")
+}
+
+/// Where Minari keeps a dataset.
+fn minari_folder(id: &str) -> anyhow::Result<PathBuf> {
+    let root = std::env::var_os("MINARI_DATASETS_PATH").filter(|root| !root.is_empty()).map(PathBuf::from);
+    let root = root.or_else(|| std::env::home_dir().map(|home| home.join(".minari/datasets")));
+    Ok(root.context("there is no home folder")?.join(id).join("data"))
+}
+
+fn local(path: PathBuf) -> anyhow::Result<LocalDataset> {
+    let data = if path.is_dir() { path.join(MINARI_DATA) } else { path.clone() };
+    let sha256 = sha256(&data).with_context(|| format!("cannot read {}", data.display()))?;
+    Ok(LocalDataset { path, sha256 })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_word_is_a_name_a_path_or_neither() {
+        let named = Source::parse("walker2d-medium-replay-v2").unwrap();
+        assert_eq!(named.entry().unwrap().file, "walker2d_medium_replay-v2.hdf5");
+        assert_eq!(
+            Source::parse("minari:mujoco/hopper/medium-v0").unwrap(),
+            Source::Minari("mujoco/hopper/medium-v0".to_owned())
+        );
+        for path in ["data/missing.hdf5", "missing.npz", "./hopper-medium-v2", "/tmp"] {
+            assert_eq!(Source::parse(path).unwrap(), Source::Path(path.into()));
+        }
+        for (word, offered) in [
+            ("walker2d-medium-repaly-v2", "walker2d-medium-replay-v2, "),
+            ("hopper-medium", "hopper-medium-v2"),
+            ("antmaze-umaze", "antmaze-umaze-v0"),
+        ] {
+            let error = Source::parse(word).unwrap_err().to_string();
+            assert!(error.contains(word) && error.contains(offered), "{error}");
+        }
+        let error = Source::parse("quadruped").unwrap_err().to_string();
+        assert_eq!(error, "unknown dataset `quadruped`");
+    }
+
+    #[test]
+    fn data_of_another_simulation_is_refused() {
+        for (source, environment, fits) in [
+            ("hopper-medium-v2", "hopper", true),
+            ("hopper-medium-v2", "walker2d", false),
+            ("hopper-medium-v2", "my-robot", false),
+            // The goal of v0 and v2 is another one, not the maze.
+            ("antmaze-umaze-v0", "antmaze-umaze", true),
+            ("antmaze-umaze-v2", "antmaze-umaze-v0", true),
+            ("antmaze-medium-play-v0", "antmaze-umaze", false),
+            // By the name of the file alone.
+            ("data/hopper_medium-v2.hdf5", "walker2d", false),
+            ("data/mine.hdf5", "walker2d", true),
+        ] {
+            let checked = Source::parse(source).unwrap().check_environment(environment);
+            assert_eq!(checked.is_ok(), fits, "{source} for {environment}: {checked:?}");
+        }
+    }
+
+    #[test]
+    fn what_is_not_there_says_how_to_get_it() {
+        let minari = Source::parse("minari:nobody/has-this-v0").unwrap().obtain();
+        let error = format!("{:#}", minari.unwrap_err());
+        assert!(error.contains("minari:nobody/has-this-v0"), "{error}");
+        let path = Source::parse("nowhere/x.hdf5").unwrap().obtain();
+        let error = format!("{:#}", path.unwrap_err());
+        assert!(error.contains("nowhere/x.hdf5"), "{error}");
+    }
+
+    #[test]
+    fn the_checksum_of_a_folder_is_that_of_its_data() {
+        let folder = tempfile::tempdir().unwrap();
+        std::fs::write(folder.path().join(MINARI_DATA), "abc").unwrap();
+        let source = Source::Path(folder.path().to_owned());
+        // FIPS 180-2, B.1.
+        let abc = "ba7816bf8f01cfea414140de5dae2223b00361a396177a9cb410ff61f20015ad";
+        assert_eq!(source.obtain().unwrap().sha256, abc);
+    }
+}
