@@ -130,6 +130,8 @@ fn local(path: PathBuf) -> anyhow::Result<LocalDataset> {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::config::resolve;
+    use crate::presets;
 
     #[test]
     fn a_word_is_a_name_a_path_or_neither() {
@@ -152,6 +154,20 @@ mod tests {
         }
         let error = Source::parse("quadruped").unwrap_err().to_string();
         assert_eq!(error, "unknown dataset `quadruped`");
+    }
+
+    #[test]
+    fn the_presets_datasets_are_known_and_of_their_environments() {
+        let resolved = presets::names().filter_map(|name| resolve(name, &toml::Table::new()).ok());
+        let mut named = 0;
+        for experiment in resolved {
+            let Some(dataset) = &experiment.dataset else { continue };
+            let source = Source::parse(dataset).unwrap();
+            assert!(matches!(source, Source::Named(_)), "{dataset}");
+            source.check_environment(&experiment.environment).unwrap();
+            named += 1;
+        }
+        assert!(named >= 15, "the rows of the paper's table have datasets");
     }
 
     #[test]
