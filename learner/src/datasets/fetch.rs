@@ -150,9 +150,8 @@ impl Fetcher {
                 Ok(sha256) => return Ok(sha256),
                 Err(error) => error,
             };
-            progress.say(&error.to_string());
             if mixed && matches!(error, TransferError::Mismatch(_)) {
-                progress.say("starting again without what was kept of an earlier attempt");
+                progress.say(&format!("{error}; starting again without what was kept of an earlier attempt"));
                 continue;
             }
             // As long as it goes forward, however slowly, it is worth going on.
@@ -160,7 +159,11 @@ impl Fetcher {
                 furthest = partial.len();
                 delays = self.delays.build();
             }
-            let Some(delay) = delays.next().filter(|_| error.is_transient()) else { return Err(error) };
+            let Some(delay) = delays.next().filter(|_| error.is_transient()) else {
+                progress.say(&error.to_string());
+                return Err(error);
+            };
+            progress.say(&format!("{error}; trying again"));
             std::thread::sleep(delay);
         }
     }
