@@ -1,11 +1,12 @@
-//! Ten Hopper episodes at the paper's sizes: a step of all of them together, and what it is made of.
+//! Ten Hopper episodes at the paper's sizes: a step of all of them together, and what it is made of. And a step of each
+//! environment.
 
 #![allow(clippy::expect_used)] // what cannot be had ends the run
 
 use candle_core::Device;
 use criterion::{BatchSize, Criterion, criterion_group, criterion_main};
 use quad_dataset::environment::find;
-use quad_evaluator::environment::make;
+use quad_evaluator::environment::{make, simulated};
 use quad_evaluator::rollout::Rollout;
 use quad_policy::{
     ActionNoise, Description, DiffusionPolicy, DiffusionShape, Ensemble, Layout, NoisePredictor, Policy, Precision,
@@ -82,23 +83,29 @@ fn select(criterion: &mut Criterion) {
     group.finish();
 }
 
-/// Control periods of one Hopper on one thread, actions uniform at random.
-fn hopper(criterion: &mut Criterion) {
-    let mut environment =
-        make(find("hopper").expect("a known environment"), 0).expect("MuJoCo compiles the embedded model");
-    let mut random = ChaCha8Rng::seed_from_u64(0);
-    let mut seed = 0;
-    environment.reset(seed);
-    criterion.bench_function("environment/hopper", |bencher| {
-        bencher.iter(|| {
-            let step = environment.step(&random.random::<[f32; 3]>().map(|unit| 2.0 * unit - 1.0));
-            if step.terminated || step.truncated {
-                seed += 1;
-                environment.reset(seed);
-            }
+/// Control periods of one environment on one thread, actions uniform at random.
+fn environments(criterion: &mut Criterion) {
+    let mut group = criterion.benchmark_group("environment");
+    // Those of one simulation differ in the goal alone.
+    for spec in simulated().filter(|spec| spec.name == spec.simulation()) {
+        let mut environment = make(spec, 0).expect("MuJoCo compiles the embedded model");
+        let mut random = ChaCha8Rng::seed_from_u64(0);
+        let mut action = vec![0.0; spec.action_dim];
+        let mut seed = 0;
+        environment.reset(seed);
+        group.bench_function(&spec.name, |bencher| {
+            bencher.iter(|| {
+                action.fill_with(|| random.random_range(-1.0..1.0));
+                let step = environment.step(&action);
+                if step.terminated || step.truncated {
+                    seed += 1;
+                    environment.reset(seed);
+                }
+            });
         });
-    });
+    }
+    group.finish();
 }
 
-criterion_group!(benches, steps, select, hopper);
+criterion_group!(benches, steps, select, environments);
 criterion_main!(benches);
