@@ -7,7 +7,7 @@ use std::fs;
 use std::path::{Path, PathBuf};
 
 use hdf5::H5Type;
-use hdf5::types::{FloatSize, TypeDescriptor};
+use hdf5::types::{FloatSize, TypeDescriptor, VarLenUnicode};
 
 use crate::DatasetError;
 
@@ -49,6 +49,12 @@ impl DatasetFile {
 
     pub(crate) fn has(&self, array: &str) -> bool {
         self.file.link_exists(array)
+    }
+
+    /// A text that stands in the file as an array of its own, without axes.
+    pub(crate) fn text(&self, array: &str) -> Option<String> {
+        let text = self.file.dataset(array).ok()?.read_scalar::<VarLenUnicode>().ok()?;
+        Some(text.as_str().to_owned())
     }
 
     /// Numbers in a row of an array.

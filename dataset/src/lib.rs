@@ -26,7 +26,7 @@ pub mod writer;
 pub use catalogue::NamedDataset;
 pub use environment::{EnvironmentSpec, Goal, UnknownEnvironment};
 pub use error::DatasetError;
-pub use recorded::{RecordedRows, Row};
+pub use recorded::{RecordedRows, Row, environments_of_its_sizes, recorded_environment};
 pub use reward::RewardRule;
 pub use sampler::{Batch, BatchSampler};
 pub use statistics::Statistics;

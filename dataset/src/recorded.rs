@@ -3,7 +3,7 @@
 use std::path::Path;
 
 use crate::file::DatasetFile;
-use crate::{DatasetError, EnvironmentSpec};
+use crate::{DatasetError, EnvironmentSpec, environment};
 
 /// One recorded step, in the simulator's precision.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -12,7 +12,7 @@ pub struct Row<'a> {
     pub observation: &'a [f64],
     /// a, as it was applied.
     pub action: &'a [f64],
-    /// s', after the step and before any reset.
+    /// s', after the step and before any reset; empty where the file does not tell.
     pub next_observation: &'a [f64],
     /// r.
     pub reward: f64,
@@ -26,18 +26,36 @@ pub struct Row<'a> {
     pub qvel: &'a [f64],
 }
 
-/// All rows of a file that has `next_observations`, `infos/qpos` and `infos/qvel` besides the arrays to learn from.
+/// All rows of a file that has `infos/qpos` and `infos/qvel` besides the arrays to learn from and, where there is a goal,
+/// `infos/goal`.
 pub struct RecordedRows {
     environment: &'static EnvironmentSpec,
     observations: Vec<f64>,
     actions: Vec<f64>,
-    next_observations: Vec<f64>,
+    /// D4RL's AntMaze files have none.
+    next_observations: Option<Vec<f64>>,
     rewards: Vec<f64>,
     terminals: Vec<bool>,
     timeouts: Vec<bool>,
     qpos: Vec<f64>,
     qvel: Vec<f64>,
+    goals: Option<Vec<f64>>,
 }
+
+/// The environments of the table whose sizes a file has.
+pub fn environments_of_its_sizes(path: impl AsRef<Path>) -> Result<Vec<&'static EnvironmentSpec>, DatasetError> {
+    let file = DatasetFile::open(path.as_ref())?;
+    let sizes = (file.width("observations")?, file.width("actions")?);
+    Ok(environment::all().iter().filter(|spec| (spec.observation_dim, spec.action_dim) == sizes).collect())
+}
+
+/// The environment that a file says it was recorded in, as `evaluator collect` writes it.
+pub fn recorded_environment(path: impl AsRef<Path>) -> Result<Option<String>, DatasetError> {
+    Ok(DatasetFile::open(path.as_ref())?.text("metadata/environment"))
+}
+
+/// Numbers in a goal: x and y.
+const GOAL_DIM: usize = 2;
 
 impl RecordedRows {
     /// Reads a file recorded in `environment`.
@@ -47,12 +65,16 @@ impl RecordedRows {
             environment,
             observations: file.numbers("observations", environment.observation_dim)?,
             actions: file.numbers("actions", environment.action_dim)?,
-            next_observations: file.numbers("next_observations", environment.observation_dim)?,
+            next_observations: match file.has("next_observations") {
+                true => Some(file.numbers("next_observations", environment.observation_dim)?),
+                false => None,
+            },
             rewards: file.numbers("rewards", 1)?,
             terminals: file.flags("terminals")?,
             timeouts: file.flags("timeouts")?,
             qpos: file.numbers("infos/qpos", environment.qpos_dim)?,
             qvel: file.numbers("infos/qvel", environment.qvel_dim)?,
+            goals: environment.goal.map(|_| file.numbers("infos/goal", GOAL_DIM)).transpose()?,
         })
     }
 
@@ -73,12 +95,27 @@ impl RecordedRows {
         Row {
             observation: &self.observations[at(observation_dim)],
             action: &self.actions[at(action_dim)],
-            next_observation: &self.next_observations[at(observation_dim)],
+            next_observation: self.next_observation(i),
             reward: self.rewards[i],
             terminal: self.terminals[i],
             timeout: self.timeouts[i],
             qpos: &self.qpos[at(qpos_dim)],
             qvel: &self.qvel[at(qvel_dim)],
+        }
+    }
+
+    /// Where the goal was at row `i`, if there is one: x and y.
+    pub fn goal(&self, i: usize) -> Option<&[f64]> {
+        self.goals.as_ref().map(|goals| &goals[i * GOAL_DIM..][..GOAL_DIM])
+    }
+
+    /// The stored one, or else the following row's observation where no episode ended between the two.
+    fn next_observation(&self, i: usize) -> &[f64] {
+        let width = self.environment.observation_dim;
+        match &self.next_observations {
+            Some(stored) => &stored[i * width..][..width],
+            None if self.terminals[i] || self.timeouts[i] || i + 1 == self.len() => &[],
+            None => &self.observations[(i + 1) * width..][..width],
         }
     }
 

@@ -52,16 +52,18 @@ struct CollectArgs {
 
 /// Replay a recorded file one step at a time from its own states, and say how far the simulation is from it
 ///
-/// The file needs infos/qpos, infos/qvel and next_observations beside what is learned from. Differences are reported, not
+/// The file needs infos/qpos, infos/qvel and, for a maze, infos/goal beside what is learned from. Without next_observations,
+/// the observation of the following row counts, as long as no episode ends between the two. Differences are reported, not
 /// judged: the exit code is 0 whenever the file could be replayed. A reward differs when it is more than 0.001 (relative,
-/// for rewards above 1) away from the recorded one, which rounding to float32 cannot explain.
+/// for rewards above 1) away from the recorded one, and further than the next observation, which rounding to float32 cannot
+/// explain.
 #[derive(Debug, Args)]
 struct VerifyArgs {
     /// The file to replay
     file: PathBuf,
-    /// Environment that it was recorded in: hopper
-    #[arg(long, value_name = "NAME", value_parser = environment::find, default_value = "hopper")]
-    env: &'static EnvironmentSpec,
+    /// Environment that it was recorded in [default: what the file says, or the only environment of its sizes]
+    #[arg(long, value_name = "NAME", value_parser = environment::find)]
+    env: Option<&'static EnvironmentSpec>,
     /// Print one JSON object
     #[arg(long)]
     json: bool,
@@ -82,10 +84,14 @@ impl Cli {
                 Ok(())
             }
             Command::VerifyDataset(args) => {
-                let report = verify::verify(&args.file, args.env).hint(format!(
-                    "a file that can be replayed is what `evaluator collect --env {} --out FILE` writes",
-                    args.env.name
-                ))?;
+                let spec = args.env.map_or_else(|| verify::environment_of(&args.file), Ok);
+                let report = match spec.and_then(|spec| verify::verify(&args.file, spec)) {
+                    Ok(report) => report,
+                    Err(error) => {
+                        let hint = error.hint();
+                        return Err(error).hint(hint);
+                    }
+                };
                 print(&if args.json { serde_json::to_string(&report)? } else { verified(&report) });
                 Ok(())
             }
@@ -104,9 +110,11 @@ fn collected(args: &CollectArgs, summary: &Summary) -> String {
 }
 
 fn verified(report: &Report) -> String {
-    let Report { transitions, obs_error, reward_error, rewards_differ, terminals_differ } = report;
+    let Report { environment, transitions, compared, obs_error, reward_error, rewards_differ, terminals_differ } =
+        report;
     format!(
-        "transitions        {transitions}\n\
+        "environment        {environment}\n\
+         transitions        {transitions}, of which {compared} have a next observation to compare\n\
          observation error  median {:.1e}, p99 {:.1e}, max {:.1e}\n\
          reward error       max {:.1e}\n\
          rewards differ     {rewards_differ}\n\
