@@ -22,7 +22,7 @@ CANDIDATES=1,10
 
 seeds="0 1 2"
 [ "${1:-}" != --seeds ] || { seeds=${2:-}; shift 2; }
-[ $# -gt 0 ] && [ -n "$seeds" ] || { usage >&2; exit 2; }
+if [ $# -eq 0 ] || [ -z "$seeds" ]; then usage >&2; exit 2; fi
 
 # preset FILE: the demonstration for the environment that the file's name begins with.
 preset() {

@@ -6,7 +6,7 @@ use std::path::{Path, PathBuf};
 use quad_dataset::environment::find;
 use quad_dataset::{D4rlWriter, EnvironmentSpec, Metadata, RecordedRows};
 use quad_evaluator::collect::{Summary, collect};
-use quad_evaluator::verify::verify;
+use quad_evaluator::verify::{environment_of, verify};
 use tempfile::TempDir;
 
 const TRANSITIONS: usize = 2000;
@@ -58,8 +58,9 @@ fn whole_episodes_are_recorded_and_counted() {
 fn a_recorded_file_replays() {
     let folder = tempfile::tempdir().unwrap();
     let (path, summary) = record(&folder, 4, 2);
+    assert_eq!(environment_of(&path).unwrap(), hopper(), "it says so itself");
     let report = verify(&path, hopper()).unwrap();
-    assert_eq!(report.transitions, summary.transitions);
+    assert_eq!((report.transitions, report.compared), (summary.transitions, summary.transitions));
     assert_eq!((report.rewards_differ, report.terminals_differ), (0, 0));
     // Nothing but float32's rounding, which is there: an error of exactly zero would mean that nothing was compared.
     assert!(report.obs_error.median > 1e-9 && report.obs_error.median < 1e-6, "{report:?}");
