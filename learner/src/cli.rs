@@ -46,7 +46,7 @@ pub enum Command {
     /// Datasets by name: list them, fetch one
     #[command(subcommand)]
     Datasets(DatasetsCommand),
-    /// Print the evaluations of finished or running runs; several folders are summarised over seeds
+    /// Print the evaluations of finished or running runs, summaries over their seeds, and what the paper has for their tasks
     Report(ReportArgs),
 }
 
@@ -175,6 +175,9 @@ pub struct ReportArgs {
     /// Print JSON instead of a table
     #[arg(long)]
     pub json: bool,
+    /// Print the summaries as Markdown
+    #[arg(long, conflicts_with = "json")]
+    pub markdown: bool,
     /// Also draw the learning curves of all the folders into one SVG file
     #[arg(long, value_name = "FILE")]
     pub plot: Option<PathBuf>,

@@ -17,6 +17,14 @@ pub enum Device {
 }
 
 impl Device {
+    /// What it is called on command lines and in files.
+    pub fn name(self) -> &'static str {
+        match self {
+            Self::Cpu => "cpu",
+            Self::Cuda => "cuda",
+        }
+    }
+
     /// That the device is there and can compute with this precision.
     ///
     /// # Errors

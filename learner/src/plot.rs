@@ -34,9 +34,14 @@ fn draw(path: &Path, runs: &[RunReport]) -> Result<(), Box<dyn std::error::Error
     let root = SVGBackend::new(path, SIZE).into_drawing_area();
     root.fill(&WHITE)?;
     let (last_step, range) = limits(runs);
+    let measure = match [true, false].map(|normalised| runs.iter().any(|run| run.normalised == normalised)) {
+        [_, false] => "D4RL-normalised score",
+        [false, true] => "return",
+        [true, true] => "D4RL-normalised score, or return",
+    };
     let title = match runs {
-        [run] => format!("{}: normalised score over {} episodes", run.run, episodes(run)),
-        _ => "Normalised score".to_owned(),
+        [run] => format!("{}: {measure} over {} episodes", run.run, episodes(run)),
+        _ => measure.to_owned(),
     };
     let mut chart = ChartBuilder::on(&root)
         .caption(title, ("sans-serif", 20))
@@ -47,7 +52,7 @@ fn draw(path: &Path, runs: &[RunReport]) -> Result<(), Box<dyn std::error::Error
     chart
         .configure_mesh()
         .x_desc("gradient steps")
-        .y_desc("D4RL-normalised score")
+        .y_desc(measure)
         .x_label_formatter(&|step| format!("{step:.0}"))
         .light_line_style(WHITE)
         .draw()?;
@@ -65,7 +70,7 @@ fn draw(path: &Path, runs: &[RunReport]) -> Result<(), Box<dyn std::error::Error
         let points: Vec<_> = run.evaluations.iter().map(|e| (e.step as f64, e.score.mean)).collect();
         if runs.len() == 1 {
             let edge = |sign: f64| {
-                move |e: &crate::report::EvaluationReport| {
+                move |e: &crate::report::run::EvaluationReport| {
                     (e.step as f64, e.score.mean + sign * e.score.std.unwrap_or(0.0))
                 }
             };

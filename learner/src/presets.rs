@@ -129,7 +129,7 @@ pub(crate) fn unknown_key(table: &Table) -> Option<(String, Vec<String>)> {
 }
 
 /// The values of a table and of the tables in it, with dotted keys.
-fn keys(table: &Table) -> Vec<(String, &Value)> {
+pub(crate) fn keys(table: &Table) -> Vec<(String, &Value)> {
     let mut all = Vec::new();
     for (key, value) in table {
         match value {

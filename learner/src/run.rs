@@ -61,10 +61,12 @@ fn report(args: &ReportArgs) -> anyhow::Result<()> {
         plot::learning_curves(path, &report.runs)?;
         info!("learning curves: {}", path.display());
     }
-    match args.json {
-        true => print(&serde_json::to_string_pretty(&report)?)?,
-        false => print(report.table().trim_end())?,
-    }
+    let text = match (args.json, args.markdown) {
+        (true, _) => serde_json::to_string_pretty(&report)?,
+        (_, true) => report.markdown(),
+        _ => report.text(),
+    };
+    print(text.trim_end())?;
     Ok(())
 }
 

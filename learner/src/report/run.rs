@@ -1,0 +1,192 @@
+//! One run: its folder, read and summarised.
+
+use std::collections::{BTreeMap, BTreeSet};
+use std::fmt::Alignment::Right;
+use std::fmt::Write;
+use std::path::{Path, PathBuf};
+
+use quad_dataset::environment;
+use serde::Serialize;
+
+use super::table::{Style, Table, spread};
+use super::{FINAL_STEPS, Spread};
+use crate::algorithms::Hyperparameters;
+use crate::config::RunConfig;
+use crate::run_dir::{RunDir, RunDirError, ScoreLine};
+
+/// One snapshot's episodes.
+#[derive(Clone, Debug, PartialEq, Serialize)]
+pub struct EvaluationReport {
+    /// Gradient step of the snapshot.
+    pub step: u64,
+    /// Episodes scored.
+    pub episodes: usize,
+    /// Whether these are all of them.
+    pub complete: bool,
+    /// Score over the episodes: D4RL-normalised, or the return where the environment has no reference returns.
+    pub score: Spread,
+    /// Mean undiscounted return.
+    pub mean_return: f64,
+    /// Mean length in environment steps.
+    pub mean_length: f64,
+}
+
+/// One run.
+#[derive(Clone, Debug, PartialEq, Serialize)]
+pub struct RunReport {
+    /// Its folder.
+    pub dir: PathBuf,
+    /// Its name.
+    pub run: String,
+    /// The preset it started from.
+    pub preset: String,
+    /// The variant of the algorithm: `quad`, `dac` or `none` for QUAD's kinds of guidance, or another algorithm's name.
+    pub variant: String,
+    /// The hyper-parameters that matter most.
+    pub agent: String,
+    /// Actions sampled per state in an evaluation.
+    pub candidates: u32,
+    /// Seed.
+    pub seed: u64,
+    /// Gradient steps.
+    pub steps: u64,
+    /// Whether scores are D4RL-normalised; without reference returns they are returns.
+    pub normalised: bool,
+    /// Arithmetic that the policies were scored in; several, if evaluators differed.
+    pub scored_in: String,
+    /// Mean score of the dataset's trajectories, of the same kind.
+    pub dataset_score: f64,
+    /// Its evaluations by step.
+    pub evaluations: Vec<EvaluationReport>,
+    /// Mean score of the last 3 complete evaluations; absent if they are fewer.
+    pub mean_last_3: Option<f64>,
+    /// The same of the last 5.
+    pub mean_last_5: Option<f64>,
+    /// The same of those in the last 50,000 steps of the run; absent if it has no more steps than that.
+    pub mean_last_50000_steps: Option<f64>,
+    #[serde(skip)]
+    pub(super) config: RunConfig,
+}
+
+impl RunReport {
+    /// Reads a run folder.
+    ///
+    /// # Errors
+    /// There is no run in it, or a file is not what a learner writes.
+    pub fn read(path: &Path) -> Result<Self, RunDirError> {
+        let (dir, config) = RunDir::open(path)?;
+        let unusable = |error: crate::config::ConfigError| RunDirError::Content {
+            path: path.join("config.toml"),
+            line: None,
+            reason: error.to_string(),
+        };
+        let agent = config.experiment.hyperparameters().map_err(unusable)?;
+        Ok(Self::new(path, config, &*agent, &dir.read_scores()?))
+    }
+
+    fn new(path: &Path, config: RunConfig, agent: &dyn Hyperparameters, lines: &[ScoreLine]) -> Self {
+        let experiment = &config.experiment;
+        let mut by_step: BTreeMap<u64, BTreeMap<u64, &ScoreLine>> = BTreeMap::new();
+        for line in lines {
+            by_step.entry(line.step).or_default().insert(line.seed, line);
+        }
+        let evaluations: Vec<_> = by_step
+            .into_iter()
+            .filter_map(|(step, episodes)| {
+                evaluation(step, &Vec::from_iter(episodes.into_values()), experiment.episodes)
+            })
+            .collect();
+        let complete: Vec<_> = evaluations.iter().filter(|e| e.complete).map(|e| (e.step, e.score.mean)).collect();
+        let mean = |evaluations: &[(u64, f64)]| {
+            let scores: Vec<_> = evaluations.iter().map(|(_, score)| *score).collect();
+            Spread::of(&scores).map(|spread| spread.mean)
+        };
+        let last = |count: usize| mean(&complete[complete.len().checked_sub(count)?..]);
+        let final_steps = experiment.steps.checked_sub(FINAL_STEPS).filter(|start| *start > 0);
+        let in_final_steps = |start| mean(&complete[complete.partition_point(|(step, _)| *step <= start)..]);
+        Self {
+            dir: path.to_owned(),
+            run: config.run.name.clone(),
+            preset: config.run.preset.clone(),
+            variant: agent.variant(),
+            agent: agent.summary(),
+            candidates: experiment.candidates,
+            seed: experiment.seed,
+            steps: experiment.steps,
+            normalised: environment::find(&experiment.environment).is_ok(),
+            scored_in: precisions(lines),
+            dataset_score: config.dataset.mean_score.unwrap_or(config.dataset.mean_return),
+            mean_last_3: last(3),
+            mean_last_5: last(5),
+            mean_last_50000_steps: final_steps.and_then(in_final_steps),
+            evaluations,
+            config,
+        }
+    }
+
+    /// What its scores are: normalised scores, or returns.
+    pub fn measure(&self) -> &'static str {
+        if self.normalised { "score" } else { "return" }
+    }
+
+    /// The evaluations as a table for people.
+    pub fn table(&self) -> String {
+        let mut text = format!(
+            "{}: preset {}, {}, {} candidates, {} steps, seed {}, scored in {}\n\n",
+            self.run, self.preset, self.agent, self.candidates, self.steps, self.seed, self.scored_in
+        );
+        let episodes = |e: &EvaluationReport| match e.complete {
+            true => e.episodes.to_string(),
+            false => format!("{} (part)", e.episodes),
+        };
+        let mut table = Table::new(["step", "episodes", self.measure(), "length"].map(|name| (name, Right)));
+        let mut with_returns = Table::new(["step", "episodes", "score", "return", "length"].map(|name| (name, Right)));
+        for e in &self.evaluations {
+            let (step, score, length) = (e.step.to_string(), spread(e.score, 2), format!("{:.1}", e.mean_length));
+            table.push([step.clone(), episodes(e), score.clone(), length.clone()]);
+            with_returns.push([step, episodes(e), score, format!("{:.1}", e.mean_return), length]);
+        }
+        text.push_str(&if self.normalised { with_returns.render(Style::Text) } else { table.render(Style::Text) });
+        if self.evaluations.is_empty() {
+            text.push_str("(no evaluation has a score yet)\n");
+        }
+        text.push('\n');
+        let figures = [
+            ("last 3 evaluations:", self.mean_last_3),
+            ("last 5 evaluations:", self.mean_last_5),
+            ("last 50000 steps:", self.mean_last_50000_steps),
+            ("dataset:", Some(self.dataset_score)),
+        ];
+        for (name, mean) in figures {
+            if let Some(mean) = mean {
+                // Writing to a string cannot fail.
+                writeln!(text, "mean {} of the {name:19} {mean:.2}", self.measure()).ok();
+            }
+        }
+        text
+    }
+}
+
+fn evaluation(step: u64, episodes: &[&ScoreLine], expected: u32) -> Option<EvaluationReport> {
+    let mean =
+        |value: fn(&ScoreLine) -> f64| episodes.iter().map(|line| value(line)).sum::<f64>() / episodes.len() as f64;
+    let scores: Vec<_> = episodes.iter().map(|line| line.score).collect();
+    Some(EvaluationReport {
+        step,
+        episodes: episodes.len(),
+        complete: episodes.len() == expected as usize,
+        score: Spread::of(&scores)?,
+        mean_return: mean(|line| line.episode_return),
+        mean_length: mean(|line| line.length.into()),
+    })
+}
+
+/// The precisions that scored, each once.
+fn precisions(lines: &[ScoreLine]) -> String {
+    let said = |line: &ScoreLine| if line.precision.is_empty() { "unknown".to_owned() } else { line.precision.clone() };
+    let precisions: BTreeSet<String> = lines.iter().map(said).collect();
+    match precisions.is_empty() {
+        true => "-".to_owned(),
+        false => Vec::from_iter(precisions).join(" and "),
+    }
+}
