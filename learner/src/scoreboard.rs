@@ -159,7 +159,7 @@ impl Scoreboard {
     pub fn claim(&mut self, request: &JobRequest, now: Instant) -> JobReply {
         let wait = |time: Duration| JobReply::Wait { milliseconds: time.as_millis() as u64 };
         let rules = &self.rules;
-        if !request.environments.iter().any(|name| *name == rules.task.environment) {
+        if !request.environments.contains(&rules.task.environment) {
             return wait(NOT_FOR_YOU);
         }
         let id = self.jobs.keys().next_back().map_or(1, |newest| newest + 1);
