@@ -14,6 +14,9 @@ pub struct EnvironmentSpec {
     pub name: String,
     #[serde(default)]
     simulation: Option<String>,
+    /// What Gymnasium calls it, without version and variant.
+    #[serde(default)]
+    gymnasium: Option<String>,
     /// Numbers in an observation.
     pub observation_dim: usize,
     /// Numbers in an action, each within ±1.
@@ -81,6 +84,14 @@ pub fn find(name: &str) -> Result<&'static EnvironmentSpec, UnknownEnvironment> 
         .ok_or_else(|| UnknownEnvironment { name: name.to_owned() })
 }
 
+/// The environment that Gymnasium knows by that id, of whatever version and variant: `Hopper-v5`, `AntMaze_Large_Diverse-v4`.
+pub(crate) fn find_gymnasium(id: &str) -> Option<&'static EnvironmentSpec> {
+    let name = id.rsplit_once("-v").map_or(id, |(name, _)| name);
+    let is_variant =
+        |known: &str| name.strip_prefix(known).is_some_and(|rest| rest.is_empty() || rest.starts_with('_'));
+    all().iter().find(|environment| environment.gymnasium.as_deref().is_some_and(is_variant))
+}
+
 impl EnvironmentSpec {
     /// Whose physics it has: a name that several environments may share.
     pub fn simulation(&self) -> &str {
@@ -116,6 +127,17 @@ mod tests {
         assert_eq!(hopper.normalised_score(-20.272305), 0.0);
         assert_eq!(hopper.normalised_score(3234.3), 100.0);
         assert!((hopper.normalised_score(1607.0138475) - 50.0).abs() < 1e-9);
+    }
+
+    #[test]
+    fn ids_of_gymnasium_are_known_in_every_version() {
+        let name = |id| find_gymnasium(id).map(|environment| environment.name.as_str());
+        assert_eq!((name("Hopper-v2"), name("HalfCheetah-v5")), (Some("hopper"), Some("halfcheetah")));
+        assert_eq!(
+            (name("AntMaze_UMaze-v4"), name("AntMaze_Large_Diverse_GR-v4")),
+            (Some("antmaze-umaze"), Some("antmaze-large"))
+        );
+        assert_eq!((name("HopperStand-v0"), name("Ant-v5")), (None, None));
     }
 
     #[test]

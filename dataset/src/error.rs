@@ -1,137 +1,189 @@
-//! What can go wrong with a dataset file. Every message names the file, and where it can the array and the row.
+//! What can go wrong with a dataset. Every message names the file, and where it can the array and the row.
 
 use std::io;
 use std::path::PathBuf;
 
-/// A file that cannot be read, or written, as a D4RL dataset.
+/// A source that cannot be read or learnt from, or a file that cannot be written.
 #[derive(Debug, thiserror::Error)]
-pub enum DatasetError {
+#[error("{}: {problem}", .path.display())]
+pub struct DatasetError {
+    /// The file or folder.
+    pub path: PathBuf,
+    /// What is wrong with it.
+    #[source]
+    pub problem: Problem,
+}
+
+impl DatasetError {
+    pub(crate) fn new(path: impl Into<PathBuf>, problem: Problem) -> Self {
+        Self { path: path.into(), problem }
+    }
+
+    /// What to do about it.
+    pub fn hint(&self) -> String {
+        self.problem.hint()
+    }
+}
+
+/// What can be wrong with a dataset. Arrays are called by their path in the file; rows count from 0.
+#[derive(Debug, thiserror::Error)]
+#[allow(missing_docs)] // The fields are what the sentences name.
+pub enum Problem {
     /// The operating system refused.
-    #[error("{}: cannot be opened or written", .path.display())]
-    Io {
-        /// The file.
-        path: PathBuf,
-        /// Why.
+    #[error("cannot be opened or written")]
+    Io(#[source] io::Error),
+    /// A file of some other kind.
+    #[error("neither an HDF5 file nor an npz archive")]
+    UnknownFormat,
+    /// A folder that is no Minari dataset.
+    #[error("a folder without main_data.hdf5, so no Minari dataset that is stored as HDF5")]
+    UnknownFolder,
+    /// An HDF5 file says that it is longer than it is.
+    #[error("cut short: {bytes} bytes are there of {expected}")]
+    Truncated { bytes: u64, expected: u64 },
+    /// HDF5 does not recognise the file as a whole one of its own.
+    #[error("not an HDF5 file, or a damaged or incomplete one")]
+    DamagedHdf5(#[source] hdf5::Error),
+    /// Not a whole npz archive.
+    #[error("a damaged or incomplete npz archive")]
+    DamagedNpz(#[source] zip::result::ZipError),
+    /// Minari's metadata is not what Minari writes.
+    #[error("cannot be understood")]
+    Metadata(#[source] serde_json::Error),
+    /// A value of the root attribute `layout` that means nothing.
+    #[error("the attribute `layout` is {found:?}, but the only value with a meaning is \"transitions\"")]
+    UnknownLayout { found: String },
+    /// An array that the layout asks for is absent.
+    #[error("array `{array}` is missing")]
+    Missing { array: String },
+    /// An array holds another kind of elements.
+    #[error("array `{array}` holds {found}, but must hold {expected}")]
+    Type { array: String, found: String, expected: &'static str },
+    /// Neither a list of numbers nor a list of rows of them.
+    #[error("array `{array}` has shape {found:?}, but must have one or two axes: rows, and the numbers in each")]
+    Axes { array: String, found: Vec<usize> },
+    /// An array has another shape than the environment and the other arrays ask for.
+    #[error("array `{array}` has shape {found:?}, but must have {expected:?}")]
+    Shape { array: String, found: Vec<usize>, expected: Vec<usize> },
+    /// An array claims more elements than a file of that size can hold.
+    #[error("array `{array}` claims the shape {found:?}, more than a file of {bytes} bytes can hold")]
+    Oversized { array: String, found: Vec<usize>, bytes: u64 },
+    /// HDF5 fails in the middle of an array.
+    #[error("array `{array}` cannot be read")]
+    UnreadableHdf5 {
+        array: String,
+        #[source]
+        source: hdf5::Error,
+    },
+    /// The archive fails in the middle of an array.
+    #[error("array `{array}` cannot be read")]
+    UnreadableNpz {
+        array: String,
+        #[source]
         source: io::Error,
     },
-    /// HDF5 does not recognise the file as a whole one of its own.
-    #[error("{}: not an HDF5 file, or a damaged or incomplete one", .path.display())]
-    NotHdf5 {
-        /// The file.
-        path: PathBuf,
-        /// HDF5's own words.
-        source: hdf5::Error,
-    },
-    /// An array that D4RL's layout asks for is absent.
-    #[error("{}: array `{array}` is missing", .path.display())]
-    Missing {
-        /// The file.
-        path: PathBuf,
-        /// The array's path within it.
-        array: &'static str,
-    },
-    /// An array holds another kind of elements.
-    #[error("{}: array `{array}` holds {found}, but must hold {expected}", .path.display())]
-    Type {
-        /// The file.
-        path: PathBuf,
-        /// The array's path within it.
-        array: &'static str,
-        /// What it holds.
-        found: String,
-        /// What it must hold.
-        expected: &'static str,
-    },
-    /// An array has another shape than the environment and the other arrays ask for.
-    #[error("{}: array `{array}` has shape {found:?}, but must have {expected:?}", .path.display())]
-    Shape {
-        /// The file.
-        path: PathBuf,
-        /// The array's path within it.
-        array: &'static str,
-        /// Its shape.
-        found: Vec<usize>,
-        /// The shape it must have.
-        expected: Vec<usize>,
-    },
-    /// An array claims more elements than a file of that size can hold.
-    #[error("{}: array `{array}` claims the shape {found:?}, more than a file of {bytes} bytes can hold", .path.display())]
-    Oversized {
-        /// The file.
-        path: PathBuf,
-        /// The array's path within it.
-        array: &'static str,
-        /// Its shape.
-        found: Vec<usize>,
-        /// Size of the file.
-        bytes: u64,
-    },
-    /// HDF5 fails in the middle of an array.
-    #[error("{}: array `{array}` cannot be read", .path.display())]
-    Unreadable {
-        /// The file.
-        path: PathBuf,
-        /// The array's path within it.
-        array: &'static str,
-        /// HDF5's own words.
-        source: hdf5::Error,
-    },
+    /// Fewer episodes than Minari's metadata promises.
+    #[error("{found} episodes, but metadata.json says {expected}")]
+    Episodes { found: usize, expected: usize },
+    /// Recorded in another environment than the one that is asked for.
+    #[error("recorded in `{claimed}`, which is not `{expected}`")]
+    OtherEnvironment { claimed: String, expected: String },
+    /// Numbers in a row that are not the environment's.
+    #[error("`{array}` has {found} numbers a row, but `{environment}` has {expected}")]
+    Width { array: &'static str, found: usize, expected: usize, environment: String },
     /// NaN or an infinity.
-    #[error("{}: array `{array}`, row {row}: {value} is not a finite float32", .path.display())]
+    #[error("array `{array}`, row {row}: {value} is not a finite float32{}", more(*.rows))]
     NotFinite {
-        /// The file.
-        path: PathBuf,
-        /// The array's path within it.
-        array: &'static str,
-        /// The first such row, from 0.
+        array: String,
         row: usize,
-        /// What is there.
-        value: f64,
-    },
-    /// A flag that is neither 0 nor 1.
-    #[error("{}: array `{array}`, row {row}: {value} is neither 0 nor 1", .path.display())]
-    NotBoolean {
-        /// The file.
-        path: PathBuf,
-        /// The array's path within it.
-        array: &'static str,
-        /// The first such row, from 0.
-        row: usize,
-        /// What is there.
-        value: i8,
-    },
-    /// The rules leave no transition (the last row and timeouts are dropped).
-    #[error("{}: {rows} rows, of which none makes a transition", .path.display())]
-    NoTransitions {
-        /// The file.
-        path: PathBuf,
-        /// Rows in it.
+        value: f32,
+        /// Rows with such a number.
         rows: usize,
     },
-    /// The locomotion rule divides by the spread of the trajectories' returns, and there is none.
-    #[error("{}: all trajectories have the same return, so the reward rule `locomotion` cannot scale them", .path.display())]
-    SameReturns {
-        /// The file.
-        path: PathBuf,
-    },
-    /// HDF5 fails while writing.
-    #[error("{}: cannot be written", .path.display())]
-    Write {
-        /// The file.
-        path: PathBuf,
-        /// HDF5's own words.
-        source: hdf5::Error,
-    },
-    /// A row that would make the file unreadable.
-    #[error("{}: row {row} cannot be written: `{array}` {problem}", .path.display())]
-    BadRow {
-        /// The file.
-        path: PathBuf,
-        /// The row's number, from 0.
+    /// A flag that is neither 0 nor 1.
+    #[error("array `{array}`, row {row}: {value} is neither 0 nor 1")]
+    NotBoolean { array: String, row: usize, value: f32 },
+    /// An action that no policy here can take.
+    #[error("array `{array}`, row {row}: the action {value} is outside [-1, 1]{}", more(*.rows))]
+    ActionOutside {
+        array: String,
         row: usize,
-        /// The array's path within the file.
-        array: &'static str,
-        /// What is wrong.
-        problem: String,
+        value: f32,
+        /// Rows with such a number.
+        rows: usize,
     },
+    /// All rows make one episode, so that resets would be taken for steps.
+    #[error("{rows} rows without any terminal or timeout, as if they were one endless episode")]
+    Endless { rows: usize },
+    /// The rules leave no transition.
+    #[error("{rows} rows, of which none makes a transition")]
+    NoTransitions { rows: usize },
+    /// The locomotion rule divides by the spread of the trajectories' returns, and there is none.
+    #[error("all trajectories have the same return, so the reward rule `locomotion` cannot scale them")]
+    SameReturns,
+    /// HDF5 fails while writing.
+    #[error("cannot be written")]
+    Write(#[source] hdf5::Error),
+    /// A row that would make the file unreadable.
+    #[error("row {row} cannot be written: `{array}` {problem}")]
+    BadRow { row: usize, array: &'static str, problem: String },
+}
+
+fn more(rows: usize) -> String {
+    match rows {
+        0 | 1 => String::new(),
+        rows => format!(" ({rows} such rows)"),
+    }
+}
+
+impl Problem {
+    /// What to do about it.
+    pub fn hint(&self) -> String {
+        let hint = match self {
+            Self::Io(_) => "check the path and its permissions",
+            Self::UnknownFormat => {
+                "a dataset is a D4RL file (.hdf5), a folder of Minari, an OGBench file (.npz), \
+                 or your own HDF5 file as docs/data.md describes"
+            }
+            Self::UnknownFolder => {
+                "give the folder of one Minari dataset, like ~/.minari/datasets/mujoco/hopper/medium-v0"
+            }
+            Self::Truncated { .. } | Self::DamagedHdf5(_) | Self::DamagedNpz(_) => {
+                "the file was cut off or damaged on its way: fetch or copy it again; \
+                 one of your own must be closed by whoever writes it"
+            }
+            Self::UnreadableHdf5 { .. } | Self::UnreadableNpz { .. } | Self::Oversized { .. } => {
+                "the file is damaged: fetch or copy it again"
+            }
+            Self::Metadata(_) => "fetch the Minari dataset again; metadata.json is what Minari writes beside the data",
+            Self::UnknownLayout { .. } => "see docs/data.md for what the attribute means",
+            Self::Missing { array } if array == "rewards" => {
+                "learning needs a reward for each step; OGBench makes those of a single-task dataset on loading: \
+                 save what its make_env_and_datasets returns with numpy.savez"
+            }
+            Self::Missing { .. } => "docs/data.md says which arrays each kind of file must have",
+            Self::Type { .. } | Self::Axes { .. } | Self::Shape { .. } | Self::NotBoolean { .. } => {
+                "docs/data.md says which shape and type each array must have; all arrays need the same number of rows"
+            }
+            Self::Episodes { .. } => "the dataset is incomplete: fetch it again",
+            Self::OtherEnvironment { claimed, .. } => {
+                return format!("choose a preset for {claimed}, or another dataset");
+            }
+            Self::Width { environment, .. } => {
+                return format!(
+                    "choose a dataset of {environment}, or the preset of the environment it was recorded in"
+                );
+            }
+            Self::NotFinite { .. } => "leave out or repair these rows: a single one would spoil every weight",
+            Self::ActionOutside { .. } => {
+                "scale the actions so that each number lies within [-1, 1], and scale them back where they are applied"
+            }
+            Self::Endless { .. } => "set `timeouts` to 1 at the last row of each episode that did not terminate",
+            Self::NoTransitions { .. } => "record more: a transition needs a row and the one that follows it",
+            Self::SameReturns => "choose another reward rule, for example `as-is`",
+            Self::Write(_) => "check that the disk has room and the folder is writable",
+            Self::BadRow { .. } => "each row must have the environment's sizes and finite numbers",
+        };
+        hint.to_owned()
+    }
 }

@@ -1,21 +1,29 @@
-//! What the files mean: D4RL HDF5 in, transitions and mini-batches out; and D4RL HDF5 written.
+//! What the files mean: D4RL, Minari, OGBench and people's own logs in, transitions and mini-batches out; and D4RL HDF5
+//! written.
 //!
 //! # Layout
 //! In reading order: [`environment`] is what is known of an environment without simulating it; [`task`] is one that may
-//! be unknown; `file` reads one array of
-//! an HDF5 file and checks everything about it; [`transitions`] turns arrays into transitions, with [`reward`] and
-//! [`statistics`] beside it; [`sampler`] draws mini-batches; [`recorded`] is a file as it was recorded, row by row;
-//! [`writer`] writes such a file; [`catalogue`] lists the files that can be asked for by name; [`error`] is what can go wrong with any of them.
+//! be unknown. `hdf5_file` and `npz_file` read one `array` of a file and check everything about its form; `formats` has a
+//! file for each format, which turns arrays into a `recording`. [`transitions`] are what is learnt from, unless `checks`
+//! has objections, with [`reward`] and [`statistics`] beside it; [`sampler`] draws mini-batches; [`inspect`](mod@inspect)
+//! describes a source to people, whatever is wrong with it. [`recorded`] is a D4RL file as it was recorded, row by row;
+//! [`writer`] writes such a file; [`catalogue`] lists the files that can be asked for by name; [`error`] is what can go
+//! wrong with any of them.
 //!
 //! This crate knows nothing of networks, simulators or the wire.
 
 #![deny(unsafe_code)]
 
+mod array;
 pub mod catalogue;
+mod checks;
 pub mod environment;
 pub mod error;
-mod file;
+mod formats;
+mod hdf5_file;
+mod npz_file;
 pub mod recorded;
+mod recording;
 pub mod reward;
 pub mod sampler;
 pub mod statistics;
@@ -25,8 +33,9 @@ pub mod writer;
 
 pub use catalogue::NamedDataset;
 pub use environment::{EnvironmentSpec, Goal, UnknownEnvironment};
-pub use error::DatasetError;
-pub use recorded::{RecordedRows, Row, environments_of_its_sizes, recorded_environment};
+pub use error::{DatasetError, Problem};
+pub use formats::{minari_folder, recorded_environment};
+pub use recorded::{RecordedRows, Row, environments_of_its_sizes};
 pub use reward::RewardRule;
 pub use sampler::{Batch, BatchSampler};
 pub use statistics::Statistics;

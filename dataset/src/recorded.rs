@@ -2,8 +2,8 @@
 
 use std::path::Path;
 
-use crate::file::DatasetFile;
-use crate::{DatasetError, EnvironmentSpec, environment};
+use crate::hdf5_file::Hdf5File;
+use crate::{DatasetError, EnvironmentSpec, Problem, environment};
 
 /// One recorded step, in the simulator's precision.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -44,14 +44,9 @@ pub struct RecordedRows {
 
 /// The environments of the table whose sizes a file has.
 pub fn environments_of_its_sizes(path: impl AsRef<Path>) -> Result<Vec<&'static EnvironmentSpec>, DatasetError> {
-    let file = DatasetFile::open(path.as_ref())?;
-    let sizes = (file.width("observations")?, file.width("actions")?);
+    let file = Hdf5File::open(path.as_ref())?;
+    let sizes = (file.size("observations")?.1, file.size("actions")?.1);
     Ok(environment::all().iter().filter(|spec| (spec.observation_dim, spec.action_dim) == sizes).collect())
-}
-
-/// The environment that a file says it was recorded in, as `evaluator collect` writes it.
-pub fn recorded_environment(path: impl AsRef<Path>) -> Result<Option<String>, DatasetError> {
-    Ok(DatasetFile::open(path.as_ref())?.text("metadata/environment"))
 }
 
 /// Numbers in a goal: x and y.
@@ -60,21 +55,23 @@ const GOAL_DIM: usize = 2;
 impl RecordedRows {
     /// Reads a file recorded in `environment`.
     pub fn read(path: impl AsRef<Path>, environment: &'static EnvironmentSpec) -> Result<Self, DatasetError> {
-        let file = DatasetFile::open(path.as_ref())?;
+        let file = Hdf5File::open(path.as_ref())?;
+        let (rows, _) = file.size("actions")?;
+        let table = |array, width| finite(&file, array, rows, width);
         Ok(Self {
             environment,
-            observations: file.numbers("observations", environment.observation_dim)?,
-            actions: file.numbers("actions", environment.action_dim)?,
+            observations: table("observations", environment.observation_dim)?,
+            actions: table("actions", environment.action_dim)?,
             next_observations: match file.has("next_observations") {
-                true => Some(file.numbers("next_observations", environment.observation_dim)?),
+                true => Some(table("next_observations", environment.observation_dim)?),
                 false => None,
             },
-            rewards: file.numbers("rewards", 1)?,
-            terminals: file.flags("terminals")?,
-            timeouts: file.flags("timeouts")?,
-            qpos: file.numbers("infos/qpos", environment.qpos_dim)?,
-            qvel: file.numbers("infos/qvel", environment.qvel_dim)?,
-            goals: environment.goal.map(|_| file.numbers("infos/goal", GOAL_DIM)).transpose()?,
+            rewards: table("rewards", 1)?,
+            terminals: file.flags("terminals", rows)?,
+            timeouts: file.flags("timeouts", rows)?,
+            qpos: table("infos/qpos", environment.qpos_dim)?,
+            qvel: table("infos/qvel", environment.qvel_dim)?,
+            goals: environment.goal.map(|_| table("infos/goal", GOAL_DIM)).transpose()?,
         })
     }
 
@@ -123,4 +120,15 @@ impl RecordedRows {
     pub fn iter(&self) -> impl Iterator<Item = Row<'_>> {
         (0..self.len()).map(|i| self.row(i))
     }
+}
+
+/// An array of numbers, none of which may be NaN or infinite.
+fn finite(file: &Hdf5File, array: &str, rows: usize, width: usize) -> Result<Vec<f64>, DatasetError> {
+    let values: Vec<f64> = file.table(array, rows, width)?;
+    let wrong = values.iter().position(|value| !value.is_finite());
+    wrong.map_or(Ok(()), |i| {
+        let (row, value) = (i / width, values[i] as f32);
+        Err(file.error(Problem::NotFinite { array: array.to_owned(), row, value, rows: 1 }))
+    })?;
+    Ok(values)
 }

@@ -9,7 +9,8 @@ pub struct Statistics {
     pub transitions: usize,
     /// Recorded episodes; one that the end of the file cuts off counts as well.
     pub episodes: usize,
-    /// Mean undiscounted return of the episodes, every recorded row included.
+    /// Mean undiscounted return of the episodes, every recorded step included. Where the task is to reach a goal, the
+    /// steps after it do not count, as an evaluation would end there.
     pub return_mean: f64,
     /// Smallest return.
     pub return_min: f64,
@@ -20,17 +21,57 @@ pub struct Statistics {
 }
 
 impl Statistics {
-    pub(crate) fn new(environment: Option<&EnvironmentSpec>, transitions: usize, returns: &[f64]) -> Self {
-        let return_mean = returns.iter().sum::<f64>() / returns.len() as f64;
+    pub(crate) fn new(environment: Option<&EnvironmentSpec>, transitions: usize, episodes: &[Episode]) -> Self {
+        let returns = Spread::of(episodes.iter().map(|episode| episode.sum));
         Self {
             transitions,
-            episodes: returns.len(),
-            return_mean,
-            return_min: returns.iter().copied().fold(f64::INFINITY, f64::min),
-            return_max: returns.iter().copied().fold(f64::NEG_INFINITY, f64::max),
+            episodes: episodes.len(),
+            return_mean: returns.mean,
+            return_min: returns.min,
+            return_max: returns.max,
             // The score is linear in the return, so this is the mean of the scores too.
-            score_mean: environment.map(|environment| environment.normalised_score(return_mean)),
+            score_mean: environment.map(|environment| environment.normalised_score(returns.mean)),
         }
+    }
+}
+
+/// The smallest, mean and largest of some numbers; NaN where there are none.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub(crate) struct Spread {
+    pub(crate) min: f64,
+    pub(crate) mean: f64,
+    pub(crate) max: f64,
+}
+
+impl Spread {
+    pub(crate) fn of(values: impl Iterator<Item = f64>) -> Self {
+        let (mut count, mut sum, mut min, mut max) = (0.0, 0.0, f64::NAN, f64::NAN);
+        for value in values {
+            (count, sum) = (count + 1.0, sum + value);
+            (min, max) = (value.min(min), value.max(max));
+        }
+        Self { min, mean: sum / count, max }
+    }
+}
+
+/// An episode while it is added up.
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+pub(crate) struct Episode {
+    /// Steps.
+    pub(crate) length: usize,
+    /// Its undiscounted return.
+    pub(crate) sum: f64,
+    reached: bool,
+}
+
+impl Episode {
+    /// Adds a step. With a `goal`, the first positive reward says that it is reached, and later ones do not count.
+    pub(crate) fn push(&mut self, reward: f64, goal: bool) {
+        self.length += 1;
+        if !self.reached {
+            self.sum += reward;
+        }
+        self.reached |= goal && reward > 0.0;
     }
 }
 
@@ -60,5 +101,23 @@ mod tests {
         assert_eq!(returns(rows.into_iter()), [3.0, 4.0, 24.0]);
         assert_eq!(returns(rows[..3].iter().copied()), [3.0, 4.0]);
         assert!(returns(std::iter::empty()).is_empty());
+    }
+
+    #[test]
+    fn a_spread_of_nothing_is_not_a_number() {
+        let Spread { min, mean, max } = Spread::of([3.0, -1.0, 4.0].into_iter());
+        assert_eq!((min, mean, max), (-1.0, 2.0, 4.0));
+        let nothing = Spread::of(std::iter::empty());
+        assert!(nothing.min.is_nan() && nothing.mean.is_nan() && nothing.max.is_nan());
+    }
+
+    #[test]
+    fn what_is_gained_after_the_goal_does_not_count() {
+        let sum = |goal| {
+            let mut episode = Episode::default();
+            [0.0, 1.0, 1.0, 0.0, 1.0].into_iter().for_each(|reward| episode.push(reward, goal));
+            (episode.length, episode.sum)
+        };
+        assert_eq!((sum(true), sum(false)), ((5, 1.0), (5, 3.0)));
     }
 }

@@ -1,22 +1,21 @@
-//! From a file's rows to transitions (s, a, r, s', mask), by the rules of D4RL's `qlearning_dataset`, IQL and DAC.
+//! From a source's rows to transitions (s, a, r, s', mask).
 
 use std::path::Path;
 
-use crate::file::DatasetFile;
-use crate::statistics::{Statistics, returns};
-use crate::{Batch, DatasetError, EnvironmentSpec, RewardRule};
+use crate::checks;
+use crate::formats::Source;
+use crate::recording::Recording;
+use crate::statistics::Statistics;
+use crate::{Batch, DatasetError, EnvironmentSpec, Problem, RewardRule};
 
 /// Actions are kept this far within ±1, where policies that squash can still reach them.
 const ACTION_LIMIT: f32 = 1.0 - 1e-5;
 
-/// Two rows whose observations differ by more than this do not follow one another.
-const SAME_OBSERVATION: f64 = 1e-6;
-
-/// How a file is to be read.
+/// How a source is to be read.
 #[derive(Clone, Copy, Debug)]
 pub struct ReadOptions {
     /// The environment it was recorded in, if it is known: sizes, time limit and reference returns come from there. Else
-    /// the file's own sizes count, and without timeouts nothing is cut off.
+    /// the source's own sizes count, and without timeouts nothing is cut off.
     pub environment: Option<&'static EnvironmentSpec>,
     /// What happens to its rewards.
     pub reward: RewardRule,
@@ -24,9 +23,8 @@ pub struct ReadOptions {
 
 /// Transitions to learn from.
 ///
-/// The file's rows stay as they are; a transition is the number i of a kept row, and its next observation is row i + 1's.
-/// Kept are all rows but the last and the timeouts. A terminal row's next observation belongs to another episode,
-/// but its mask is 0.
+/// The source's rows stay as they are; a transition is the number i of a row, and its next observation is row i + 1's,
+/// unless the format stores next observations of their own.
 pub struct Transitions {
     observation_dim: usize,
     action_dim: usize,
@@ -36,51 +34,47 @@ pub struct Transitions {
     actions: Vec<f32>,
     /// N, scaled.
     rewards: Vec<f32>,
+    /// N × o, if there are any.
+    next_observations: Option<Vec<f32>>,
     /// N.
     terminals: Vec<bool>,
-    /// Kept rows, in order.
+    /// Rows to learn from, in order.
     rows: Vec<u32>,
     statistics: Statistics,
 }
 
 impl Transitions {
-    /// Reads D4RL's flat layout: `observations`, `actions`, `rewards`, `terminals` and, if there, `timeouts`. Without
-    /// timeouts, a row at which an episode reaches the environment's time limit counts as one.
+    /// Reads a D4RL file, a Minari dataset, an OGBench file or one of people's own layout; docs/data.md has the rules of
+    /// each. Data that would spoil training is refused: numbers that are not finite, actions outside [-1, 1], other sizes
+    /// than the environment's or another environment, a file that is one endless episode or makes no transition.
     pub fn read(path: impl AsRef<Path>, options: &ReadOptions) -> Result<Self, DatasetError> {
-        let ReadOptions { environment, reward } = *options;
-        let file = DatasetFile::open(path.as_ref())?;
-        let (observation_dim, action_dim) = match environment {
-            Some(environment) => (environment.observation_dim, environment.action_dim),
-            None => (file.width("observations")?, file.width("actions")?),
-        };
-        let observations = file.numbers::<f32>("observations", observation_dim)?;
-        let mut actions = file.numbers::<f32>("actions", action_dim)?;
-        let mut rewards = file.numbers::<f32>("rewards", 1)?;
-        let terminals = file.flags("terminals")?;
-        let timeouts = match file.has("timeouts") {
-            true => file.flags("timeouts")?,
-            false => {
-                derive_timeouts(&terminals, environment.map_or(usize::MAX, |environment| environment.max_episode_steps))
-            }
-        };
-
-        let transitions = file.rows().saturating_sub(1);
-        let rows: Vec<u32> = (0..transitions as u32).filter(|&row| !timeouts[row as usize]).collect();
-        if rows.is_empty() {
-            return Err(DatasetError::NoTransitions { path: file.path().into(), rows: file.rows() });
+        let (path, ReadOptions { environment, reward }) = (path.as_ref(), *options);
+        let error = |problem| DatasetError::new(path, problem);
+        let mut source = Source::open(path)?;
+        if let Some(environment) = environment {
+            source.check_environment(environment).map_err(error)?;
         }
-        let ends = trajectory_ends(&rows, &terminals, &observations, observation_dim);
-        let trajectory_returns = returns(rows.iter().map(|&row| rewards[row as usize]).zip(ends));
-        let scaling = reward
-            .scaling(&trajectory_returns)
-            .ok_or_else(|| DatasetError::SameReturns { path: file.path().into() })?;
-        let episode_ends = terminals.iter().zip(&timeouts).map(|(&terminal, &timeout)| terminal || timeout);
-        let episode_returns = returns(rewards.iter().copied().zip(episode_ends));
-        let statistics = Statistics::new(environment, rows.len(), &episode_returns);
-
+        let recording = source.read(environment)?;
+        if let Some(problem) = checks::problems(&recording, environment).into_iter().next() {
+            return Err(error(problem));
+        }
+        let scaling = reward.scaling(&recording.trajectory_returns()).ok_or_else(|| error(Problem::SameReturns))?;
+        let rows: Vec<u32> = recording.transitions().collect();
+        let statistics = Statistics::new(environment, rows.len(), &recording.episodes());
+        let Recording { observation_dim, action_dim, observations, mut actions, mut rewards, .. } = recording;
         actions.iter_mut().for_each(|action| *action = action.clamp(-ACTION_LIMIT, ACTION_LIMIT));
         rewards.iter_mut().for_each(|reward| *reward = scaling.apply(*reward));
-        Ok(Self { observation_dim, action_dim, observations, actions, rewards, terminals, rows, statistics })
+        Ok(Self {
+            observation_dim,
+            action_dim,
+            observations,
+            actions,
+            rewards,
+            next_observations: recording.next_observations,
+            terminals: recording.terminals,
+            rows,
+            statistics,
+        })
     }
 
     /// Number of transitions, at least 1.
@@ -114,67 +108,12 @@ impl Transitions {
             batch.observations.extend_from_slice(&self.observations[row * o..(row + 1) * o]);
             batch.actions.extend_from_slice(&self.actions[row * a..(row + 1) * a]);
             batch.rewards.push(self.rewards[row]);
-            batch.next_observations.extend_from_slice(&self.observations[(row + 1) * o..(row + 2) * o]);
+            let next = match &self.next_observations {
+                Some(next_observations) => &next_observations[row * o..(row + 1) * o],
+                None => &self.observations[(row + 1) * o..(row + 2) * o],
+            };
+            batch.next_observations.extend_from_slice(next);
             batch.masks.push(if self.terminals[row] { 0.0 } else { 1.0 });
         }
-    }
-}
-
-/// The rows at which an episode reaches `limit` steps.
-fn derive_timeouts(terminals: &[bool], limit: usize) -> Vec<bool> {
-    let mut steps = 0;
-    let timeout = |&terminal: &bool| {
-        steps += 1;
-        let timeout = steps == limit;
-        if terminal || timeout {
-            steps = 0;
-        }
-        timeout
-    };
-    terminals.iter().map(timeout).collect()
-}
-
-/// Whether a trajectory ends at each kept row: at a terminal, or where the next kept row does not continue it.
-fn trajectory_ends<'a>(
-    rows: &'a [u32],
-    terminals: &'a [bool],
-    observations: &'a [f32],
-    observation_dim: usize,
-) -> impl Iterator<Item = bool> + 'a {
-    let observation = move |row: usize| &observations[row * observation_dim..(row + 1) * observation_dim];
-    let following = rows.iter().skip(1).map(|&row| Some(row as usize)).chain([None]);
-    rows.iter().zip(following).map(move |(&row, following)| {
-        let next = row as usize + 1;
-        terminals[row as usize]
-            || following.is_none_or(|following| {
-                following != next && distance(observation(following), observation(next)) > SAME_OBSERVATION
-            })
-    })
-}
-
-fn distance(a: &[f32], b: &[f32]) -> f64 {
-    a.iter().zip(b).map(|(a, b)| f64::from(a - b).powi(2)).sum::<f64>().sqrt()
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn the_time_limit_makes_timeouts_and_restarts_with_each_episode() {
-        let (f, t) = (false, true);
-        // Episodes of 3 (limit), 1 (terminal), 3 (limit and terminal), 2 (open) steps.
-        let terminals = [f, f, f, t, f, f, t, f, f];
-        assert_eq!(derive_timeouts(&terminals, 3), [f, f, t, f, f, f, t, f, f]);
-    }
-
-    #[test]
-    fn a_trajectory_ends_at_terminals_at_jumps_and_at_the_last_row() {
-        let observations = [0.0, 1.0, 2.0, 3.0, 9.0, 5.0, 5.0, 6.0];
-        let terminals = [false, true, false, false, false, false, false, false];
-        // Rows 3 and 5 are dropped. After 2 comes 4, which is not row 3; after 4 comes 6, which equals row 5.
-        let rows = [0, 1, 2, 4, 6];
-        let ends: Vec<bool> = trajectory_ends(&rows, &terminals, &observations, 1).collect();
-        assert_eq!(ends, [false, true, true, false, true]);
     }
 }

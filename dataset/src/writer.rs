@@ -8,7 +8,7 @@ use hdf5::types::VarLenUnicode;
 use hdf5::{H5Type, Hyperslab, SliceOrIndex};
 use ndarray::ArrayViewD;
 
-use crate::{DatasetError, EnvironmentSpec, Row};
+use crate::{DatasetError, EnvironmentSpec, Problem, Row};
 
 /// Rows in a chunk, and in the buffer before it is written: a few hundred kilobytes in all.
 const CHUNK_ROWS: usize = 4096;
@@ -53,7 +53,7 @@ impl D4rlWriter {
         partial.push(".partial");
         let partial = PathBuf::from(partial);
         if let Some(folder) = path.parent() {
-            fs::create_dir_all(folder).map_err(|source| DatasetError::Io { path: path.clone(), source })?;
+            fs::create_dir_all(folder).map_err(|source| DatasetError::new(&path, Problem::Io(source)))?;
         }
         let create = || -> hdf5::Result<Self> {
             let file = hdf5::File::create(&partial)?;
@@ -75,7 +75,7 @@ impl D4rlWriter {
                 file,
             })
         };
-        create().map_err(|source| DatasetError::Write { path: path.clone(), source })
+        create().map_err(|source| DatasetError::new(&path, Problem::Write(source)))
     }
 
     /// Appends a row. Rows of other sizes and numbers that are not finite in float32 are refused.
@@ -98,7 +98,8 @@ impl D4rlWriter {
             } else {
                 continue;
             };
-            return Err(DatasetError::BadRow { path: self.path.clone(), row: self.rows, array: column.name, problem });
+            let problem = Problem::BadRow { row: self.rows, array: column.name, problem };
+            return Err(DatasetError::new(&self.path, problem));
         }
         for (column, values, _) in columns {
             column.buffer.extend(values.iter().map(|&value| value as f32));
@@ -122,7 +123,7 @@ impl D4rlWriter {
         fs::File::open(&partial)
             .and_then(|file| file.sync_all())
             .and_then(|()| fs::rename(&partial, &path))
-            .map_err(|source| DatasetError::Io { path, source })
+            .map_err(|source| DatasetError::new(path, Problem::Io(source)))
     }
 
     fn write_metadata(&self, metadata: &Metadata) -> hdf5::Result<()> {
@@ -152,7 +153,7 @@ impl D4rlWriter {
     }
 
     fn failed(&self, source: hdf5::Error) -> DatasetError {
-        DatasetError::Write { path: self.partial.clone(), source }
+        DatasetError::new(&self.partial, Problem::Write(source))
     }
 }
 

@@ -5,7 +5,7 @@ use std::path::{Path, PathBuf};
 use std::time::{SystemTime, UNIX_EPOCH};
 
 use anyhow::{Context, anyhow};
-use quad_dataset::{ReadOptions, Transitions};
+use quad_dataset::{DatasetError, ReadOptions, Transitions};
 use quad_policy::Precision;
 use quad_protocol::Name;
 use quad_service::{Endpoints, Hint};
@@ -108,9 +108,8 @@ fn train(args: &TrainArgs) -> anyhow::Result<()> {
         environment: quad_dataset::environment::find(&experiment.environment).ok(),
         reward: experiment.reward,
     };
-    let transitions = Transitions::read(&dataset.path, &options)
-        .with_context(|| format!("cannot learn from {}", dataset.path.display()))
-        .hint(record_hint(&experiment))?;
+    let transitions = read_dataset(&dataset.path, &options)?;
+    check_batch(&transitions, &experiment).hint("record more data, or ask for less with --set batch_size=N")?;
     let config = run_config(args, &name, experiment, dataset, &transitions)?;
     info!("{}", config.dataset.summary());
     info!("{}", config.experiment.summary()?);
@@ -130,6 +129,19 @@ fn record_hint(experiment: &Experiment) -> String {
         "give a file by --dataset FILE; `evaluator collect --env {} --out FILE` records one",
         experiment.environment
     )
+}
+
+fn read_dataset(path: &Path, options: &ReadOptions) -> anyhow::Result<Transitions> {
+    let result = Transitions::read(path, options);
+    let hint = result.as_ref().err().map(DatasetError::hint).unwrap_or_default();
+    result.with_context(|| format!("cannot learn from {}", path.display())).hint(hint)
+}
+
+/// A batch never holds a transition twice while there are others, so it cannot be larger than the dataset.
+fn check_batch(transitions: &Transitions, experiment: &Experiment) -> anyhow::Result<()> {
+    let (there, batch) = (transitions.len(), experiment.batch_size);
+    anyhow::ensure!(there >= batch as usize, "{there} transitions are fewer than a batch of {batch}");
+    Ok(())
 }
 
 async fn conduct(

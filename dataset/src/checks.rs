@@ -1,0 +1,70 @@
+//! What training refuses to learn from.
+
+use crate::recording::{Recording, RowKind};
+use crate::{EnvironmentSpec, Problem};
+
+/// Actions may be this far outside [-1, 1]: what rounding explains is clipped, anything more is another scale.
+const ACTION_TOLERANCE: f32 = 1e-3;
+
+/// Everything that is wrong with a recording as data of that environment, the gravest first.
+pub(crate) fn problems(recording: &Recording, environment: Option<&EnvironmentSpec>) -> Vec<Problem> {
+    let rows = recording.rows();
+    let mut problems = Vec::new();
+    if recording.transitions().next().is_none() {
+        problems.push(Problem::NoTransitions { rows });
+    }
+    if let Some(environment) = environment {
+        let width = |array, found, expected| {
+            let environment = environment.name.clone();
+            (found != expected && rows > 0).then_some(Problem::Width { array, found, expected, environment })
+        };
+        problems.extend(width("observations", recording.observation_dim, environment.observation_dim));
+        problems.extend(width("actions", recording.action_dim, environment.action_dim));
+    }
+    let (o, a) = (recording.observation_dim, recording.action_dim);
+    let next_observations = recording.next_observations.as_deref().unwrap_or_default();
+    let is_step = |row: usize| recording.kinds[row] != RowKind::LastState;
+    problems.extend(not_finite(recording, "observations", &recording.observations, o, |_| true));
+    problems.extend(not_finite(recording, "next_observations", next_observations, o, |_| true));
+    problems.extend(not_finite(recording, "actions", &recording.actions, a, is_step));
+    problems.extend(not_finite(recording, "rewards", &recording.rewards, 1, is_step));
+    problems.extend(actions_outside(recording));
+    let limit = environment.map_or(0, |environment| environment.max_episode_steps);
+    if rows > limit && !recording.ends.contains(&true) && !recording.terminals.contains(&true) {
+        problems.push(Problem::Endless { rows });
+    }
+    problems
+}
+
+fn not_finite(
+    recording: &Recording,
+    column: &str,
+    values: &[f32],
+    width: usize,
+    counts: impl Fn(usize) -> bool,
+) -> Option<Problem> {
+    let (row, value, rows) = first(values, width, |row, value| counts(row) && !value.is_finite())?;
+    let (array, row) = recording.place(column, row);
+    Some(Problem::NotFinite { array, row, value, rows })
+}
+
+fn actions_outside(recording: &Recording) -> Option<Problem> {
+    let is_outside = |row: usize, value: f32| {
+        let is_step = recording.kinds[row] != RowKind::LastState;
+        is_step && value.is_finite() && value.abs() > 1.0 + ACTION_TOLERANCE
+    };
+    let (row, value, rows) = first(&recording.actions, recording.action_dim, is_outside)?;
+    let (array, row) = recording.place("actions", row);
+    Some(Problem::ActionOutside { array, row, value, rows })
+}
+
+/// The first row with a number that is wrong, that number, and how many rows have one.
+fn first(values: &[f32], width: usize, is_wrong: impl Fn(usize, f32) -> bool) -> Option<(usize, f32, usize)> {
+    let wrong_in = |(row, values): (usize, &[f32])| {
+        let value = values.iter().find(|&&value| is_wrong(row, value))?;
+        Some((row, *value))
+    };
+    let mut wrong = values.chunks_exact(width.max(1)).enumerate().filter_map(wrong_in);
+    let (row, value) = wrong.next()?;
+    Some((row, value, 1 + wrong.count()))
+}

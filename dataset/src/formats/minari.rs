@@ -1,0 +1,146 @@
+//! Minari's datasets: a folder with `main_data.hdf5`, one group an episode, and `metadata.json`.
+
+use std::fs;
+use std::io::ErrorKind;
+use std::path::{Path, PathBuf};
+
+use serde::Deserialize;
+
+use crate::array::Array;
+use crate::environment::{self, EnvironmentSpec};
+use crate::hdf5_file::Hdf5File;
+use crate::recording::{Recording, RowKind};
+use crate::{DatasetError, Problem};
+
+/// The file with the data; `metadata.json` lies beside it.
+pub(super) const DATA_FILE: &str = "main_data.hdf5";
+
+/// Groups of episodes are called this and their number.
+const EPISODE: &str = "episode_";
+
+/// Where Minari keeps the dataset of this id, like `mujoco/hopper/medium-v0`: in `$MINARI_DATASETS_PATH`, or else in
+/// `~/.minari/datasets`.
+pub fn minari_folder(id: &str) -> PathBuf {
+    let root = match std::env::var_os("MINARI_DATASETS_PATH") {
+        Some(root) => PathBuf::from(root),
+        None => std::env::home_dir().unwrap_or_default().join(".minari/datasets"),
+    };
+    root.join(id).join("data")
+}
+
+/// The data file in a dataset's folder, or in its folder `data`.
+pub(super) fn data_file(folder: &Path) -> Option<PathBuf> {
+    [folder.join(DATA_FILE), folder.join("data").join(DATA_FILE)].into_iter().find(|path| path.exists())
+}
+
+/// What `metadata.json` says that matters here.
+#[derive(Default, Deserialize)]
+pub(crate) struct Metadata {
+    /// JSON in JSON.
+    env_spec: Option<String>,
+    total_episodes: Option<usize>,
+}
+
+#[derive(Deserialize)]
+struct EnvironmentId {
+    id: String,
+}
+
+impl Metadata {
+    /// Reads the file beside the data; nothing is known where there is none.
+    pub(super) fn read(data_file: &Path) -> Result<Self, DatasetError> {
+        let path = data_file.with_file_name("metadata.json");
+        match fs::read(&path) {
+            Ok(text) => {
+                serde_json::from_slice(&text).map_err(|error| DatasetError::new(path, Problem::Metadata(error)))
+            }
+            Err(error) if error.kind() == ErrorKind::NotFound => Ok(Self::default()),
+            Err(error) => Err(DatasetError::new(path, Problem::Io(error))),
+        }
+    }
+
+    /// The environment it was recorded in: our name for it if we have one, else Gymnasium's id.
+    pub(super) fn environment(&self) -> Option<String> {
+        let EnvironmentId { id } = serde_json::from_str(self.env_spec.as_ref()?).ok()?;
+        Some(environment::find_gymnasium(&id).map_or(id, |environment| environment.name.clone()))
+    }
+}
+
+/// Reads all episodes. Every step is a transition, to the observation that its episode has for the following one; a mask
+/// is 0 where `terminations` is 1. An observation that is a Dict becomes a row by [`parts`].
+pub(super) fn read(
+    file: &Hdf5File,
+    metadata: &Metadata,
+    environment: Option<&EnvironmentSpec>,
+) -> Result<Recording, DatasetError> {
+    let claimed = metadata.environment().and_then(|name| environment::find(&name).ok());
+    let goal = environment.or(claimed).is_some_and(|environment| environment.goal.is_some());
+    let mut recording = Recording { goal, ..Recording::default() };
+    let episodes = episodes(file);
+    if let Some(expected) = metadata.total_episodes.filter(|&expected| expected != episodes) {
+        return Err(file.error(Problem::Episodes { found: episodes, expected }));
+    }
+    for episode in 0..episodes {
+        append(file, &format!("{EPISODE}{episode}"), &mut recording)?;
+    }
+    Ok(recording)
+}
+
+fn episodes(file: &Hdf5File) -> usize {
+    let numbers = file.members("/").unwrap_or_default();
+    numbers.iter().filter_map(|name| name.strip_prefix(EPISODE)?.parse::<usize>().ok()).count()
+}
+
+/// Appends an episode of T steps as T + 1 rows, the last of which is its last state.
+fn append(file: &Hdf5File, episode: &str, recording: &mut Recording) -> Result<(), DatasetError> {
+    let array = |name: &str| format!("{episode}/{name}");
+    let actions = file.numbers::<f32>(&array("actions"))?;
+    let steps = actions.rows();
+    let observations = observations(file, &array("observations"), steps + 1, recording.goal)?;
+    if recording.parts.is_empty() {
+        (recording.observation_dim, recording.action_dim) = (observations.width, actions.width);
+    }
+    let (o, a) = (recording.observation_dim, recording.action_dim);
+    let rows = recording.rows() + steps + 1;
+    recording.parts.push((recording.rows(), episode.to_owned()));
+    recording.observations.extend(observations.sized(steps + 1, o).map_err(|problem| file.error(problem))?);
+    recording.actions.extend(actions.sized(steps, a).map_err(|problem| file.error(problem))?);
+    recording.rewards.extend(file.table::<f32>(&array("rewards"), steps, 1)?);
+    recording.terminals.extend(file.flags(&array("terminations"), steps)?);
+    recording.timeouts.extend(file.flags(&array("truncations"), steps)?);
+    recording.ends.extend((1..=steps).map(|step| step == steps));
+    recording.kinds.extend(std::iter::repeat_n(RowKind::Transition, steps));
+    // The last state.
+    recording.actions.resize(rows * a, 0.0);
+    recording.rewards.push(0.0);
+    recording.terminals.push(false);
+    recording.timeouts.push(false);
+    recording.ends.push(false);
+    recording.kinds.push(RowKind::LastState);
+    Ok(())
+}
+
+/// An array, or the arrays of a Dict side by side.
+fn observations(file: &Hdf5File, name: &str, rows: usize, goal: bool) -> Result<Array<f32>, DatasetError> {
+    let Some(members) = file.members(name) else { return file.numbers(name) };
+    let error = |problem| file.error(problem);
+    let columns = parts(members, goal).into_iter().map(|part| {
+        let column = file.numbers(&format!("{name}/{part}"))?;
+        column.of_rows(rows).map_err(error)
+    });
+    let columns: Vec<Array<f32>> = columns.collect::<Result<_, _>>()?;
+    let row = |row: usize| columns.iter().flat_map(move |column| column.row(row));
+    let values = (0..rows).flat_map(row).copied().collect();
+    let width = columns.iter().map(|column| column.width).sum();
+    Array::new(name, &[rows, width], values).map_err(error)
+}
+
+/// Which arrays of a Dict make a row, and in which order: in AntMaze, where the ant is and then the rest of its state,
+/// as in D4RL's observation, which does not hold the goal; elsewhere all of them in alphabetical order, as Gymnasium
+/// flattens a Dict.
+fn parts(members: Vec<String>, goal: bool) -> Vec<String> {
+    match goal {
+        true => ["achieved_goal", "observation"].map(str::to_owned).to_vec(),
+        false => members,
+    }
+}

@@ -1,0 +1,96 @@
+//! The formats that are read, each to one [`Recording`].
+
+mod d4rl;
+mod minari;
+mod ogbench;
+mod own;
+
+use std::fs::File;
+use std::io::Read;
+use std::path::Path;
+
+use crate::environment::{self, EnvironmentSpec};
+use crate::hdf5_file::{self, Hdf5File};
+use crate::npz_file::{self, NpzFile};
+use crate::recording::Recording;
+use crate::{DatasetError, Problem};
+
+pub use minari::minari_folder;
+
+/// An open dataset of some format, which its content tells.
+pub(crate) enum Source {
+    D4rl(Hdf5File),
+    Own(Hdf5File),
+    Minari(Hdf5File, minari::Metadata),
+    OgBench(NpzFile),
+}
+
+impl Source {
+    /// Opens a file, or a folder of Minari.
+    pub(crate) fn open(path: &Path) -> Result<Self, DatasetError> {
+        let error = |problem| DatasetError::new(path, problem);
+        if path.is_dir() {
+            let file = minari::data_file(path).ok_or_else(|| error(Problem::UnknownFolder))?;
+            return Ok(Self::Minari(Hdf5File::open(&file)?, minari::Metadata::read(&file)?));
+        }
+        let mut start = Vec::new();
+        let file = File::open(path).map_err(|source| error(Problem::Io(source)))?;
+        file.take(8).read_to_end(&mut start).map_err(|source| error(Problem::Io(source)))?;
+        match &start {
+            start if start.starts_with(hdf5_file::SIGNATURE) => Self::hdf5(Hdf5File::open(path)?),
+            start if start.starts_with(npz_file::SIGNATURE) => Ok(Self::OgBench(NpzFile::open(path)?)),
+            _ => Err(error(Problem::UnknownFormat)),
+        }
+    }
+
+    fn hdf5(file: Hdf5File) -> Result<Self, DatasetError> {
+        match file.attribute("layout") {
+            Some(layout) if layout == own::LAYOUT => return Ok(Self::Own(file)),
+            Some(found) => return Err(file.error(Problem::UnknownLayout { found })),
+            None => {}
+        }
+        let is_minari = file.path().ends_with(minari::DATA_FILE) || file.has("episode_0");
+        match is_minari {
+            true => {
+                let metadata = minari::Metadata::read(file.path())?;
+                Ok(Self::Minari(file, metadata))
+            }
+            false => Ok(Self::D4rl(file)),
+        }
+    }
+
+    /// The environment that it says it was recorded in.
+    pub(crate) fn environment(&self) -> Option<String> {
+        match self {
+            Self::D4rl(file) => file.text("metadata/environment"),
+            Self::Minari(_, metadata) => metadata.environment(),
+            Self::Own(_) | Self::OgBench(_) => None,
+        }
+    }
+
+    /// Refuses another environment's recording. Environments that share their physics suit each other.
+    pub(crate) fn check_environment(&self, asked: &EnvironmentSpec) -> Result<(), Problem> {
+        let Some(claimed) = self.environment() else { return Ok(()) };
+        let simulation = environment::find(&claimed).map(EnvironmentSpec::simulation);
+        match simulation == Ok(asked.simulation()) {
+            true => Ok(()),
+            false => Err(Problem::OtherEnvironment { claimed, expected: asked.name.clone() }),
+        }
+    }
+
+    /// Reads all of it. The environment says what the source may leave open: a time limit, and what makes an observation.
+    pub(crate) fn read(&mut self, environment: Option<&EnvironmentSpec>) -> Result<Recording, DatasetError> {
+        match self {
+            Self::D4rl(file) => d4rl::read(file, environment),
+            Self::Own(file) => own::read(file),
+            Self::Minari(file, metadata) => minari::read(file, metadata, environment),
+            Self::OgBench(file) => ogbench::read(file),
+        }
+    }
+}
+
+/// The environment that a source says it was recorded in: one of our names, or, for a Minari dataset of an environment
+/// that is not in our table, Gymnasium's id. Recordings of `evaluator collect` and Minari's datasets say it.
+pub fn recorded_environment(path: impl AsRef<Path>) -> Result<Option<String>, DatasetError> {
+    Ok(Source::open(path.as_ref())?.environment())
+}

@@ -1,0 +1,52 @@
+//! OGBench's npz files.
+
+use crate::DatasetError;
+use crate::npz_file::NpzFile;
+use crate::recording::{Recording, RowKind};
+
+/// Reads `observations`, `actions`, `rewards`, `terminals` and, if there, `masks`.
+///
+/// `terminals` mark the end of a trajectory, not of what can be gained: that is where `masks` are 0, and nowhere in a file
+/// without masks. As OGBench stores its data, the last state of a trajectory is a row of its own, so that a row at a
+/// terminal starts no transition. As its loader returns the data, either each row is a transition with its own
+/// `next_observations`, or `valids` say which rows start one.
+pub(super) fn read(file: &mut NpzFile) -> Result<Recording, DatasetError> {
+    let observations = file.numbers("observations")?;
+    let (rows, observation_dim) = (observations.rows(), observations.width);
+    let actions = file.numbers("actions")?.of_rows(rows).map_err(|problem| file.error(problem))?;
+    let terminals = file.flags("terminals", rows)?;
+    let masks = match file.has("masks") {
+        true => file.flags("masks", rows)?,
+        false => vec![true; rows],
+    };
+    let next_observations = match file.has("next_observations") {
+        true => Some(file.table("next_observations", rows, observation_dim)?),
+        false => None,
+    };
+    let last_states: Vec<bool> = match (&next_observations, file.has("valids")) {
+        (Some(_), _) => vec![false; rows],
+        (None, true) => file.flags("valids", rows)?.into_iter().map(|valid| !valid).collect(),
+        // A trajectory that the end of the file cuts off ends with a last state, too.
+        (None, false) => (0..rows).map(|row| terminals[row] || row + 1 == rows).collect(),
+    };
+    let is_last = |row: usize| match &next_observations {
+        Some(_) => terminals[row],
+        None => !last_states[row] && terminals.get(row + 1) == Some(&true) && last_states[row + 1],
+    };
+    let ends: Vec<bool> = (0..rows).map(is_last).collect();
+    let kind = |&last: &bool| if last { RowKind::LastState } else { RowKind::Transition };
+    Ok(Recording {
+        observation_dim,
+        action_dim: actions.width,
+        observations: observations.values,
+        actions: actions.values,
+        rewards: file.table("rewards", rows, 1)?,
+        kinds: last_states.iter().map(kind).collect(),
+        terminals: masks.iter().zip(&last_states).map(|(&mask, &last)| !mask && !last).collect(),
+        timeouts: (0..rows).map(|row| ends[row] && masks[row]).collect(),
+        ends,
+        next_observations,
+        goal: false,
+        parts: Vec::new(),
+    })
+}

@@ -1,0 +1,45 @@
+//! The layout for people's own data: HDF5, one row a transition.
+
+use crate::DatasetError;
+use crate::hdf5_file::Hdf5File;
+use crate::recording::{Recording, RowKind, differ};
+
+/// The value of the root attribute `layout` that tells this layout from D4RL's.
+pub(super) const LAYOUT: &str = "transitions";
+
+/// Reads `observations`, `actions`, `rewards`, `next_observations`, `terminals` and, if there, `timeouts`. Every row is a
+/// transition, with the next observation that the file stores. Terminals and timeouts end an episode; without timeouts,
+/// so does a row whose next observation is not the following row's observation.
+pub(super) fn read(file: &Hdf5File) -> Result<Recording, DatasetError> {
+    let observations = file.numbers("observations")?;
+    let (rows, observation_dim) = (observations.rows(), observations.width);
+    let actions = file.numbers("actions")?.of_rows(rows).map_err(|problem| file.error(problem))?;
+    let next_observations = file.table("next_observations", rows, observation_dim)?;
+    let mut recording = Recording {
+        observation_dim,
+        action_dim: actions.width,
+        observations: observations.values,
+        actions: actions.values,
+        rewards: file.table("rewards", rows, 1)?,
+        kinds: vec![RowKind::Transition; rows],
+        terminals: file.flags("terminals", rows)?,
+        timeouts: match file.has("timeouts") {
+            true => file.flags("timeouts", rows)?,
+            false => vec![false; rows],
+        },
+        ..Recording::default()
+    };
+    recording.ends = match file.has("timeouts") {
+        true => (0..rows).map(|row| recording.terminals[row] || recording.timeouts[row]).collect(),
+        false => (0..rows).map(|row| recording.terminals[row] || jumps(&recording, &next_observations, row)).collect(),
+    };
+    recording.next_observations = Some(next_observations);
+    Ok(recording)
+}
+
+/// Whether a row's stored next observation is not where the following row starts.
+pub(super) fn jumps(recording: &Recording, next_observations: &[f32], row: usize) -> bool {
+    let width = recording.observation_dim;
+    let next = &next_observations[row * width..(row + 1) * width];
+    row + 1 < recording.rows() && differ(next, recording.observation(row + 1))
+}

@@ -1,0 +1,119 @@
+//! Arrays of an npz archive: a zip file of NumPy's `.npy` files, stored or deflated.
+
+use std::fs::File;
+use std::io::{self, BufReader};
+use std::path::{Path, PathBuf};
+
+use npyz::{Deserialize, NpyFile, Order, TypeChar};
+use zip::ZipArchive;
+use zip::result::ZipError;
+
+use crate::array::Array;
+use crate::{DatasetError, Problem};
+
+/// The first bytes of a zip file.
+pub(crate) const SIGNATURE: &[u8] = b"PK";
+
+/// An open npz archive.
+pub(crate) struct NpzFile {
+    path: PathBuf,
+    archive: ZipArchive<BufReader<File>>,
+}
+
+impl NpzFile {
+    pub(crate) fn open(path: &Path) -> Result<Self, DatasetError> {
+        let file = File::open(path).map_err(|source| DatasetError::new(path, Problem::Io(source)))?;
+        let archive = ZipArchive::new(BufReader::new(file))
+            .map_err(|source| DatasetError::new(path, Problem::DamagedNpz(source)))?;
+        Ok(Self { path: path.into(), archive })
+    }
+
+    pub(crate) fn has(&self, array: &str) -> bool {
+        self.archive.index_for_name(&entry(array)).is_some()
+    }
+
+    /// An array of numbers, converted to float32, that may be NaN.
+    pub(crate) fn numbers(&mut self, array: &str) -> Result<Array<f32>, DatasetError> {
+        self.read(array).map_err(|problem| self.error(problem))
+    }
+
+    /// An array of `rows × width` numbers.
+    pub(crate) fn table(&mut self, array: &str, rows: usize, width: usize) -> Result<Vec<f32>, DatasetError> {
+        let table = self.numbers(array)?.sized(rows, width);
+        table.map_err(|problem| self.error(problem))
+    }
+
+    /// An array of one flag a row, which may be stored as numbers.
+    pub(crate) fn flags(&mut self, array: &str, rows: usize) -> Result<Vec<bool>, DatasetError> {
+        let flags = self.numbers(array)?.into_flags(rows);
+        flags.map_err(|problem| self.error(problem))
+    }
+
+    pub(crate) fn error(&self, problem: Problem) -> DatasetError {
+        DatasetError::new(&self.path, problem)
+    }
+
+    fn read(&mut self, array: &str) -> Result<Array<f32>, Problem> {
+        let name = array.to_owned();
+        let entry = self.archive.by_name(&entry(array)).map_err(|error| match error {
+            ZipError::FileNotFound => Problem::Missing { array: name.clone() },
+            other => Problem::DamagedNpz(other),
+        })?;
+        let bytes = entry.size();
+        let unreadable = |source| Problem::UnreadableNpz { array: name.clone(), source };
+        let mut reader = BufReader::new(entry);
+        let file = NpyFile::new(&mut reader).map_err(unreadable)?;
+
+        let shape: Vec<usize> = file.shape().iter().map(|&axis| axis as usize).collect();
+        let claimed = shape.iter().fold(1u64, |product, &axis| product.saturating_mul(axis as u64));
+        if claimed > bytes || shape.first().is_some_and(|&rows| rows > u32::MAX as usize) {
+            return Err(Problem::Oversized { array: name, found: shape, bytes });
+        }
+        let order = file.order();
+        let values = floats(file, &name)?;
+        // Only at its end does the archive compare the entry with its checksum.
+        io::copy(&mut reader, &mut io::sink()).map_err(unreadable)?;
+        Array::new(array, &shape, if order == Order::Fortran { by_rows(&shape, &values) } else { values })
+    }
+}
+
+fn entry(array: &str) -> String {
+    format!("{array}.npy")
+}
+
+fn floats<R: io::Read>(file: NpyFile<R>, array: &str) -> Result<Vec<f32>, Problem> {
+    let npyz::DType::Plain(element) = file.dtype() else {
+        return Err(wrong_type(array, file.dtype().descr()));
+    };
+    match (element.type_char(), element.size_field()) {
+        (TypeChar::Float, 4) => convert::<f32, R>(file, array, |value| value),
+        (TypeChar::Float, 8) => convert::<f64, R>(file, array, |value| value as f32),
+        (TypeChar::Bool, 1) => convert::<bool, R>(file, array, |value| f32::from(u8::from(value))),
+        (TypeChar::Int, 1) => convert::<i8, R>(file, array, f32::from),
+        (TypeChar::Int, 4) => convert::<i32, R>(file, array, |value| value as f32),
+        (TypeChar::Int, 8) => convert::<i64, R>(file, array, |value| value as f32),
+        (TypeChar::Uint, 1) => convert::<u8, R>(file, array, f32::from),
+        _ => Err(wrong_type(array, element.to_string())),
+    }
+}
+
+fn convert<T: Deserialize, R: io::Read>(
+    file: NpyFile<R>,
+    array: &str,
+    to_f32: impl Fn(T) -> f32,
+) -> Result<Vec<f32>, Problem> {
+    let found = file.dtype().descr();
+    let values = file.data::<T>().map_err(|_| wrong_type(array, found))?;
+    let values: io::Result<Vec<f32>> = values.map(|value| value.map(&to_f32)).collect();
+    values.map_err(|source| Problem::UnreadableNpz { array: array.to_owned(), source })
+}
+
+fn wrong_type(array: &str, found: String) -> Problem {
+    Problem::Type { array: array.to_owned(), found, expected: "numbers or booleans" }
+}
+
+/// Row by row what is stored column by column.
+fn by_rows(shape: &[usize], values: &[f32]) -> Vec<f32> {
+    let rows = shape.first().copied().unwrap_or(0);
+    (0..rows).flat_map(|row| values.iter().skip(row).step_by(rows.max(1)).copied()).collect()
+}

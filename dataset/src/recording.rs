@@ -1,0 +1,159 @@
+//! What every format is read into: rows as they were recorded, not judged yet.
+
+use crate::statistics::{Episode, returns};
+
+/// Two rows whose observations differ by more than this do not follow one another.
+const SAME_OBSERVATION: f64 = 1e-6;
+
+/// What a row is good for.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(crate) enum RowKind {
+    /// A step to learn from.
+    Transition,
+    /// A step that the format's rules drop: it counts towards its episode and nothing else.
+    Dropped,
+    /// No step, but the last state of an episode, to which the row before leads.
+    LastState,
+}
+
+/// Rows of a dataset, N of them. What follows the last end of an episode is an episode, too, cut off by the file's end.
+#[derive(Default)]
+pub(crate) struct Recording {
+    /// Numbers in an observation, o.
+    pub observation_dim: usize,
+    /// Numbers in an action, a.
+    pub action_dim: usize,
+    /// N × o.
+    pub observations: Vec<f32>,
+    /// N × a.
+    pub actions: Vec<f32>,
+    /// N.
+    pub rewards: Vec<f32>,
+    /// N × o, where the format stores them apart. Else the following row's observation is the next one.
+    pub next_observations: Option<Vec<f32>>,
+    /// N.
+    pub kinds: Vec<RowKind>,
+    /// Whether nothing is to be gained after a row, so that its mask is 0; N.
+    pub terminals: Vec<bool>,
+    /// Whether the episode was cut off after a row; N.
+    pub timeouts: Vec<bool>,
+    /// Whether a row is the last step of its episode; N.
+    pub ends: Vec<bool>,
+    /// Whether the task is to reach a goal, after which the recording goes on.
+    pub goal: bool,
+    /// Where the file has several arrays of each kind: the first row of each, and the path of the group it is in.
+    pub parts: Vec<(usize, String)>,
+}
+
+impl Recording {
+    pub(crate) fn rows(&self) -> usize {
+        self.rewards.len()
+    }
+
+    pub(crate) fn observation(&self, row: usize) -> &[f32] {
+        &self.observations[row * self.observation_dim..(row + 1) * self.observation_dim]
+    }
+
+    /// Numbers of the rows to learn from, in order.
+    pub(crate) fn transitions(&self) -> impl Iterator<Item = u32> {
+        let kinds = self.kinds.iter().zip(0..);
+        kinds.filter(|(kind, _)| **kind == RowKind::Transition).map(|(_, row)| row)
+    }
+
+    /// All episodes, every recorded step included.
+    pub(crate) fn episodes(&self) -> Vec<Episode> {
+        let mut episodes = Vec::new();
+        let mut open = Episode::default();
+        for row in (0..self.rows()).filter(|&row| self.kinds[row] != RowKind::LastState) {
+            open.push(f64::from(self.rewards[row]), self.goal);
+            if self.ends[row] {
+                episodes.push(std::mem::take(&mut open));
+            }
+        }
+        episodes.extend((open.length > 0).then_some(open));
+        episodes
+    }
+
+    /// Returns of the trajectories that the locomotion rule speaks of: runs of rows to learn from, each up to a terminal,
+    /// the end of an episode, or a row that does not lead to the next one.
+    pub(crate) fn trajectory_returns(&self) -> Vec<f64> {
+        let following = self.transitions().skip(1).map(Some).chain([None]);
+        let rows = self.transitions().zip(following).map(|(row, following)| {
+            let row = row as usize;
+            let ends = self.terminals[row]
+                || self.ends[row]
+                || following.is_none_or(|following| !self.continues(row, following as usize));
+            (self.rewards[row], ends)
+        });
+        returns(rows)
+    }
+
+    /// Whether `following`, the next row to learn from after `row`, goes on where that one led to.
+    fn continues(&self, row: usize, following: usize) -> bool {
+        following == row + 1 || !differ(self.observation(following), self.observation(row + 1))
+    }
+
+    /// The name of the array that holds row `row` of a column, and the row's number there.
+    pub(crate) fn place(&self, column: &str, row: usize) -> (String, usize) {
+        match self.parts.iter().rev().find(|(first, _)| *first <= row) {
+            None => (column.to_owned(), row),
+            Some((first, group)) => (format!("{group}/{column}"), row - first),
+        }
+    }
+}
+
+/// Whether two observations are more than rounding apart.
+pub(crate) fn differ(a: &[f32], b: &[f32]) -> bool {
+    a.iter().zip(b).map(|(a, b)| f64::from(a - b).powi(2)).sum::<f64>().sqrt() > SAME_OBSERVATION
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use RowKind::{Dropped, LastState, Transition};
+
+    fn recording(kinds: &[RowKind]) -> Recording {
+        let n = kinds.len();
+        Recording {
+            observation_dim: 1,
+            action_dim: 1,
+            observations: (0..n).map(|i| i as f32).collect(),
+            actions: vec![0.0; n],
+            rewards: (0..n).map(|i| (1 << i) as f32).collect(),
+            kinds: kinds.to_vec(),
+            terminals: vec![false; n],
+            timeouts: vec![false; n],
+            ends: vec![false; n],
+            ..Recording::default()
+        }
+    }
+
+    #[test]
+    fn a_trajectory_ends_at_terminals_at_jumps_and_at_the_last_row() {
+        let kinds = [Transition, Transition, Transition, Dropped, Transition, Dropped, Transition, Dropped];
+        let mut recording = recording(&kinds);
+        // After 2 comes 4, which is not where 3 is; after 4 comes 6, which equals where 4 led to.
+        recording.observations = vec![0.0, 1.0, 2.0, 3.0, 9.0, 5.0, 5.0, 6.0];
+        recording.terminals[1] = true;
+        assert_eq!(recording.trajectory_returns(), [1.0 + 2.0, 4.0, 16.0 + 64.0]);
+    }
+
+    #[test]
+    fn an_episode_counts_dropped_steps_but_not_last_states() {
+        let mut recording = recording(&[Transition, Dropped, Transition, Transition, LastState, Transition, Dropped]);
+        recording.ends[1] = true;
+        recording.ends[3] = true;
+        let episodes = recording.episodes();
+        let figures: Vec<_> = episodes.iter().map(|episode| (episode.length, episode.sum)).collect();
+        assert_eq!(figures, [(2, 3.0), (2, 12.0), (2, 96.0)]);
+        assert_eq!(recording.trajectory_returns(), [1.0, 12.0, 32.0]);
+    }
+
+    #[test]
+    fn rows_are_found_again_in_their_part() {
+        let mut recording = recording(&[Transition; 6]);
+        assert_eq!(recording.place("rewards", 4), ("rewards".to_owned(), 4));
+        recording.parts = vec![(0, "episode_0".to_owned()), (3, "episode_1".to_owned())];
+        assert_eq!(recording.place("rewards", 4), ("episode_1/rewards".to_owned(), 1));
+    }
+}

@@ -1,0 +1,96 @@
+//! The crate against files: its own, h5py's, Minari's, OGBench's, recorded ones where they are at hand, and broken ones.
+#![allow(clippy::unwrap_used, clippy::expect_used, clippy::print_stderr)]
+
+use std::path::{Path, PathBuf};
+use std::process::Command;
+
+use quad_dataset::{Batch, EnvironmentSpec, ReadOptions, RewardRule, Transitions, environment};
+
+mod broken;
+mod d4rl;
+mod minari;
+mod ogbench;
+mod own;
+mod round_trip;
+mod speed;
+
+fn hopper() -> &'static EnvironmentSpec {
+    environment::find("hopper").unwrap()
+}
+
+/// A folder of recordings that may be beside the repository.
+fn shared(path: &str) -> Option<PathBuf> {
+    let path = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../shared").join(path);
+    let exists = path.exists();
+    if !exists {
+        eprintln!("skipped, because {} is missing", path.display());
+    }
+    exists.then_some(path)
+}
+
+fn read(path: &Path, environment: Option<&'static EnvironmentSpec>, reward: RewardRule) -> Transitions {
+    Transitions::read(path, &ReadOptions { environment, reward }).unwrap()
+}
+
+fn all(transitions: &Transitions) -> Batch {
+    let indices: Vec<u32> = (0..transitions.len() as u32).collect();
+    let mut batch = Batch::default();
+    transitions.gather(&indices, &mut batch);
+    batch
+}
+
+/// Compares every transition of a source, and its statistics, with a reference file of `peers.py`.
+fn compare(path: &Path, environment: Option<&'static EnvironmentSpec>, reference: &Path) {
+    let reference = hdf5::File::open(reference).unwrap();
+    let array = |name: &str| reference.dataset(name).unwrap().read_raw::<f32>().unwrap();
+
+    let transitions = read(path, environment, RewardRule::Locomotion);
+    let batch = all(&transitions);
+    assert_eq!(batch.size, transitions.len());
+    assert_eq!(batch.observations, array("observations"));
+    assert_eq!(batch.actions, array("actions"));
+    assert_eq!(batch.next_observations, array("next_observations"));
+    assert_eq!(batch.masks, array("masks"));
+    assert_close("rewards", &batch.rewards, &array("rewards"));
+    assert_eq!(all(&read(path, environment, RewardRule::AsIs)).rewards, array("raw_rewards"));
+
+    let ours = transitions.statistics();
+    let figures = [ours.transitions as f64, ours.episodes as f64, ours.return_mean, ours.return_min, ours.return_max];
+    let theirs = reference.dataset("statistics").unwrap().read_raw::<f64>().unwrap();
+    for (ours, theirs) in figures.iter().zip(&theirs) {
+        assert!((ours - theirs).abs() <= 1e-9 * theirs.abs(), "{figures:?} against {theirs:?}");
+    }
+    assert_eq!(ours.score_mean, environment.map(|environment| environment.normalised_score(ours.return_mean)));
+}
+
+fn assert_close(name: &str, ours: &[f32], theirs: &[f32]) {
+    assert_eq!(ours.len(), theirs.len(), "{name}");
+    for (i, (ours, theirs)) in ours.iter().zip(theirs).enumerate() {
+        assert!((ours - theirs).abs() <= 1e-6 * theirs.abs().max(1e-3), "{name} {i}: {ours} against {theirs}");
+    }
+}
+
+/// Runs `peers.py`; false where there is no Python to run it, unless QUAD_REQUIRE_PEERS=1 asks for one.
+fn peers(arguments: &[&str]) -> bool {
+    peers_in(Path::new("."), arguments)
+}
+
+/// As [`peers`], in another folder, which is also Minari's root.
+fn peers_in(folder: &Path, arguments: &[&str]) -> bool {
+    let here = Path::new(env!("CARGO_MANIFEST_DIR"));
+    let python = match std::env::var_os("QUAD_PYTHON") {
+        Some(python) => PathBuf::from(python),
+        None => here.join("../.deps/venv/bin/python"),
+    };
+    if !python.exists() {
+        let required = std::env::var("QUAD_REQUIRE_PEERS").is_ok_and(|value| value == "1");
+        assert!(!required, "{} is missing; deploy/setup.sh --tests makes it", python.display());
+        eprintln!("skipped, because {} is missing", python.display());
+        return false;
+    }
+    let mut command = Command::new(python);
+    command.arg(here.join("tests/formats/peers.py")).args(arguments);
+    let output = command.current_dir(folder).env("MINARI_DATASETS_PATH", folder).output().unwrap();
+    assert!(output.status.success(), "peers.py {arguments:?}:\n{}", String::from_utf8_lossy(&output.stderr));
+    true
+}

@@ -1,0 +1,96 @@
+//! Datasets that Minari wrote, against Minari's own reader.
+
+use std::path::{Path, PathBuf};
+
+use quad_dataset::{
+    DatasetError, EnvironmentSpec, ReadOptions, RewardRule, Transitions, environment, recorded_environment,
+};
+use tempfile::{TempDir, tempdir};
+
+use crate::{compare, hopper, peers_in, shared};
+
+/// A folder that Minari takes for its own, with one dataset in it.
+struct Root(TempDir);
+
+impl Root {
+    fn new(kind: &str) -> Option<Self> {
+        let this = Self(tempdir().unwrap());
+        peers_in(this.0.path(), &["write-minari", kind, "made/up-v0"]).then_some(this)
+    }
+
+    fn dataset(&self) -> PathBuf {
+        self.0.path().join("made/up-v0")
+    }
+
+    fn metadata(&self) -> PathBuf {
+        self.dataset().join("data/metadata.json")
+    }
+
+    fn error(&self) -> DatasetError {
+        let options = ReadOptions { environment: Some(hopper()), reward: RewardRule::AsIs };
+        Transitions::read(self.dataset(), &options).err().unwrap()
+    }
+}
+
+fn compare_with_minari(root: &Path, id: &str, kind: &str, environment: Option<&'static EnvironmentSpec>) {
+    let folder = tempdir().unwrap();
+    let out = folder.path().join("reference.hdf5");
+    let arguments = ["minari-reference", kind, id, out.to_str().unwrap()];
+    if peers_in(root, &arguments) {
+        let dataset = root.join(id);
+        for path in [dataset.clone(), dataset.join("data"), dataset.join("data/main_data.hdf5")] {
+            compare(&path, environment, &out);
+        }
+    }
+}
+
+#[test]
+fn observations_in_an_array() {
+    let Some(root) = Root::new("hopper") else { return };
+    assert_eq!(recorded_environment(root.dataset()).unwrap().as_deref(), Some("hopper"));
+    compare_with_minari(root.0.path(), "made/up-v0", "hopper", Some(hopper()));
+}
+
+#[test]
+fn antmaze_has_a_dict_whose_goal_is_left_out() {
+    let Some(root) = Root::new("antmaze") else { return };
+    let umaze = environment::find("antmaze-umaze").unwrap();
+    compare_with_minari(root.0.path(), "made/up-v0", "antmaze", Some(umaze));
+    let text = root.error().to_string();
+    assert!(text.ends_with("recorded in `antmaze-umaze`, which is not `hopper`"), "{text}");
+}
+
+#[test]
+fn another_dict_is_flattened_in_alphabetical_order() {
+    let Some(root) = Root::new("own") else { return };
+    assert_eq!(recorded_environment(root.dataset()).unwrap().as_deref(), Some("Robot-v0"));
+    compare_with_minari(root.0.path(), "made/up-v0", "own", None);
+}
+
+#[test]
+fn a_dataset_that_minari_wrote_elsewhere() {
+    if let Some(root) = shared("fixtures/minari_root") {
+        compare_with_minari(&root, "mujoco/hopper/fixture-v0", "hopper", Some(hopper()));
+    }
+}
+
+#[test]
+fn damaged_metadata_and_missing_episodes() {
+    let Some(root) = Root::new("hopper") else { return };
+    let whole = std::fs::read_to_string(root.metadata()).unwrap();
+    std::fs::write(root.metadata(), &whole[..whole.len() / 2]).unwrap();
+    assert_eq!(root.error().to_string(), format!("{}: cannot be understood", root.metadata().display()));
+
+    std::fs::write(root.metadata(), whole).unwrap();
+    let data = root.dataset().join("data/main_data.hdf5");
+    hdf5::File::open_rw(&data).unwrap().unlink("episode_3").unwrap();
+    let text = root.error().to_string();
+    assert!(text.ends_with(": 3 episodes, but metadata.json says 4"), "{text}");
+}
+
+#[test]
+fn a_folder_of_something_else() {
+    let folder = tempdir().unwrap();
+    let error = recorded_environment(folder.path()).unwrap_err();
+    assert!(error.to_string().contains("a folder without main_data.hdf5"), "{error}");
+}

@@ -1,0 +1,53 @@
+//! Files of OGBench's layout, against OGBench's own reader.
+
+use std::path::{Path, PathBuf};
+
+use quad_dataset::{DatasetError, ReadOptions, RewardRule, Transitions};
+use tempfile::{TempDir, tempdir};
+
+use crate::{compare, hopper, peers};
+
+fn written(variant: &str) -> Option<(TempDir, PathBuf)> {
+    let folder = tempdir().unwrap();
+    let path = folder.path().join("made-up-singletask-v0.npz");
+    peers(&["write-ogbench", variant, path.to_str().unwrap()]).then_some((folder, path))
+}
+
+fn error(path: &Path) -> DatasetError {
+    let options = ReadOptions { environment: Some(hopper()), reward: RewardRule::AsIs };
+    Transitions::read(path, &options).err().unwrap()
+}
+
+#[test]
+fn whatever_way_it_is_stored() {
+    let Some((folder, path)) = written("raw") else { return };
+    let out = folder.path().join("reference.hdf5");
+    assert!(peers(&["ogbench-reference", path.to_str().unwrap(), out.to_str().unwrap()]));
+    compare(&path, Some(hopper()), &out);
+    for variant in ["fortran", "regular", "compact"] {
+        let (_folder, path) = written(variant).unwrap();
+        compare(&path, Some(hopper()), &out);
+    }
+}
+
+#[test]
+fn without_rewards_there_is_nothing_to_learn() {
+    let Some((_folder, path)) = written("goals") else { return };
+    let error = error(&path);
+    assert!(error.to_string().ends_with("array `rewards` is missing"), "{error}");
+    assert!(error.hint().contains("make_env_and_datasets"), "{}", error.hint());
+}
+
+#[test]
+fn cut_short_and_damaged_inside() {
+    let Some((_folder, path)) = written("raw") else { return };
+    let whole = std::fs::read(&path).unwrap();
+    for length in [4, whole.len() / 2, whole.len() - 1] {
+        std::fs::write(&path, &whole[..length]).unwrap();
+        assert!(error(&path).to_string().ends_with("a damaged or incomplete npz archive"), "{length} bytes");
+    }
+    let mut damaged = whole;
+    damaged[300..340].fill(7);
+    std::fs::write(&path, damaged).unwrap();
+    assert!(error(&path).to_string().ends_with("array `observations` cannot be read"), "{}", error(&path));
+}
