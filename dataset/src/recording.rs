@@ -93,6 +93,12 @@ impl Recording {
         following == row + 1 || !differ(self.observation(following), self.observation(row + 1))
     }
 
+    /// Whether a row's stored next observation is not where the following row starts.
+    pub(crate) fn jumps(&self, next_observations: &[f32], row: usize) -> bool {
+        let next = &next_observations[row * self.observation_dim..(row + 1) * self.observation_dim];
+        row + 1 < self.rows() && differ(next, self.observation(row + 1))
+    }
+
     /// The name of the array that holds row `row` of a column, and the row's number there.
     pub(crate) fn place(&self, column: &str, row: usize) -> (String, usize) {
         match self.parts.iter().rev().find(|(first, _)| *first <= row) {
@@ -103,7 +109,7 @@ impl Recording {
 }
 
 /// Whether two observations are more than rounding apart.
-pub(crate) fn differ(a: &[f32], b: &[f32]) -> bool {
+fn differ(a: &[f32], b: &[f32]) -> bool {
     a.iter().zip(b).map(|(a, b)| f64::from(a - b).powi(2)).sum::<f64>().sqrt() > SAME_OBSERVATION
 }
 

@@ -59,6 +59,16 @@ impl Source {
         }
     }
 
+    /// What people call the format.
+    pub(crate) fn format(&self) -> &'static str {
+        match self {
+            Self::D4rl(_) => "D4RL",
+            Self::Own(_) => "transitions",
+            Self::Minari(..) => "Minari",
+            Self::OgBench(_) => "OGBench",
+        }
+    }
+
     /// The environment that it says it was recorded in.
     pub(crate) fn environment(&self) -> Option<String> {
         match self {
@@ -75,6 +85,21 @@ impl Source {
         match simulation == Ok(asked.simulation()) {
             true => Ok(()),
             false => Err(Problem::OtherEnvironment { claimed, expected: asked.name.clone() }),
+        }
+    }
+
+    /// Whether a D4RL file leaves it open where episodes are cut off.
+    pub(crate) fn lacks_timeouts(&self) -> bool {
+        matches!(self, Self::D4rl(file) if !file.has("timeouts"))
+    }
+
+    /// The next observations that a D4RL file stores although the rules take the following row's.
+    pub(crate) fn unused_next_observations(&self, recording: &Recording) -> Result<Option<Vec<f32>>, DatasetError> {
+        match self {
+            Self::D4rl(file) if file.has("next_observations") => {
+                file.table("next_observations", recording.rows(), recording.observation_dim).map(Some)
+            }
+            _ => Ok(None),
         }
     }
 

@@ -2,7 +2,7 @@
 
 use crate::DatasetError;
 use crate::hdf5_file::Hdf5File;
-use crate::recording::{Recording, RowKind, differ};
+use crate::recording::{Recording, RowKind};
 
 /// The value of the root attribute `layout` that tells this layout from D4RL's.
 pub(super) const LAYOUT: &str = "transitions";
@@ -31,15 +31,8 @@ pub(super) fn read(file: &Hdf5File) -> Result<Recording, DatasetError> {
     };
     recording.ends = match file.has("timeouts") {
         true => (0..rows).map(|row| recording.terminals[row] || recording.timeouts[row]).collect(),
-        false => (0..rows).map(|row| recording.terminals[row] || jumps(&recording, &next_observations, row)).collect(),
+        false => (0..rows).map(|row| recording.terminals[row] || recording.jumps(&next_observations, row)).collect(),
     };
     recording.next_observations = Some(next_observations);
     Ok(recording)
-}
-
-/// Whether a row's stored next observation is not where the following row starts.
-pub(super) fn jumps(recording: &Recording, next_observations: &[f32], row: usize) -> bool {
-    let width = recording.observation_dim;
-    let next = &next_observations[row * width..(row + 1) * width];
-    row + 1 < recording.rows() && differ(next, recording.observation(row + 1))
 }

@@ -8,6 +8,7 @@ use quad_dataset::{Batch, EnvironmentSpec, ReadOptions, RewardRule, Transitions,
 
 mod broken;
 mod d4rl;
+mod inspect;
 mod minari;
 mod ogbench;
 mod own;

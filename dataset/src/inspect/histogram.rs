@@ -1,0 +1,81 @@
+//! How often numbers are how large, as a picture in plain characters.
+
+use std::fmt;
+
+use serde::Serialize;
+
+/// Bars at most.
+const BINS: usize = 12;
+
+/// Characters of the longest bar.
+const WIDTH: usize = 40;
+
+/// Counts of numbers in bins of equal width. A number on an inner edge is in the bin above it.
+#[derive(Debug, PartialEq, Serialize)]
+pub struct Histogram {
+    /// Lower edge of the first bin.
+    pub from: f64,
+    /// Upper edge of the last bin.
+    pub to: f64,
+    /// Numbers in each bin; a single bin where all of them are equal, none where there are no numbers.
+    pub counts: Vec<usize>,
+}
+
+impl Histogram {
+    pub(super) fn of(values: &[f64]) -> Self {
+        let from = values.iter().copied().fold(f64::NAN, f64::min);
+        let to = values.iter().copied().fold(f64::NAN, f64::max);
+        let bins = match (values.len(), from == to) {
+            (0, _) => 0,
+            (_, true) => 1,
+            (_, false) => BINS,
+        };
+        let mut counts = vec![0; bins];
+        for value in values {
+            let bin = ((value - from) / (to - from) * bins as f64) as usize; // NaN becomes 0
+            counts[bin.min(bins - 1)] += 1;
+        }
+        Self { from, to, counts }
+    }
+}
+
+impl fmt::Display for Histogram {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let bins = self.counts.len();
+        let most = self.counts.iter().copied().max().unwrap_or(1);
+        for (bin, &count) in self.counts.iter().enumerate() {
+            let edge = |bin: usize| self.from + (self.to - self.from) * bin as f64 / bins as f64;
+            // Whatever is there shows.
+            let bar = "#".repeat((count * WIDTH).div_ceil(most));
+            writeln!(f, "  {:>10.2} to {:>10.2}  {bar:<WIDTH$}  {count}", edge(bin), edge(bin + 1))?;
+        }
+        Ok(())
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn every_number_is_in_one_bin() {
+        let values: Vec<f64> = (0..=24).map(f64::from).collect();
+        let histogram = Histogram::of(&values);
+        assert_eq!((histogram.from, histogram.to), (0.0, 24.0));
+        assert_eq!(histogram.counts, [2, 2, 2, 2, 2, 2, 2, 2, 2, 2, 2, 3]);
+        assert_eq!(Histogram::of(&[5.0; 3]).counts, [3]);
+        assert!(Histogram::of(&[]).counts.is_empty());
+    }
+
+    #[test]
+    fn the_longest_bar_is_the_most_frequent() {
+        let mut values = vec![0.0; 80];
+        values.extend([12.0, 11.5]);
+        let text = Histogram::of(&values).to_string();
+        let lines: Vec<&str> = text.lines().collect();
+        assert_eq!(lines.len(), 12);
+        assert_eq!(lines[0], format!("        0.00 to       1.00  {}  80", "#".repeat(40)));
+        assert_eq!(lines[11], format!("       11.00 to      12.00  {:<40}  2", "#"));
+        assert_eq!(lines[1].matches('#').count(), 0);
+    }
+}
