@@ -35,7 +35,7 @@ pub mod writer;
 pub use catalogue::NamedDataset;
 pub use environment::{EnvironmentSpec, Goal, UnknownEnvironment};
 pub use error::{DatasetError, Problem};
-pub use formats::{minari_folder, recorded_environment};
+pub use formats::{data_file, minari_folder, recorded_environment};
 pub use inspect::{Inspection, inspect};
 pub use recorded::{RecordedRows, Row, environments_of_its_sizes};
 pub use reward::RewardRule;

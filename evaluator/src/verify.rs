@@ -3,7 +3,9 @@
 use std::path::{Path, PathBuf};
 
 use quad_dataset::environment::{UnknownEnvironment, find};
-use quad_dataset::{DatasetError, EnvironmentSpec, RecordedRows, Row, environments_of_its_sizes, recorded_environment};
+use quad_dataset::{
+    DatasetError, EnvironmentSpec, Problem, RecordedRows, Row, environments_of_its_sizes, recorded_environment,
+};
 use rayon::prelude::*;
 use serde::Serialize;
 use thiserror::Error;
@@ -89,10 +91,11 @@ pub enum VerifyError {
 
 impl VerifyError {
     /// What to do about it.
-    pub fn hint(&self) -> &'static str {
+    pub fn hint(&self) -> String {
         match self {
-            Self::Unknown { .. } | Self::Unnamed { .. } => "--env NAME says where it was recorded",
-            _ => "a file that can be replayed is what `evaluator collect --env hopper --out FILE` writes",
+            Self::Dataset(error) if !matches!(error.problem, Problem::Missing { .. }) => error.hint(),
+            Self::Unknown { .. } | Self::Unnamed { .. } => "--env NAME says where it was recorded".to_owned(),
+            _ => "a file that can be replayed is what `evaluator collect --env hopper --out FILE` writes".to_owned(),
         }
     }
 }

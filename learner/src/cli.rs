@@ -4,6 +4,7 @@ use std::net::SocketAddr;
 use std::path::PathBuf;
 
 use clap::{Args, Parser, Subcommand};
+use quad_dataset::{EnvironmentSpec, environment};
 use quad_policy::Precision;
 use quad_service::parse_endpoint;
 use toml::{Table, Value};
@@ -164,6 +165,22 @@ pub enum DatasetsCommand {
         /// A name of `learner datasets list`
         name: String,
     },
+    /// Print what is in a dataset and what is wrong with it, before a day of training is spent on it
+    Inspect(InspectArgs),
+}
+
+/// Arguments of `learner datasets inspect`.
+#[derive(Debug, Args)]
+pub struct InspectArgs {
+    /// A file or folder of any format, a name of `learner datasets list`, or minari:ID
+    #[arg(value_name = "FILE|NAME")]
+    pub dataset: String,
+    /// Environment that it is for: sizes, time limit and scores are that one's [default: what the dataset says it is from]
+    #[arg(long, value_name = "NAME", value_parser = environment::find)]
+    pub env: Option<&'static EnvironmentSpec>,
+    /// Print JSON instead of a page
+    #[arg(long)]
+    pub json: bool,
 }
 
 /// Arguments of `learner report`.

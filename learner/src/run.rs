@@ -5,7 +5,7 @@ use std::path::{Path, PathBuf};
 use std::time::{SystemTime, UNIX_EPOCH};
 
 use anyhow::{Context, anyhow};
-use quad_dataset::{DatasetError, ReadOptions, Transitions};
+use quad_dataset::{DatasetError, ReadOptions, Transitions, environment};
 use quad_policy::Precision;
 use quad_protocol::Name;
 use quad_service::{Endpoints, Hint};
@@ -13,7 +13,7 @@ use tokio::sync::mpsc;
 use toml::Table;
 use tracing::{debug, info, warn};
 
-use crate::cli::{Cli, Command, DatasetsCommand, PresetsArgs, ReportArgs, TrainArgs};
+use crate::cli::{Cli, Command, DatasetsCommand, InspectArgs, PresetsArgs, ReportArgs, TrainArgs};
 use crate::conduct::{Conductor, Ending, open_network};
 use crate::config::{self, DatasetInfo, Experiment, RunConfig, RunInfo};
 use crate::datasets::{self, LocalDataset, Source};
@@ -77,6 +77,25 @@ fn datasets(command: &DatasetsCommand) -> anyhow::Result<()> {
             let dataset = Source::Named(datasets::source::named(name)?).obtain()?;
             print(&dataset.path.display().to_string())?;
         }
+        DatasetsCommand::Inspect(args) => inspect(args)?,
+    }
+    Ok(())
+}
+
+/// Problems are part of the result: only what cannot be read at all is an error.
+fn inspect(args: &InspectArgs) -> anyhow::Result<()> {
+    let source = Source::parse(&args.dataset)?;
+    let environment = args.env.or_else(|| environment::find(&source.entry()?.environment).ok());
+    let path = match source {
+        Source::Path(path) => path,
+        source => source.obtain()?.path,
+    };
+    let inspection = quad_dataset::inspect(&path, environment);
+    let hint = inspection.as_ref().err().map(DatasetError::hint).unwrap_or_default();
+    let inspection = inspection.hint(hint)?;
+    match args.json {
+        true => print(&serde_json::to_string_pretty(&inspection)?)?,
+        false => print(&inspection.to_string())?,
     }
     Ok(())
 }
@@ -104,10 +123,8 @@ fn train(args: &TrainArgs) -> anyhow::Result<()> {
     args.device.check(experiment.precision)?;
     let dataset = source.obtain().hint(record_hint(&experiment))?;
 
-    let options = ReadOptions {
-        environment: quad_dataset::environment::find(&experiment.environment).ok(),
-        reward: experiment.reward,
-    };
+    let options =
+        ReadOptions { environment: environment::find(&experiment.environment).ok(), reward: experiment.reward };
     let transitions = read_dataset(&dataset.path, &options)?;
     check_batch(&transitions, &experiment).hint("record more data, or ask for less with --set batch_size=N")?;
     let config = run_config(args, &name, experiment, dataset, &transitions)?;
@@ -160,7 +177,7 @@ async fn conduct(
          or join a router with --connect",
     )?;
     // From here on nothing outside can be wrong any more, so a refused start leaves no folder behind.
-    let run_dir = RunDir::create(path, config)?;
+    let run_dir = RunDir::create(path, config).hint("choose a folder that you may write to with --run-dir DIR")?;
     let (notify, notices) = mpsc::unbounded_channel();
     let threads = Threads::start(&run, config, transitions, &run_dir, &metrics, &notify)?;
     let display = Display::start(metrics.clone(), steps);

@@ -12,7 +12,8 @@ fn write_log(path: &std::path::Path) {
     let file = hdf5::File::create(path).unwrap();
     let layout: hdf5::types::VarLenUnicode = "transitions".parse().unwrap();
     file.new_attr::<hdf5::types::VarLenUnicode>().create("layout").unwrap().write_scalar(&layout).unwrap();
-    let observation = |shift: usize| Array2::from_shape_fn((rows, 5), |(i, j)| ((i + shift + 7 * j) as f64 / 9.0).sin());
+    let observation =
+        |shift: usize| Array2::from_shape_fn((rows, 5), |(i, j)| ((i + shift + 7 * j) as f64 / 9.0).sin());
     let actions = Array2::from_shape_fn((rows, 2), |(i, j)| ((i + 3 * j) as f64 / 5.0).cos());
     let rewards = Array1::from_shape_fn(rows, |i| (i % 50) as i64);
     let timeouts = Array1::from_shape_fn(rows, |i| u8::from(i % 50 == 49));

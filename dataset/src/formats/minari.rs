@@ -22,8 +22,8 @@ const EPISODE: &str = "episode_";
 /// `~/.minari/datasets`.
 pub fn minari_folder(id: &str) -> PathBuf {
     let root = match std::env::var_os("MINARI_DATASETS_PATH") {
-        Some(root) => PathBuf::from(root),
-        None => std::env::home_dir().unwrap_or_default().join(".minari/datasets"),
+        Some(root) if !root.is_empty() => PathBuf::from(root),
+        _ => std::env::home_dir().unwrap_or_default().join(".minari/datasets"),
     };
     root.join(id).join("data")
 }

@@ -7,7 +7,7 @@ mod own;
 
 use std::fs::File;
 use std::io::Read;
-use std::path::Path;
+use std::path::{Path, PathBuf};
 
 use crate::environment::{self, EnvironmentSpec};
 use crate::hdf5_file::{self, Hdf5File};
@@ -16,6 +16,15 @@ use crate::recording::Recording;
 use crate::{DatasetError, Problem};
 
 pub use minari::minari_folder;
+
+/// The file with a source's data: for a folder of Minari's the one that is in it, else the path itself.
+pub fn data_file(path: impl AsRef<Path>) -> Result<PathBuf, DatasetError> {
+    let path = path.as_ref();
+    match path.is_dir() {
+        true => minari::data_file(path).ok_or_else(|| DatasetError::new(path, Problem::UnknownFolder)),
+        false => Ok(path.to_owned()),
+    }
+}
 
 /// An open dataset of some format, which its content tells.
 pub(crate) enum Source {
@@ -29,8 +38,8 @@ impl Source {
     /// Opens a file, or a folder of Minari.
     pub(crate) fn open(path: &Path) -> Result<Self, DatasetError> {
         let error = |problem| DatasetError::new(path, problem);
+        let file = data_file(path)?;
         if path.is_dir() {
-            let file = minari::data_file(path).ok_or_else(|| error(Problem::UnknownFolder))?;
             return Ok(Self::Minari(Hdf5File::open(&file)?, minari::Metadata::read(&file)?));
         }
         let mut start = Vec::new();

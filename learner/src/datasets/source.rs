@@ -15,8 +15,6 @@ use crate::presets::nearest;
 const MIRROR: &str = "QUAD_DATASETS_URL";
 /// What names a dataset of Minari's begin with.
 const MINARI: &str = "minari:";
-/// The file of a folder of Minari's that holds the data.
-const MINARI_DATA: &str = "main_data.hdf5";
 
 /// Where a run's data comes from.
 #[derive(Clone, Debug, PartialEq)]
@@ -89,8 +87,8 @@ impl Source {
                 Ok(LocalDataset { path, sha256 })
             }
             Self::Minari(id) => {
-                let path = minari_folder(id)?;
-                if !path.join(MINARI_DATA).exists() {
+                let path = quad_dataset::minari_folder(id);
+                if !path.exists() {
                     return Err(anyhow!("the dataset {MINARI}{id} is not in {}", path.display())).hint(format!(
                         "fetch it by Minari's own client: pip install minari, then: minari download {id}"
                     ));
@@ -114,15 +112,11 @@ pub fn named(name: &str) -> anyhow::Result<&'static NamedDataset> {
         .hint("`learner datasets list` prints all names; to train on a file, give its path")
 }
 
-/// Where Minari keeps a dataset.
-fn minari_folder(id: &str) -> anyhow::Result<PathBuf> {
-    let root = std::env::var_os("MINARI_DATASETS_PATH").filter(|root| !root.is_empty()).map(PathBuf::from);
-    let root = root.or_else(|| std::env::home_dir().map(|home| home.join(".minari/datasets")));
-    Ok(root.context("there is no home folder")?.join(id).join("data"))
-}
-
 fn local(path: PathBuf) -> anyhow::Result<LocalDataset> {
-    let data = if path.is_dir() { path.join(MINARI_DATA) } else { path.clone() };
+    let data = quad_dataset::data_file(&path).or_else(|error| {
+        let hint = error.hint();
+        Err(error).hint(hint)
+    })?;
     let sha256 = sha256(&data).with_context(|| format!("cannot read {}", data.display()))?;
     Ok(LocalDataset { path, sha256 })
 }
