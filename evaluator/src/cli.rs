@@ -31,12 +31,12 @@ enum Command {
 
 /// Record a dataset of mediocre behaviour to learn from, without downloading anything
 ///
-/// Trains linear policies by augmented random search, from ones that fall over at once to ones that hop well, and mixes
-/// noisy episodes of all of them into one file in D4RL's layout (HDF5; h5py reads it). About a minute on two cores. The
+/// Trains linear policies by augmented random search, from ones that fall over at once to ones that move well, and mixes
+/// noisy episodes of all of them into one file in D4RL's layout (HDF5; h5py reads it). One to two minutes on two cores. The
 /// same seed makes the same data.
 #[derive(Debug, Args)]
 struct CollectArgs {
-    /// Environment to act in: hopper
+    /// Environment to act in: hopper, halfcheetah or walker2d
     #[arg(long, value_name = "NAME", value_parser = environment::find)]
     env: &'static EnvironmentSpec,
     /// The file to write. It appears when it is complete
@@ -79,7 +79,14 @@ impl Cli {
                 Ok(())
             }
             Command::Collect(args) => {
-                let summary = collect::collect(args.env, &args.out, args.transitions.get(), args.seed)?;
+                let recorded = collect::collect(args.env, &args.out, args.transitions.get(), args.seed);
+                let summary = match recorded {
+                    Ok(summary) => summary,
+                    Err(error) => {
+                        let hint = error.hint();
+                        return Err(error).hint(hint);
+                    }
+                };
                 print(&collected(&args, &summary));
                 Ok(())
             }

@@ -9,17 +9,8 @@ use tracing::info;
 
 use super::CollectError;
 use super::linear::LinearPolicy;
+use super::recipe::Recipe;
 use crate::environment::{self, Environment, EnvironmentError, Step};
-
-/// Episodes by their normalised score: where a band begins, and its share of the transitions.
-///
-/// Left to itself, a search's history is mostly long, good episodes, and there is little to learn offline from what is
-/// good already. These shares make the mixture that offline learning is for, whatever the seed: a third of the
-/// transitions, but nearly nine in ten episodes, fall over soon and pull the mean score down to about 8; most of the others
-/// hop a while with one gait or another; and one in ten shows how far it can be taken. Good actions are there to be
-/// found, diluted by worse ones in the same states.
-const MIXTURE: [(f64, f64); 6] =
-    [(f64::NEG_INFINITY, 0.22), (3.0, 0.15), (10.0, 0.2), (30.0, 0.2), (50.0, 0.13), (80.0, 0.1)];
 
 /// Each episode adds Gaussian noise to its actions (which span ±1), of a standard deviation drawn uniformly from this
 /// range: enough to show what other actions in a state lead to, up to more than most gaits survive.
@@ -39,20 +30,22 @@ const NOISE_STREAM: u64 = 3;
 /// episode's normalised score.
 pub fn record(
     spec: &'static EnvironmentSpec,
+    recipe: &Recipe,
     policies: &[LinearPolicy],
     transitions: usize,
     mut random: ChaCha8Rng,
     writer: &mut D4rlWriter,
 ) -> Result<Vec<f64>, CollectError> {
     let mut recorders = (0..ROUND).map(|_| Recorder::new(spec)).collect::<Result<Vec<_>, EnvironmentError>>()?;
-    let mut room = MIXTURE.map(|(_, share)| share * transitions as f64);
+    let mixture = recipe.mixture;
+    let mut room: Vec<f64> = mixture.iter().map(|(_, share)| share * transitions as f64).collect();
     let mut scores = Vec::new();
     let (mut simulated, mut announced) = (0, 0);
     loop {
         // Past the end of the highest band with room, an episode is of no use.
         let patient = simulated <= PATIENCE * transitions;
         let highest = room.iter().rposition(|&room| room > 0.0).filter(|_| patient);
-        let ceiling = highest.and_then(|band| MIXTURE.get(band + 1)).map_or(f64::INFINITY, |&(from, _)| from);
+        let ceiling = highest.and_then(|band| mixture.get(band + 1)).map_or(f64::INFINITY, |&(from, _)| from);
         let tasks: Vec<(&LinearPolicy, u64)> =
             (0..ROUND).map(|_| (&policies[random.random_range(0..policies.len())], random.random())).collect();
         recorders
@@ -63,7 +56,7 @@ pub fn record(
         for recorder in &recorders {
             simulated += recorder.steps.len();
             let score = spec.normalised_score(recorder.episode_return);
-            let band = MIXTURE.iter().rposition(|&(from, _)| score >= from).unwrap_or(0);
+            let band = mixture.iter().rposition(|&(from, _)| score >= from).unwrap_or(0);
             if recorder.ended() && (room[band] > 0.0 || !patient) {
                 room[band] -= recorder.steps.len() as f64;
                 recorder.write(writer)?;

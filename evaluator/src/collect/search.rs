@@ -13,6 +13,7 @@ use rayon::prelude::*;
 use tracing::info;
 
 use super::linear::{LinearPolicy, Moments};
+use super::recipe::Recipe;
 use crate::environment::{self, Environment, EnvironmentError};
 
 /// N: directions tried in one iteration, each forwards and backwards.
@@ -26,34 +27,21 @@ const STEP_SIZE: f64 = 0.02;
 /// Taken off each step's reward.
 const ALIVE_BONUS: f64 = 1.0;
 
-/// Independent searches. Each comes by a gait of its own, so that the recorded actions in a state differ as those of
-/// different people do, not only by noise. One in three or four searches takes long to find any.
-const SEARCHES: u64 = 8;
-
-/// Steps that the searches may take for each transition that is to be recorded…
-const STEPS_PER_TRANSITION: u64 = 16;
-/// …up to this many: by then most of them hop, and a minute of two cores is over.
-const MAX_STEPS: u64 = 1_600_000;
-
-/// Steps to train for when `transitions` are to be recorded.
-pub fn budget(transitions: usize) -> u64 {
-    (STEPS_PER_TRANSITION * transitions as u64).min(MAX_STEPS)
-}
-
-/// Trains for about `budget` environment steps; answers with the policies of all iterations, `random` being asked for a
-/// generator for each search.
+/// Trains for as many steps as the recipe has for `transitions`; answers with the policies of all iterations, `random` being
+/// asked for a generator for each search.
 pub fn train(
     spec: &EnvironmentSpec,
-    budget: u64,
+    recipe: &Recipe,
+    transitions: usize,
     random: impl Fn(u64) -> ChaCha8Rng,
 ) -> Result<Vec<LinearPolicy>, EnvironmentError> {
     let mut policies = Vec::new();
-    for index in 0..SEARCHES {
+    for index in 0..recipe.searches {
         let mut search = Search::new(spec, random(index))?;
-        search.run(budget / SEARCHES);
+        search.run(recipe.search_steps(transitions) / recipe.searches);
         let score = spec.normalised_score(search.recent_return());
         let steps = search.environment_steps;
-        info!("training, search {} of {SEARCHES}: normalised score {score:.1} after {steps} steps", index + 1);
+        info!("training, search {} of {}: normalised score {score:.1} after {steps} steps", index + 1, recipe.searches);
         policies.extend(search.policies);
     }
     Ok(policies)
