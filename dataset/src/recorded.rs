@@ -125,10 +125,9 @@ impl RecordedRows {
 /// An array of numbers, none of which may be NaN or infinite.
 fn finite(file: &Hdf5File, array: &str, rows: usize, width: usize) -> Result<Vec<f64>, DatasetError> {
     let values: Vec<f64> = file.table(array, rows, width)?;
-    let wrong = values.iter().position(|value| !value.is_finite());
-    wrong.map_or(Ok(()), |i| {
+    if let Some(i) = values.iter().position(|value| !value.is_finite()) {
         let (row, value) = (i / width, values[i] as f32);
-        Err(file.error(Problem::NotFinite { array: array.to_owned(), row, value, rows: 1 }))
-    })?;
+        return Err(file.error(Problem::NotFinite { array: array.to_owned(), row, value, rows: 1 }));
+    }
     Ok(values)
 }

@@ -186,10 +186,10 @@ fn a_run_folder_that_cannot_be_made() {
 fn what_cannot_be_replayed() {
     let verify = |path: &Path| Command::new(binary("evaluator")).arg("verify-dataset").arg(path).output().unwrap();
     let subject = Subject::of(400, |_| ());
-    assert_refused(&verify(&subject.dataset), "array `next_observations` is missing", "evaluator collect");
+    assert_refused(&verify(&subject.dataset), "array `infos/qpos` is missing", "evaluator collect");
     let whole = fs::read(&subject.dataset).unwrap();
     fs::write(&subject.dataset, &whole[..whole.len() / 2]).unwrap();
     assert_refused(&verify(&subject.dataset), "cut short", "fetch or copy it again");
     fs::write(&subject.dataset, "my notes").unwrap();
-    assert_refused(&verify(&subject.dataset), "not an HDF5 file", "docs/data.md");
+    assert_refused(&verify(&subject.dataset), "neither an HDF5 file nor an npz archive", "docs/data.md");
 }

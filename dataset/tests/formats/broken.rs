@@ -124,7 +124,7 @@ fn a_missing_array() {
         assert_eq!(subject.error(), format!("array `{array}` is missing"));
     }
     let error = RecordedRows::read(Subject::new().path(), hopper()).err().unwrap();
-    assert!(error.to_string().ends_with("array `next_observations` is missing"), "{error}");
+    assert!(error.to_string().ends_with("array `infos/qpos` is missing"), "{error}");
 }
 
 #[test]
