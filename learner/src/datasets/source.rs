@@ -196,7 +196,7 @@ mod tests {
     #[test]
     fn the_checksum_of_a_folder_is_that_of_its_data() {
         let folder = tempfile::tempdir().unwrap();
-        std::fs::write(folder.path().join(MINARI_DATA), "abc").unwrap();
+        std::fs::write(folder.path().join("main_data.hdf5"), "abc").unwrap();
         let source = Source::Path(folder.path().to_owned());
         // FIPS 180-2, B.1.
         let abc = "ba7816bf8f01cfea414140de5dae2223b00361a396177a9cb410ff61f20015ad";
