@@ -21,8 +21,10 @@ fn number(table: &Table, key: &str) -> Option<f64> {
     value.as_float().or(value.as_integer().map(|value| value as f64))
 }
 
-/// Table 4: task, environment, τ, b, constant η, ρ.
-const TABLE_4: [(&str, &str, f64, Option<f64>, Option<f64>, f64); 15] = [
+/// Task, environment, τ, b, constant η, ρ.
+type Row = (&'static str, &'static str, f64, Option<f64>, Option<f64>, f64);
+
+const TABLE_4: [Row; 15] = [
     ("hopper-medium-v2", "hopper", 10.0, Some(1.0), None, 1.5),
     ("hopper-medium-replay-v2", "hopper", 0.1, Some(1.0), None, 1.5),
     ("hopper-medium-expert-v2", "hopper", 0.1, Some(0.05), None, 1.5),
