@@ -128,7 +128,8 @@ fn beside_a_plain_run(change: impl Fn(&mut RunConfig), score: impl Fn(&mut Score
 
 #[test]
 fn unlike_runs_are_no_seeds_of_each_other_and_the_report_says_what_differs() {
-    let changes: [(&[&str], fn(&mut RunConfig)); 6] = [
+    type Change = (&'static [&'static str], fn(&mut RunConfig));
+    let changes: [Change; 6] = [
         (&["agent.tau = 0.1", "agent.tau = 0.5"], |config| {
             drop(config.experiment.agent.insert("tau".into(), 0.5.into()))
         }),
