@@ -8,10 +8,10 @@ use quad_dataset::EnvironmentSpec;
 use quad_dataset::environment;
 use quad_service::Hint;
 
-use crate::collect::{self, Summary};
+use crate::collect::{self, CollectError, Summary};
 use crate::score::{self, ScoreArgs};
 use crate::serve::{self, ServeArgs};
-use crate::verify::{self, Report};
+use crate::verify::{self, Report, VerifyError};
 
 /// Runs policies in MuJoCo, and records datasets there.
 #[derive(Debug, Parser)]
@@ -79,26 +79,14 @@ impl Cli {
                 Ok(())
             }
             Command::Collect(args) => {
-                let recorded = collect::collect(args.env, &args.out, args.transitions.get(), args.seed);
-                let summary = match recorded {
-                    Ok(summary) => summary,
-                    Err(error) => {
-                        let hint = error.hint();
-                        return Err(error).hint(hint);
-                    }
-                };
+                let summary = collect::collect(args.env, &args.out, args.transitions.get(), args.seed)
+                    .hint_of(CollectError::hint)?;
                 print(&collected(&args, &summary));
                 Ok(())
             }
             Command::VerifyDataset(args) => {
                 let spec = args.env.map_or_else(|| verify::environment_of(&args.file), Ok);
-                let report = match spec.and_then(|spec| verify::verify(&args.file, spec)) {
-                    Ok(report) => report,
-                    Err(error) => {
-                        let hint = error.hint();
-                        return Err(error).hint(hint);
-                    }
-                };
+                let report = spec.and_then(|spec| verify::verify(&args.file, spec)).hint_of(VerifyError::hint)?;
                 print(&if args.json { serde_json::to_string(&report)? } else { verified(&report) });
                 Ok(())
             }

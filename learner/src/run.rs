@@ -90,9 +90,7 @@ fn inspect(args: &InspectArgs) -> anyhow::Result<()> {
         Source::Path(path) => path,
         source => source.obtain()?.path,
     };
-    let inspection = quad_dataset::inspect(&path, environment);
-    let hint = inspection.as_ref().err().map(DatasetError::hint).unwrap_or_default();
-    let inspection = inspection.hint(hint)?;
+    let inspection = quad_dataset::inspect(&path, environment).hint_of(DatasetError::hint)?;
     match args.json {
         true => print(&serde_json::to_string_pretty(&inspection)?)?,
         false => print(&inspection.to_string())?,

@@ -6,17 +6,33 @@ use std::process::ExitCode;
 
 /// Adds advice to an error: what to do about it, on a line of its own.
 pub trait Hint<T> {
+    /// What may have gone wrong.
+    type Error;
+
     /// If this is an error, `hint` is shown below it. An error that has a hint already keeps that one, which is from
     /// closer to the cause.
     fn hint(self, hint: impl fmt::Display) -> anyhow::Result<T>;
+
+    /// The same, with advice that depends on the error.
+    fn hint_of<H: fmt::Display>(self, hint: impl FnOnce(&Self::Error) -> H) -> anyhow::Result<T>;
 }
 
 impl<T, E: Into<anyhow::Error>> Hint<T> for Result<T, E> {
+    type Error = E;
+
     fn hint(self, hint: impl fmt::Display) -> anyhow::Result<T> {
         self.map_err(|error| {
             let error = error.into();
             if error.is::<Hinted>() { error } else { Hinted { error, hint: hint.to_string() }.into() }
         })
+    }
+
+    fn hint_of<H: fmt::Display>(self, hint: impl FnOnce(&E) -> H) -> anyhow::Result<T> {
+        let advice = self.as_ref().err().map(hint);
+        match advice {
+            Some(advice) => self.hint(advice),
+            None => self.map_err(Into::into),
+        }
     }
 }
 

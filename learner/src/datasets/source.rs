@@ -3,7 +3,7 @@
 use std::path::{Path, PathBuf};
 
 use anyhow::{Context, anyhow};
-use quad_dataset::{NamedDataset, catalogue, environment};
+use quad_dataset::{DatasetError, NamedDataset, catalogue, environment};
 use quad_service::Hint;
 
 use super::cache;
@@ -80,10 +80,7 @@ impl Source {
             Self::Named(dataset) => {
                 let mirror = std::env::var(MIRROR).ok().filter(|mirror| !mirror.is_empty());
                 let fetched = Fetcher::new(mirror).fetch(dataset, &cache::folder()?);
-                let (path, sha256) = fetched.or_else(|error: FetchError| {
-                    let hint = error.hint();
-                    Err(error).hint(hint)
-                })?;
+                let (path, sha256) = fetched.hint_of(FetchError::hint)?;
                 Ok(LocalDataset { path, sha256 })
             }
             Self::Minari(id) => {
@@ -113,10 +110,7 @@ pub fn named(name: &str) -> anyhow::Result<&'static NamedDataset> {
 }
 
 fn local(path: PathBuf) -> anyhow::Result<LocalDataset> {
-    let data = quad_dataset::data_file(&path).or_else(|error| {
-        let hint = error.hint();
-        Err(error).hint(hint)
-    })?;
+    let data = quad_dataset::data_file(&path).hint_of(DatasetError::hint)?;
     let sha256 = sha256(&data).with_context(|| format!("cannot read {}", data.display()))?;
     Ok(LocalDataset { path, sha256 })
 }
