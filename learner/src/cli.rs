@@ -21,7 +21,11 @@ Examples:
   # Behaviour cloning with the same steps: no critic at all.
   learner train --preset hopper-demo --dataset data/hopper-demo.hdf5 --guidance none --candidates 1
 
-Ctrl-C or SIGTERM stops early: snapshots and scores so far stay in the run folder, and the exit code is 1.";
+  # Go on after a crash or Ctrl-C: the same command again.
+
+Ctrl-C or SIGTERM stops early with a checkpoint, and the exit code is 1; a second one ends at once. The same command goes on
+from the run folder's newest checkpoint. On the same machine a run that was interrupted ends with the same weights, bit for
+bit, as one that was not.";
 
 const FETCH_NOTE: &str = "\
 The file goes where D4RL keeps it: $D4RL_DATASET_DIR, or ~/.d4rl/datasets. $QUAD_DATASETS_URL, the address of a folder, is
@@ -61,9 +65,16 @@ pub struct TrainArgs {
     /// or minari:ID [default: the preset's]
     #[arg(long, value_name = "FILE|NAME")]
     dataset: Option<String>,
-    /// Folder of this run; its last part names the run [default: runs/PRESET-VARIANT-seedSEED]
+    /// Folder of this run; its last part names the run. A run of the same configuration that is there already goes on
+    /// [default: runs/PRESET-VARIANT-seedSEED]
     #[arg(long, value_name = "DIR")]
     pub run_dir: Option<PathBuf>,
+    /// Seconds between two checkpoints, so many of which a crash may cost; longer where saving would take 1 % of the time
+    #[arg(long, value_name = "N", default_value_t = 30)]
+    pub checkpoint_seconds: u64,
+    /// Begin anew: a run that is in the folder already is kept under another name
+    #[arg(long)]
+    pub fresh: bool,
     /// Listen for evaluators here, e.g. tcp/127.0.0.1:7447, or tcp/0.0.0.0:7447 for other machines
     /// [default: tcp/127.0.0.1:7447; any free port with --eval-interval 0]
     #[arg(long, value_name = "ENDPOINT", value_parser = parse_endpoint, conflicts_with = "connect")]

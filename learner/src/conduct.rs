@@ -25,6 +25,8 @@ use crate::wire::Wire;
 const SESSION_PATIENCE: Duration = Duration::from_secs(1);
 /// When no evaluator has been connected for this long after training, the user is told what to do.
 const EVALUATOR_PATIENCE: Duration = Duration::from_secs(10);
+/// The disk hangs if it takes longer than this for one file.
+const DISK_PATIENCE: Duration = Duration::from_secs(30);
 /// Longest time to close the session in, should the network hang.
 const CLOSE_PATIENCE: Duration = Duration::from_secs(5);
 
@@ -91,7 +93,12 @@ impl Conductor {
         let mut wire = None;
         let ending = self.watch(opening, &mut wire).await;
         self.display.finish();
-        tokio::task::spawn_blocking(|| self.threads.join()).await??;
+        let ended = tokio::task::spawn_blocking(|| self.threads.join()).await?;
+        let ending = match (ending, ended) {
+            // Why a thread ended badly is known already if the run has failed by it.
+            (Ending::Failed(error), _) | (_, Err(error)) => Ending::Failed(error),
+            (ending, Ok(())) => ending,
+        };
         if let Some(wire) = wire {
             // An evaluator that misses the goodbye notices the lost connection.
             timeout(CLOSE_PATIENCE, wire.close()).await.ok();
@@ -105,6 +112,7 @@ impl Conductor {
         ticker.set_missed_tick_behavior(MissedTickBehavior::Skip);
         let (mut training, mut settled, mut interrupted) = (true, false, false);
         let mut waiting = Waiting::default();
+        let mut hangs = false;
         while training || !settled {
             tokio::select! {
                 session = &mut opening, if wire.is_none() => match self.go_online(session).await {
@@ -129,6 +137,12 @@ impl Conductor {
                 },
                 _ = ticker.tick() => {
                     self.display.tick(Instant::now());
+                    let busy_for = self.threads.desk.busy_for();
+                    if busy_for > DISK_PATIENCE && !hangs {
+                        self.display.say("the disk hangs: snapshots and checkpoints wait for it; training goes on");
+                        self.metrics.disk.trouble.set(1);
+                    }
+                    hangs = busy_for > DISK_PATIENCE;
                     if !training && waiting.is_too_long(self.metrics.evaluators.present.get() > 0) {
                         self.display.say(&self.advice());
                     }
@@ -179,6 +193,10 @@ impl Conductor {
                 let present = evaluators(self.metrics.evaluators.present.get());
                 format!("training is done; waiting for the scores of {pending} episodes ({present} here)")
             }
+            Notice::DiskTrouble(error) => format!(
+                "the run cannot be saved: {error}; training goes on, and it is tried again until the disk takes it"
+            ),
+            Notice::DiskWell => "the disk takes what is saved again".to_owned(),
             Notice::Settled | Notice::Failed(_) => return,
         };
         self.display.say(&text);

@@ -67,7 +67,7 @@ pub struct RunConfig {
 pub struct RunInfo {
     /// Name of the run: its folder's name, and its place in Zenoh's key space.
     pub name: String,
-    /// Start of the learner in milliseconds since 1970; tells it from an earlier learner of the same run.
+    /// When the run began, in milliseconds since 1970.
     pub incarnation: u64,
     /// Preset that was asked for.
     pub preset: String,
@@ -233,6 +233,11 @@ impl Experiment {
     pub fn hyperparameters(&self) -> Result<Box<dyn Hyperparameters>, ConfigError> {
         let described = |source| ConfigError::Agent { algorithm: self.algorithm.clone(), source };
         (self.definition()?.read)(&self.agent).map_err(described)
+    }
+
+    /// Whether the policy after that gradient step is evaluated.
+    pub fn is_evaluated(&self, step: u64) -> bool {
+        self.eval_interval > 0 && (step == self.steps || step.is_multiple_of(self.eval_interval))
     }
 
     /// The figures that tell runs apart, in one line.

@@ -6,9 +6,10 @@ use std::time::{Duration, Instant};
 
 use anyhow::anyhow;
 use quad_protocol::{
-    CodecError, Hash, JobReply, JobRequest, Message, Name, Progress, RecordedScores, ScoreReply, ScoreReport, decode,
-    encode, episode_seeds, keys,
+    CodecError, EpisodeScore, Hash, JobReply, JobRequest, Message, Name, Progress, RecordedScores, ScoreReply,
+    ScoreReport, decode, encode, episode_seeds, keys,
 };
+use quad_service::hinted;
 use tokio::sync::mpsc::UnboundedSender;
 use tracing::{debug, error};
 use zenoh::bytes::ZBytes;
@@ -21,7 +22,7 @@ use crate::inbox::Messages;
 use crate::metrics::Metrics;
 use crate::notice::Notice;
 use crate::run_dir::{Log, RunDirError, ScoreLine};
-use crate::scoreboard::{Refusal, Scoreboard};
+use crate::scoreboard::{OtherWeights, Refusal, Scoreboard};
 
 /// How often expired leases are looked for.
 const TICK: Duration = Duration::from_millis(250);
@@ -154,7 +155,11 @@ impl Hub {
         match event {
             Event::Evaluate { step, weights } => {
                 let seeds = episode_seeds(self.plan.seed, step, self.plan.episodes);
-                self.scoreboard.add_evaluation(step, weights, &seeds);
+                match self.scoreboard.add_evaluation(step, weights, &seeds) {
+                    Ok(Some(scores)) => self.show(step, &scores),
+                    Ok(None) => {}
+                    Err(error) => drop(self.notices.send(Notice::Failed(other_weights(error)))),
+                }
             }
             Event::TrainingCompleted => {
                 self.training_completed = true;
@@ -224,11 +229,7 @@ impl Hub {
         evaluation.scores_duplicate.inc_by(screened.duplicates.into());
         evaluation.jobs_completed.inc_by(recorded.job_completed.into());
         if let Some(scores) = recorded.evaluation_completed {
-            let mean = scores.iter().map(|score| score.score).sum::<f64>() / scores.len() as f64;
-            if i64::try_from(report.step).is_ok_and(|step| step >= evaluation.step.get()) {
-                evaluation.score.set(mean);
-                evaluation.step.set(report.step as i64);
-            }
+            self.show(report.step, &scores);
             *completed = Some(Notice::Evaluated { step: report.step, scores });
         }
         let reply = ScoreReply::Recorded { new: screened.new.len() as u32, duplicates: screened.duplicates };
@@ -238,8 +239,19 @@ impl Hub {
         Ok(reply)
     }
 
+    /// Lets the metrics show a complete evaluation, if it is the newest.
+    fn show(&self, step: u64, scores: &[EpisodeScore]) {
+        let evaluation = &self.metrics.evaluation;
+        if let Ok(step) = i64::try_from(step)
+            && step >= evaluation.step.get()
+        {
+            evaluation.score.set(scores.iter().map(|score| score.score).sum::<f64>() / scores.len() as f64);
+            evaluation.step.set(step);
+        }
+    }
+
     /// Publishes recorded scores for observers. The system works without any, so a failure does not matter.
-    fn publish(&self, report: &ScoreReport, episodes: Vec<quad_protocol::EpisodeScore>) {
+    fn publish(&self, report: &ScoreReport, episodes: Vec<EpisodeScore>) {
         let Some(session) = &self.session else { return };
         let ScoreReport { run, step, weights, evaluator, .. } = report.clone();
         let recorded = RecordedScores { run, step, weights, evaluator, episodes };
@@ -326,6 +338,12 @@ impl Hub {
             debug!(%error, "an answer could not be sent");
         }
     }
+}
+
+fn other_weights(error: OtherWeights) -> anyhow::Error {
+    let hint = "another kind of processor, another number of threads or another version computes other bits: go on where the \
+                run was before, or begin anew with --fresh";
+    hinted(error, hint)
 }
 
 fn parse<M: Message>(payload: Option<&ZBytes>) -> Result<M, Rejection> {

@@ -6,9 +6,11 @@
 //! - [`cli`] is the command line; [`config`] the experiment that it describes, one of the [`presets`] with flags on top,
 //!   validated once.
 //! - [`datasets`] finds or fetches the data that a run learns from.
-//! - [`run`] goes from the command line to the exit; [`conduct`] is the main loop in between.
+//! - [`run`] goes from the command line to the exit, [`resume`] takes up a run that was there, by its [`settings`];
+//!   [`conduct`] is the main loop in between.
 //! - [`threads`] starts the threads that do the work: [`train`] (nothing but gradient steps, by an [`agent`] on a
-//!   [`device`]), [`publisher`] (publishes and saves snapshots) and [`hub`] (hands out jobs, takes scores in).
+//!   [`device`]), [`keeper`] (snapshots and checkpoints to the disk), [`publisher`] (publishes snapshots) and [`hub`]
+//!   (hands out jobs, takes scores in).
 //! - [`agent`] runs one of the [`algorithms`], each a file to be read beside its paper, with an [`optimiser`] and the
 //!   [`random`] numbers of its seed, on a thread pool that is kept awake (`pool`).
 //! - [`scoreboard`] is the hub's state without any I/O.
@@ -28,6 +30,7 @@ pub mod device;
 pub mod display;
 pub mod hub;
 pub mod inbox;
+pub mod keeper;
 pub mod metrics;
 pub mod notice;
 pub mod optimiser;
@@ -37,9 +40,11 @@ pub mod presets;
 pub mod publisher;
 pub mod random;
 pub mod report;
+pub mod resume;
 pub mod run;
 pub mod run_dir;
 pub mod scoreboard;
+pub mod settings;
 pub mod threads;
 pub mod train;
 pub mod wire;

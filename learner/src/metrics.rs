@@ -6,8 +6,8 @@ use std::time::{Duration, SystemTime, UNIX_EPOCH};
 use prometheus::core::Collector;
 use prometheus::process_collector::ProcessCollector;
 use prometheus::{
-    Gauge, GaugeVec, Histogram, HistogramOpts, IntCounter, IntCounterVec, IntGauge, IntGaugeVec, Opts, Registry,
-    exponential_buckets,
+    Counter, Gauge, GaugeVec, Histogram, HistogramOpts, IntCounter, IntCounterVec, IntGauge, IntGaugeVec, Opts,
+    Registry, exponential_buckets,
 };
 use quad_protocol::{Name, Progress};
 
@@ -26,6 +26,8 @@ pub struct Metrics {
     pub evaluation: EvaluationMetrics,
     /// Of what the evaluators say about themselves.
     pub evaluators: EvaluatorMetrics,
+    /// Of what is kept on disk.
+    pub disk: DiskMetrics,
     /// Messages from the wire that were not accepted.
     pub rejected: IntCounterVec,
 }
@@ -37,6 +39,8 @@ pub struct TrainingMetrics {
     pub gradient_steps: IntCounter,
     pub gradient_steps_target: IntGauge,
     pub step_duration: Histogram,
+    pub saving_seconds: Counter,
+    pub diverged: IntGauge,
     /// What the algorithm measures, in its order.
     pub algorithm: Vec<(&'static Metric, Gauge)>,
 }
@@ -55,6 +59,16 @@ pub struct EvaluationMetrics {
     pub scores_duplicate: IntCounter,
     pub score: Gauge,
     pub step: IntGauge,
+}
+
+/// Checkpoints, and how the disk takes them.
+#[derive(Clone, Debug)]
+#[allow(missing_docs)]
+pub struct DiskMetrics {
+    pub checkpoint_step: IntGauge,
+    pub checkpoint_timestamp: Gauge,
+    pub checkpoint_bytes: IntGauge,
+    pub trouble: IntGauge,
 }
 
 /// What the evaluators' progress messages say, labelled by evaluator.
@@ -110,6 +124,11 @@ impl Metrics {
             gradient_steps: make.counter("gradient_steps_total", "Gradient steps done")?,
             gradient_steps_target: make.count("gradient_steps_target", "Gradient steps that this run will do")?,
             step_duration: make.add(Histogram::with_opts(duration))?,
+            saving_seconds: make.add(Counter::new(
+                full("saving_seconds_total"),
+                "Time that the training thread spent on copying its state and its policy instead of training",
+            ))?,
+            diverged: make.count("diverged", "1 once training has met a number that is not finite, else 0")?,
             algorithm: measured
                 .iter()
                 .map(|metric| Ok((metric, make.gauge(metric.name, metric.help)?)))
@@ -129,6 +148,13 @@ impl Metrics {
             scores_duplicate: make.counter("scores_duplicate_total", "Scores delivered for episodes that had one")?,
             score: make.gauge("evaluation_score", "Mean normalised score of the newest complete evaluation")?,
             step: make.count("evaluation_step", "Gradient step of the newest complete evaluation")?,
+        };
+        let disk = DiskMetrics {
+            checkpoint_step: make.count("checkpoint_step", "Gradient step of the newest checkpoint on disk")?,
+            checkpoint_timestamp: make
+                .gauge("checkpoint_timestamp_seconds", "When the newest checkpoint was written")?,
+            checkpoint_bytes: make.count("checkpoint_bytes", "Size of the newest checkpoint")?,
+            trouble: make.count("disk_trouble", "1 while the disk does not take what is to be kept, else 0")?,
         };
         let labelled = |name: &str, help: &str| Opts::new(full(name), help);
         let evaluators = EvaluatorMetrics {
@@ -151,7 +177,7 @@ impl Metrics {
         };
         let reasons = Opts::new(full("rejected_messages_total"), "Messages that were not accepted, by reason");
         let rejected = make.add(IntCounterVec::new(reasons, &["reason"]))?;
-        Ok((Self { training, evaluation, evaluators, rejected }, registry))
+        Ok((Self { training, evaluation, evaluators, disk, rejected }, registry))
     }
 
     /// Counts a message that was not accepted.

@@ -30,6 +30,10 @@ pub enum Notice {
     },
     /// All gradient steps are done, and no score is outstanding.
     Settled,
+    /// The disk does not take what is to be kept; what it says.
+    DiskTrouble(String),
+    /// The disk takes it again.
+    DiskWell,
     /// The run cannot go on.
     Failed(anyhow::Error),
 }

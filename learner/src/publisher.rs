@@ -1,12 +1,13 @@
-//! The thread that publishes snapshots: takes policies from the training thread, publishes and saves them as snapshots,
-//! asks for their evaluation, and answers evaluators that missed one.
+//! The thread that publishes snapshots: takes them when they are on disk, asks for their evaluation, publishes them, and
+//! answers evaluators that missed one.
 
 use std::collections::BTreeMap;
 use std::time::Duration;
 
 use anyhow::Context;
 use quad_dataset::Task;
-use quad_protocol::{Hash, Name, Origin, Schema, Snapshot, encode, keys};
+use quad_policy::Description;
+use quad_protocol::{Hash, Name, Schema, Snapshot, encode, keys};
 use tokio::sync::mpsc::UnboundedSender;
 use tracing::debug;
 use zenoh::Wait;
@@ -14,13 +15,11 @@ use zenoh::bytes::ZBytes;
 use zenoh::pubsub::Publisher;
 use zenoh::query::Query;
 
-use crate::agent::PolicyFile;
-use crate::hub::{self, EvaluationPlan};
+use crate::hub;
 use crate::inbox::{Inbox, Messages};
 use crate::metrics::Metrics;
 use crate::notice::Notice;
 use crate::run_dir::RunDir;
-use crate::train::TrainedPolicy;
 
 /// Longest wait for a message. The thread does nothing between messages, so the value does not matter.
 const IDLE: Duration = Duration::from_secs(60);
@@ -28,8 +27,8 @@ const IDLE: Duration = Duration::from_secs(60);
 /// Messages to the thread.
 #[derive(Debug)]
 pub enum Event {
-    /// A policy from the training thread.
-    Trained(TrainedPolicy),
+    /// A snapshot that is on disk and is to be evaluated.
+    Kept(Kept),
     /// All gradient steps are done; no snapshot will follow.
     TrainingCompleted,
     /// The Zenoh session is open; publish with this.
@@ -38,6 +37,19 @@ pub enum Event {
     Query(Query),
     /// End, after the messages sent before this one are handled.
     Stop,
+}
+
+/// A snapshot that is on disk.
+#[derive(Debug)]
+pub struct Kept {
+    /// After which gradient step.
+    pub step: u64,
+    /// The kind of its policy.
+    pub kind: &'static str,
+    /// Hash of the file.
+    pub hash: Hash,
+    /// The file.
+    pub tensors: Vec<u8>,
 }
 
 /// The fields that all snapshots of a run have in common.
@@ -49,10 +61,6 @@ pub struct Identity {
     pub incarnation: u64,
     /// Environment that the policy acts in.
     pub task: Task,
-    /// Which episodes each snapshot is evaluated on.
-    pub plan: EvaluationPlan,
-    /// Actions sampled per state in an evaluation.
-    pub candidates: u32,
 }
 
 /// State of the thread.
@@ -63,34 +71,35 @@ pub struct SnapshotPublisher {
     hub: Inbox<hub::Event>,
     notices: UnboundedSender<Notice>,
     publisher: Option<Publisher<'static>>,
-    /// Hash of every snapshot that was published, by step.
+    /// Hash of every snapshot that may be asked for, by step.
     hashes: BTreeMap<u64, Hash>,
     /// The newest, ready to be sent; older ones are read from the disk.
     newest: Option<(u64, ZBytes)>,
-    /// The kind of the run's policies, as the first one says.
-    kind: &'static str,
 }
 
 impl SnapshotPublisher {
-    /// State before the first snapshot.
+    /// State before the first snapshot of this life; `hashes` are those of an earlier one, which are on disk.
     pub fn new(
         identity: Identity,
         run_dir: RunDir,
         metrics: Metrics,
         hub: Inbox<hub::Event>,
         notices: UnboundedSender<Notice>,
+        hashes: BTreeMap<u64, Hash>,
     ) -> Self {
-        let (hashes, kind) = (BTreeMap::new(), "");
-        Self { identity, run_dir, metrics, hub, notices, publisher: None, hashes, newest: None, kind }
+        Self { identity, run_dir, metrics, hub, notices, publisher: None, hashes, newest: None }
     }
 
     /// The thread's work, until it is told to stop.
     pub fn run(mut self, messages: &Messages<Event>) {
+        for (&step, &weights) in &self.hashes {
+            self.hub.send(hub::Event::Evaluate { step, weights });
+        }
         while let Ok(event) = messages.next(IDLE) {
             match event {
                 None => {}
-                Some(Event::Trained(policy)) => {
-                    if let Err(error) = self.publish(policy) {
+                Some(Event::Kept(snapshot)) => {
+                    if let Err(error) = self.publish(snapshot) {
                         self.notices.send(Notice::Failed(error)).ok();
                     }
                 }
@@ -102,20 +111,12 @@ impl SnapshotPublisher {
         }
     }
 
-    fn publish(&mut self, policy: TrainedPolicy) -> anyhow::Result<()> {
-        let TrainedPolicy { step, policy: PolicyFile { kind, bytes }, evaluate } = policy;
-        let tensors = self.origin(step).attach(&bytes)?;
-        let hash = Hash::of(&tensors);
-        self.metrics.evaluation.snapshot_bytes.set(tensors.len() as i64);
-        if !evaluate {
-            return Ok(self.run_dir.write_snapshot(step, &tensors)?);
-        }
-        self.kind = kind;
-        let message = self.message(step, hash, tensors);
-        let bytes = ZBytes::from(encode(&message)?);
+    fn publish(&mut self, snapshot: Kept) -> anyhow::Result<()> {
+        let Kept { step, kind, hash, tensors } = snapshot;
+        let bytes = ZBytes::from(encode(&self.message(step, kind, hash, tensors))?);
         self.hashes.insert(step, hash);
         self.newest = Some((step, bytes.clone()));
-        // The jobs must exist first: evaluators ask for one as soon as the snapshot arrives. Saving comes last.
+        // The jobs must exist first: evaluators ask for one as soon as the snapshot arrives.
         self.hub.send(hub::Event::Evaluate { step, weights: hash });
         if let Some(publisher) = &self.publisher
             && let Err(error) = publisher.put(bytes).wait()
@@ -124,23 +125,17 @@ impl SnapshotPublisher {
             debug!(%error, step, "the snapshot could not be published");
         }
         self.metrics.evaluation.snapshots_published.inc();
-        self.run_dir.write_snapshot(step, &message.tensors)?;
         self.notices.send(Notice::Published { step }).ok();
         Ok(())
     }
 
-    fn origin(&self, step: u64) -> Origin {
-        let Identity { task, plan: EvaluationPlan { seed, episodes }, candidates, .. } = self.identity.clone();
-        Origin { environment: task.environment, seed, step, episodes, candidates }
-    }
-
-    fn message(&self, step: u64, hash: Hash, tensors: Vec<u8>) -> Snapshot {
-        let Identity { run, incarnation, task, .. } = self.identity.clone();
+    fn message(&self, step: u64, kind: &str, hash: Hash, tensors: Vec<u8>) -> Snapshot {
+        let Identity { run, incarnation, task } = self.identity.clone();
         let schema = Schema {
             environment: task.environment,
             observation_dim: task.observation_dim as u32,
             action_dim: task.action_dim as u32,
-            policy: self.kind.to_owned(),
+            policy: kind.to_owned(),
         };
         Snapshot { run, incarnation, step, schema, hash, tensors }
     }
@@ -169,7 +164,8 @@ impl SnapshotPublisher {
         }
         let tensors = self.run_dir.read_snapshot(step)?;
         anyhow::ensure!(Hash::of(&tensors) == hash, "the saved snapshot of step {step} was changed");
-        let bytes = encode(&self.message(step, hash, tensors)).context("cannot encode the snapshot")?;
+        let kind = Description::read(&tensors)?.kind();
+        let bytes = encode(&self.message(step, kind, hash, tensors)).context("cannot encode the snapshot")?;
         Ok(ZBytes::from(bytes))
     }
 }

@@ -2,13 +2,13 @@
 
 use std::io::{ErrorKind, Write};
 use std::path::{Path, PathBuf};
-use std::time::{SystemTime, UNIX_EPOCH};
+use std::time::{Duration, SystemTime, UNIX_EPOCH};
 
 use anyhow::{Context, anyhow};
 use quad_dataset::{DatasetError, ReadOptions, Transitions, environment};
 use quad_policy::Precision;
 use quad_protocol::Name;
-use quad_service::{Endpoints, Hint};
+use quad_service::{Endpoints, Hint, hinted};
 use tokio::sync::mpsc;
 use toml::Table;
 use tracing::{debug, info, warn};
@@ -22,8 +22,9 @@ use crate::metrics::Metrics;
 use crate::plot;
 use crate::presets;
 use crate::report::{Report, RunReport};
-use crate::run_dir::RunDir;
-use crate::threads::Threads;
+use crate::resume::{self, Begun, Past};
+use crate::run_dir::{Log, RunDir};
+use crate::threads::{Run, Threads};
 
 /// Where evaluators look by default.
 const DEFAULT_ENDPOINT: &str = "tcp/127.0.0.1:7447";
@@ -116,7 +117,7 @@ fn train(args: &TrainArgs) -> anyhow::Result<()> {
         None => default_run_dir(&args.preset, &experiment)?,
     };
     let name = run_name(&path)?;
-    RunDir::check_free(&path).hint("choose another --run-dir, or remove the folder if you do not need it")?;
+    let begun = resume::open(path.clone())?;
 
     args.device.check(experiment.precision)?;
     let dataset = source.obtain().hint(record_hint(&experiment))?;
@@ -126,6 +127,9 @@ fn train(args: &TrainArgs) -> anyhow::Result<()> {
     let transitions = read_dataset(&dataset.path, &options)?;
     check_batch(&transitions, &experiment).hint("record more data, or ask for less with --set batch_size=N")?;
     let config = run_config(args, &name, experiment, dataset, &transitions)?;
+    if let Some(begun) = begun.as_ref().filter(|_| !args.fresh) {
+        begun.check_same(&config)?;
+    }
     info!("{}", config.dataset.summary());
     info!("{}", config.experiment.summary()?);
     if !config.experiment.precision.is_available() {
@@ -135,7 +139,7 @@ fn train(args: &TrainArgs) -> anyhow::Result<()> {
 
     // Zenoh and the training thread have threads of their own; this runtime serves the metrics and the main loop.
     let runtime = tokio::runtime::Builder::new_multi_thread().worker_threads(2).enable_all().build()?;
-    let (run_dir, ending) = runtime.block_on(conduct(args, &path, name, &config, transitions))?;
+    let (run_dir, ending) = runtime.block_on(conduct(args, &path, begun, name, &config, transitions))?;
     conclude(&run_dir, &config, ending)
 }
 
@@ -162,6 +166,7 @@ fn check_batch(transitions: &Transitions, experiment: &Experiment) -> anyhow::Re
 async fn conduct(
     args: &TrainArgs,
     path: &Path,
+    begun: Option<Begun>,
     run: Name,
     config: &RunConfig,
     transitions: Transitions,
@@ -175,9 +180,12 @@ async fn conduct(
          or join a router with --connect",
     )?;
     // From here on nothing outside can be wrong any more, so a refused start leaves no folder behind.
-    let run_dir = RunDir::create(path, config).hint("choose a folder that you may write to with --run-dir DIR")?;
+    let (run_dir, scores, past) = take_up(path, begun, args.fresh, config)?;
     let (notify, notices) = mpsc::unbounded_channel();
-    let threads = Threads::start(&run, config, transitions, &run_dir, &metrics, &notify)?;
+    let incarnation = now()?;
+    let checkpoint_every = Duration::from_secs(args.checkpoint_seconds);
+    let state = Run { name: run.clone(), incarnation, config, dir: &run_dir, scores, past, checkpoint_every };
+    let threads = Threads::start(state, transitions, &metrics, &notify)?;
     let display = Display::start(metrics.clone(), steps);
     let metrics_address = server.address.to_string();
     let conductor = Conductor {
@@ -194,6 +202,23 @@ async fn conduct(
     Ok((run_dir, conductor.conduct(opening).await?))
 }
 
+/// The run's folder, and what is in it already.
+fn take_up(path: &Path, begun: Option<Begun>, fresh: bool, config: &RunConfig) -> anyhow::Result<(RunDir, Log, Past)> {
+    match begun {
+        Some(begun) if !fresh => return begun.go_on(&config.experiment),
+        Some(begun) => begun.set_aside()?,
+        None => {}
+    }
+    let run_dir = RunDir::create(path, config).hint("choose a folder that you may write to with --run-dir DIR")?;
+    let scores = run_dir.score_log()?;
+    Ok((run_dir, scores, Past::default()))
+}
+
+/// Milliseconds since 1970.
+fn now() -> anyhow::Result<u64> {
+    Ok(SystemTime::now().duration_since(UNIX_EPOCH)?.as_millis() as u64)
+}
+
 fn endpoints(args: &TrainArgs, eval_interval: u64) -> Endpoints {
     let default = if eval_interval == 0 { ANY_ENDPOINT } else { DEFAULT_ENDPOINT };
     let listen = match (&args.listen, &args.connect) {
@@ -206,6 +231,23 @@ fn endpoints(args: &TrainArgs, eval_interval: u64) -> Endpoints {
 /// Writes the report, however the run ended; a run that did not complete is an error.
 fn conclude(run_dir: &RunDir, config: &RunConfig, ending: Ending) -> anyhow::Result<()> {
     let folder = run_dir.path().display();
+    let reported = summarise(run_dir);
+    let kept =
+        format!("everything up to the newest checkpoint is kept in {folder}; the same command goes on from there");
+    let error = match ending {
+        Ending::Complete => return reported,
+        Ending::Failed(error) => error,
+        Ending::Interrupted => {
+            anyhow!("interrupted before the end of {} steps and their evaluations", config.experiment.steps)
+        }
+    };
+    if let Err(error) = reported {
+        warn!("the run has no report: {error:#}");
+    }
+    Err(hinted(error, kept))
+}
+
+fn summarise(run_dir: &RunDir) -> anyhow::Result<()> {
     let report = RunReport::read(run_dir.path())?;
     let mut text = String::new();
     if !report.evaluations.is_empty() {
@@ -214,16 +256,7 @@ fn conclude(run_dir: &RunDir, config: &RunConfig, ending: Ending) -> anyhow::Res
         plot::learning_curves(&picture, std::slice::from_ref(&report))?;
         text = format!("\n{}\nlearning curve: {}\n", report.table(), picture.display());
     }
-    print(&format!("{text}run folder: {folder}"))?;
-    let kept = format!("snapshots, metrics and scores so far are kept in {folder}");
-    match ending {
-        Ending::Complete => Ok(()),
-        Ending::Failed(error) => Err(error).hint(kept),
-        Ending::Interrupted => {
-            Err(anyhow!("interrupted before the end of {} steps and their evaluations", config.experiment.steps))
-                .hint(kept)
-        }
-    }
+    Ok(print(&format!("{text}run folder: {}", run_dir.path().display()))?)
 }
 
 fn default_run_dir(preset: &str, experiment: &Experiment) -> anyhow::Result<PathBuf> {
@@ -250,7 +283,7 @@ fn run_config(
     Ok(RunConfig {
         run: RunInfo {
             name: name.to_string(),
-            incarnation: SystemTime::now().duration_since(UNIX_EPOCH)?.as_millis() as u64,
+            incarnation: now()?,
             preset: presets::label(&args.preset),
             version: env!("CARGO_PKG_VERSION").to_owned(),
             device: args.device,

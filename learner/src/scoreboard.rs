@@ -10,6 +10,8 @@ use std::time::{Duration, Instant};
 use quad_dataset::Task;
 use quad_protocol::{EpisodeScore, Hash, Job, JobReply, JobRequest, Name, Progress, ScoreReport};
 
+use crate::resume::Earlier;
+
 /// After this time an evaluator asks again when there was no job for it.
 const ASK_AGAIN: Duration = Duration::from_millis(500);
 /// The same for an evaluator that does not have the run's environment.
@@ -42,6 +44,20 @@ pub struct Scoreboard {
     rules: Rules,
     evaluations: BTreeMap<u64, Evaluation>,
     jobs: BTreeMap<u64, JobRecord>,
+    /// Scores of an earlier life, by step, whose evaluation has not been asked for in this one.
+    earlier: BTreeMap<u64, Earlier>,
+}
+
+/// Training has come by a step again, and its weights are not those that were scored.
+#[derive(Clone, Debug, PartialEq, thiserror::Error)]
+#[error("the weights of step {step} are {found}, but {scored} were scored before")]
+pub struct OtherWeights {
+    /// The step.
+    pub step: u64,
+    /// Hash of the weights as they are now.
+    pub found: Hash,
+    /// Hash of those that have scores.
+    pub scored: String,
 }
 
 #[derive(Debug)]
@@ -139,14 +155,43 @@ impl Refusal {
 impl Scoreboard {
     /// An empty one.
     pub fn new(rules: Rules) -> Self {
-        Self { rules, evaluations: BTreeMap::new(), jobs: BTreeMap::new() }
+        Self { rules, evaluations: BTreeMap::new(), jobs: BTreeMap::new(), earlier: BTreeMap::new() }
     }
 
-    /// Asks for an evaluation of the snapshot of `step`. A step that is known already stays as it is.
-    pub fn add_evaluation(&mut self, step: u64, weights: Hash, seeds: &[u64]) {
-        let waiting = |&seed| Episode { seed, state: EpisodeState::Waiting };
-        let episodes = seeds.iter().map(waiting).collect();
-        self.evaluations.entry(step).or_insert(Evaluation { weights, episodes });
+    /// Takes over the scores of an earlier life. They count as soon as the evaluation of their step is asked for.
+    pub fn remember(&mut self, earlier: BTreeMap<u64, Earlier>) {
+        self.earlier = earlier;
+    }
+
+    /// Asks for an evaluation of the snapshot of `step`. A step that is known already stays as it is. Gives the scores if
+    /// an earlier life has completed it.
+    ///
+    /// # Errors
+    /// The step is known with other weights.
+    pub fn add_evaluation(
+        &mut self,
+        step: u64,
+        weights: Hash,
+        seeds: &[u64],
+    ) -> Result<Option<Vec<EpisodeScore>>, OtherWeights> {
+        let earlier = self.earlier.get(&step);
+        let known = self.evaluations.get(&step).map(|evaluation| evaluation.weights.to_string());
+        let scored = known.clone().or_else(|| earlier.map(|earlier| earlier.weights.clone()));
+        if let Some(scored) = scored.filter(|scored| *scored != weights.to_string()) {
+            return Err(OtherWeights { step, found: weights, scored });
+        }
+        if known.is_some() {
+            return Ok(None);
+        }
+        let scores = self.earlier.remove(&step).map(|earlier| earlier.episodes).unwrap_or_default();
+        let episode = |&seed| {
+            let score = scores.iter().find(|score| score.seed == seed);
+            Episode { seed, state: score.map_or(EpisodeState::Waiting, |score| EpisodeState::Scored(*score)) }
+        };
+        let evaluation = Evaluation { weights, episodes: seeds.iter().map(episode).collect() };
+        let complete = evaluation.scores();
+        self.evaluations.insert(step, evaluation);
+        Ok(complete)
     }
 
     /// Episodes that have no score yet.

@@ -1,14 +1,17 @@
 //! The threads of a run, started together and ended in order.
 
+use std::any::Any;
+use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::mpsc::{Receiver, SyncSender, sync_channel};
 use std::thread::{self, JoinHandle};
 use std::time::Duration;
 
-use anyhow::anyhow;
+use anyhow::{Context, anyhow};
 use quad_dataset::{BatchSampler, Task, Transitions};
 use quad_protocol::Name;
+use quad_service::hinted;
 use tokio::sync::mpsc::UnboundedSender;
 use tokio::sync::oneshot;
 use tracing::warn;
@@ -19,12 +22,14 @@ use crate::config::{Experiment, RunConfig};
 use crate::device::Device;
 use crate::hub::{self, EvaluationPlan, Hub};
 use crate::inbox::{Inbox, inbox};
+use crate::keeper::{Desk, Keeper, Provenance};
 use crate::metrics::{Metrics, TrainingMetrics};
 use crate::notice::Notice;
 use crate::publisher::{self, Identity, SnapshotPublisher};
-use crate::run_dir::{Log, RunDir};
+use crate::resume::Past;
+use crate::run_dir::{Checkpoint, Log, RunDir};
 use crate::scoreboard::{Rules, Scoreboard};
-use crate::train::{Outcome, Outlets, Plan, Row, train};
+use crate::train::{Outcome, Outlets, Plan, Row, TrainError, train};
 
 /// Episodes in one job: two evaluators share an evaluation of ten.
 const JOB_EPISODES: usize = 5;
@@ -32,6 +37,10 @@ const JOB_EPISODES: usize = 5;
 const LEASE: Duration = Duration::from_secs(15);
 /// Lines of `metrics.jsonl` that may wait for the disk.
 const ROWS_WAITING: usize = 1024;
+
+const DIVERGED: &str = "the same configuration would diverge again: try a smaller agent.critic_learning_rate or \
+                        agent.actor_learning_rate, a smaller agent.gradient_clip, or look for outliers with \
+                        `learner datasets inspect`; begin anew with --fresh";
 
 /// How training ended.
 pub type TrainingResult = anyhow::Result<Outcome>;
@@ -44,28 +53,49 @@ pub struct Threads {
     pub hub: Inbox<hub::Event>,
     /// Told once how training ended; fails if its thread panicked.
     pub trained: oneshot::Receiver<TrainingResult>,
+    /// Where results wait for the disk.
+    pub desk: Desk,
     stop: Arc<AtomicBool>,
-    training: JoinHandle<()>,
-    rows: JoinHandle<()>,
-    publisher_thread: JoinHandle<()>,
-    hub_thread: JoinHandle<()>,
+    training: Thread,
+    rows: Thread,
+    keeper: Thread,
+    publisher_thread: Thread,
+    hub_thread: Thread,
+}
+
+/// What a run is, and how far it is.
+pub struct Run<'a> {
+    /// Its name.
+    pub name: Name,
+    /// Which start of its learner this is: a later one has a larger number.
+    pub incarnation: u64,
+    /// Its configuration.
+    pub config: &'a RunConfig,
+    /// Its folder.
+    pub dir: &'a RunDir,
+    /// Its scores, to be appended to.
+    pub scores: Log,
+    /// What earlier learners have reached.
+    pub past: Past,
+    /// Least time between two checkpoints.
+    pub checkpoint_every: Duration,
 }
 
 impl Threads {
     /// Starts them all.
     pub fn start(
-        run: &Name,
-        config: &RunConfig,
+        run: Run<'_>,
         transitions: Transitions,
-        run_dir: &RunDir,
         metrics: &Metrics,
         notices: &UnboundedSender<Notice>,
     ) -> anyhow::Result<Self> {
+        let Run { name, incarnation, config, dir, scores, past, checkpoint_every } = run;
+        let Past { checkpoint, snapshots, scores: earlier } = past;
         let experiment = &config.experiment;
         let task = Task::new(&experiment.environment, transitions.observation_dim(), transitions.action_dim());
         let rules = Rules {
-            run: run.clone(),
-            incarnation: config.run.incarnation,
+            run: name.clone(),
+            incarnation,
             task: task.clone(),
             instance: experiment.seed,
             candidates: experiment.candidates,
@@ -73,25 +103,42 @@ impl Threads {
             lease: LEASE,
         };
         let plan = EvaluationPlan { seed: experiment.seed, episodes: experiment.episodes };
-        let scores = run_dir.score_log()?;
-        let state = Hub::new(run.clone(), plan, Scoreboard::new(rules), scores, metrics.clone(), notices.clone());
+        let mut scoreboard = Scoreboard::new(rules);
+        scoreboard.remember(earlier);
+        let state = Hub::new(name.clone(), plan, scoreboard, scores, metrics.clone(), notices.clone());
         let (hub, hub_messages) = inbox();
-        let hub_thread = spawn("hub", move || state.run(&hub_messages))?;
+        let hub_thread = spawn("hub", notices, move || state.run(&hub_messages))?;
 
-        let identity = Identity {
-            run: run.clone(),
-            incarnation: config.run.incarnation,
-            task,
-            plan,
-            candidates: experiment.candidates,
-        };
-        let state = SnapshotPublisher::new(identity, run_dir.clone(), metrics.clone(), hub.clone(), notices.clone());
+        let identity = Identity { run: name, incarnation, task: task.clone() };
+        let state = SnapshotPublisher::new(
+            identity,
+            dir.clone(),
+            metrics.clone(),
+            hub.clone(),
+            notices.clone(),
+            snapshots.clone(),
+        );
         let (publisher, publisher_messages) = inbox();
-        let publisher_thread = spawn("publisher", move || state.run(&publisher_messages))?;
+        let publisher_thread = spawn("publisher", notices, move || state.run(&publisher_messages))?;
 
+        let desk = Desk::default();
+        let provenance = Provenance { task, plan, candidates: experiment.candidates };
+        let state = Keeper::new(
+            desk.clone(),
+            provenance,
+            dir.clone(),
+            metrics.clone(),
+            publisher.clone(),
+            notices.clone(),
+            snapshots,
+        );
+        let keeper = spawn("keeper", notices, move || state.run())?;
+
+        let step = checkpoint.as_ref().map_or(0, |checkpoint| checkpoint.step);
+        metrics.training.gradient_steps.inc_by(step);
         let (row_sender, row_receiver) = sync_channel(ROWS_WAITING);
-        let log = run_dir.metrics_log()?;
-        let rows = spawn("metrics", move || write_rows(&row_receiver, log))?;
+        let (log, seconds_before) = dir.metrics_log(step)?;
+        let rows = spawn("metrics", notices, move || write_rows(&row_receiver, log))?;
 
         let stop = Arc::new(AtomicBool::new(false));
         let (tell, trained) = oneshot::channel();
@@ -99,16 +146,19 @@ impl Threads {
             experiment: experiment.clone(),
             device: config.run.device,
             transitions,
+            checkpoint,
+            checkpoint_every,
+            seconds_before,
             metrics: metrics.training.clone(),
             rows: row_sender,
-            publisher: publisher.clone(),
+            desk: desk.clone(),
             stop: stop.clone(),
         };
-        let training = spawn("training", move || {
+        let training = spawn("training", notices, move || {
             // Nobody listens any more if the process is ending.
             tell.send(trainer.run()).ok();
         })?;
-        Ok(Self { publisher, hub, trained, stop, training, rows, publisher_thread, hub_thread })
+        Ok(Self { publisher, hub, trained, desk, stop, training, rows, keeper, publisher_thread, hub_thread })
     }
 
     /// Asks training to end after its current step.
@@ -121,6 +171,8 @@ impl Threads {
         self.stop_training();
         finish("training", self.training)?;
         finish("metrics", self.rows)?;
+        self.desk.close();
+        finish("keeper", self.keeper)?;
         self.publisher.send(publisher::Event::Stop);
         finish("publisher", self.publisher_thread)?;
         self.hub.send(hub::Event::Stop);
@@ -128,21 +180,51 @@ impl Threads {
     }
 }
 
-fn spawn(name: &str, work: impl FnOnce() + Send + 'static) -> std::io::Result<JoinHandle<()>> {
-    thread::Builder::new().name(name.to_owned()).spawn(work)
+/// A thread, and at its end whether it panicked.
+type Thread = JoinHandle<Result<(), Panicked>>;
+
+#[derive(Debug, thiserror::Error)]
+#[error("the thread `{thread}` panicked, which is a bug of this program: {message}")]
+struct Panicked {
+    thread: String,
+    message: String,
 }
 
-fn finish(name: &str, thread: JoinHandle<()>) -> anyhow::Result<()> {
-    thread.join().map_err(|_| anyhow!("the thread `{name}` panicked"))
+/// Starts a thread. If it panics the run ends: without it the process would look alive and do nothing.
+fn spawn(
+    name: &str,
+    notices: &UnboundedSender<Notice>,
+    work: impl FnOnce() + Send + 'static,
+) -> std::io::Result<Thread> {
+    let (thread, notices) = (name.to_owned(), notices.clone());
+    thread::Builder::new().name(name.to_owned()).spawn(move || {
+        catch_unwind(AssertUnwindSafe(work)).map_err(|payload| {
+            let panicked = Panicked { thread, message: message(payload.as_ref()) };
+            notices.send(Notice::Failed(anyhow!("{panicked}"))).ok();
+            panicked
+        })
+    })
+}
+
+fn message(payload: &(dyn Any + Send)) -> String {
+    let text = payload.downcast_ref::<&str>().map(|text| (*text).to_owned());
+    text.or_else(|| payload.downcast_ref::<String>().cloned()).unwrap_or_default()
+}
+
+fn finish(name: &str, thread: Thread) -> anyhow::Result<()> {
+    Ok(thread.join().map_err(|_| anyhow!("the thread `{name}` panicked"))??)
 }
 
 struct Trainer {
     experiment: Experiment,
     device: Device,
     transitions: Transitions,
+    checkpoint: Option<Checkpoint>,
+    checkpoint_every: Duration,
+    seconds_before: f64,
     metrics: TrainingMetrics,
     rows: SyncSender<Row>,
-    publisher: Inbox<publisher::Event>,
+    desk: Desk,
     stop: Arc<AtomicBool>,
 }
 
@@ -160,17 +242,34 @@ impl Trainer {
         };
         let algorithm = experiment.hyperparameters()?.start(&setting)?;
         let mut agent = Agent::new(experiment.definition()?, algorithm, setting.device.clone());
+        if let Some(Checkpoint { step, state }) = &self.checkpoint {
+            let advice = "begin anew with --fresh, or go on with the version of the learner that wrote it";
+            agent
+                .load(state)
+                .map_err(|error| hinted(error, advice))
+                .with_context(|| format!("cannot go on from the checkpoint of step {step}"))?;
+        }
         let mut sampler = BatchSampler::new(self.transitions.len(), setting.batch_size, experiment.seed, agent.step());
         let outlets = Outlets {
-            metrics: self.metrics,
+            metrics: self.metrics.clone(),
             rows: self.rows,
-            snapshot: &|policy| self.publisher.send(publisher::Event::Trained(policy)),
+            snapshot: &|policy| self.desk.snapshot(policy, &self.stop),
+            checkpoint: &|checkpoint| self.desk.checkpoint(checkpoint),
             stop: &self.stop,
         };
-        let plan = Plan { steps: experiment.steps, eval_interval: experiment.eval_interval };
-        let outcome = train(&mut agent, &self.transitions, &mut sampler, plan, &outlets)?;
+        let plan = Plan {
+            steps: experiment.steps,
+            eval_interval: experiment.eval_interval,
+            checkpoint_every: self.checkpoint_every,
+            seconds_before: self.seconds_before,
+        };
+        let outcome = train(&mut agent, &self.transitions, &mut sampler, plan, &outlets).map_err(|error| {
+            let diverged = matches!(error, TrainError::Diverged { .. });
+            self.metrics.diverged.set(diverged.into());
+            if diverged { hinted(error, DIVERGED) } else { error.into() }
+        })?;
         if outcome == Outcome::Completed {
-            self.publisher.send(publisher::Event::TrainingCompleted);
+            self.desk.trained();
         }
         Ok(outcome)
     }

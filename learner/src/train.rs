@@ -1,12 +1,13 @@
 //! The training thread: samples a batch, updates the agent, again and again. It never waits for network, disk or
-//! metrics: gauges are atomics, rows go into a bounded queue that drops what does not fit, and snapshots are handed
-//! over by a send that cannot block.
+//! metrics: gauges are atomics, rows go into a bounded queue that drops what does not fit, and snapshots and checkpoints
+//! are left for another thread to keep.
 
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::mpsc::SyncSender;
-use std::time::Instant;
+use std::time::{Duration, Instant};
 
 use quad_dataset::{Batch, BatchSampler, Transitions};
+use quad_policy::PolicyError;
 use serde::ser::SerializeMap;
 use serde::{Serialize, Serializer};
 use tracing::debug;
@@ -14,9 +15,12 @@ use tracing::debug;
 use crate::agent::{Agent, PolicyFile};
 use crate::algorithms::{AlgorithmError, Metric};
 use crate::metrics::TrainingMetrics;
+use crate::run_dir::Checkpoint;
 
 /// Gradient steps that a line of `metrics.jsonl` averages over.
 pub const STEPS_PER_ROW: u64 = 100;
+/// Least time of training that is spent between two checkpoints for each second that one takes: saving costs at most 1 %.
+const TRAINING_PER_SAVING: u32 = 100;
 
 /// What is to be done.
 #[derive(Clone, Copy, Debug)]
@@ -25,6 +29,10 @@ pub struct Plan {
     pub steps: u64,
     /// Gradient steps between two evaluations; 0: none at all.
     pub eval_interval: u64,
+    /// Least time between two checkpoints.
+    pub checkpoint_every: Duration,
+    /// Seconds of training in earlier lives of the run.
+    pub seconds_before: f64,
 }
 
 /// Where the results go.
@@ -35,6 +43,8 @@ pub struct Outlets<'a> {
     pub rows: SyncSender<Row>,
     /// Takes a policy to be published or kept; must not block.
     pub snapshot: &'a dyn Fn(TrainedPolicy),
+    /// Takes a state to go on from; must not block.
+    pub checkpoint: &'a dyn Fn(Checkpoint),
     /// Set by somebody who wants training to end early.
     pub stop: &'a AtomicBool,
 }
@@ -91,14 +101,12 @@ pub enum Outcome {
 #[derive(Debug, thiserror::Error)]
 pub enum TrainError {
     /// Something is not a number any more.
-    #[error("training diverged: at gradient step {step} {what} is {value}")]
+    #[error("training diverged: at gradient step {step} {what}")]
     Diverged {
         /// The step.
         step: u64,
-        /// The metric.
-        what: &'static str,
-        /// Its value.
-        value: f32,
+        /// The metric and its value, or the tensor.
+        what: String,
     },
     /// The update failed.
     #[error("gradient step {step} failed")]
@@ -110,7 +118,18 @@ pub enum TrainError {
     },
 }
 
-/// Trains until all steps are done or somebody asks to stop; at the end the last policy is handed over in any case.
+impl TrainError {
+    fn at(step: u64, source: AlgorithmError) -> Self {
+        match source {
+            AlgorithmError::Policy(error @ PolicyError::NotFinite(_)) => {
+                Self::Diverged { step, what: error.to_string() }
+            }
+            source => Self::Update { step, source },
+        }
+    }
+}
+
+/// Trains until all steps are done or somebody asks to stop. Either way a checkpoint of the last step is handed over.
 pub fn train(
     agent: &mut Agent,
     transitions: &Transitions,
@@ -121,27 +140,36 @@ pub fn train(
     let start = Instant::now();
     let mut batch = Batch::default();
     let mut mean = RowMean::new(agent.metrics());
+    let mut next_checkpoint = start + plan.checkpoint_every;
     while agent.step() < plan.steps {
         let begin = Instant::now();
         let step = agent.step() + 1;
         sampler.next(transitions, &mut batch);
-        let values = agent.update(&batch).map_err(|source| TrainError::Update { step, source })?;
+        let values = agent.update(&batch).map_err(|source| TrainError::at(step, source))?;
         check_finite(step, agent.metrics(), &values)?;
-        outlets.metrics.observe(&values, begin.elapsed());
+        let updated = Instant::now();
+        outlets.metrics.observe(&values, updated - begin);
         mean.add(&values);
 
         let last = step == plan.steps;
         let stopped = !last && outlets.stop.load(Ordering::Relaxed);
         if step.is_multiple_of(STEPS_PER_ROW) || last || stopped {
             // A full queue means that the disk is slow; the row is for people, training is not to wait for it.
-            outlets.rows.try_send(mean.take(step, start.elapsed().as_secs_f64())).ok();
+            let seconds = plan.seconds_before + start.elapsed().as_secs_f64();
+            outlets.rows.try_send(mean.take(step, seconds)).ok();
         }
-        let due = plan.eval_interval > 0 && (last || step.is_multiple_of(plan.eval_interval));
-        if due || last || stopped {
+        let evaluate = plan.eval_interval > 0 && (last || step.is_multiple_of(plan.eval_interval));
+        if evaluate || last {
             debug!(step, "snapshot");
-            let policy = agent.policy().map_err(|source| TrainError::Update { step, source })?;
-            (outlets.snapshot)(TrainedPolicy { step, policy, evaluate: due });
+            let policy = agent.policy().map_err(|source| TrainError::at(step, source))?;
+            (outlets.snapshot)(TrainedPolicy { step, policy, evaluate });
         }
+        if last || stopped || updated >= next_checkpoint {
+            let state = agent.save().map_err(|source| TrainError::at(step, source))?;
+            (outlets.checkpoint)(Checkpoint { step, state });
+            next_checkpoint = Instant::now() + plan.checkpoint_every.max(TRAINING_PER_SAVING * updated.elapsed());
+        }
+        outlets.metrics.saving_seconds.inc_by(updated.elapsed().as_secs_f64());
         if stopped {
             return Ok(Outcome::Stopped { step });
         }
@@ -151,7 +179,7 @@ pub fn train(
 
 fn check_finite(step: u64, metrics: &[Metric], values: &[f32]) -> Result<(), TrainError> {
     match metrics.iter().zip(values).find(|(_, value)| !value.is_finite()) {
-        Some((metric, value)) => Err(TrainError::Diverged { step, what: metric.name, value: *value }),
+        Some((metric, value)) => Err(TrainError::Diverged { step, what: format!("{} is {value}", metric.name) }),
         None => Ok(()),
     }
 }

@@ -1,18 +1,17 @@
 //! The learner's side of the wire, spoken to by made-up evaluators over TCP.
 #![allow(clippy::unwrap_used, clippy::expect_used)]
 
+use std::collections::{BTreeMap, HashMap};
 use std::net::TcpListener;
 use std::time::{Duration, Instant};
 
-use quad_learner::agent::PolicyFile;
 use quad_learner::hub::{self, EvaluationPlan, Hub};
 use quad_learner::inbox::{Inbox, inbox};
 use quad_learner::metrics::Metrics;
 use quad_learner::notice::Notice;
-use quad_learner::publisher::{self, Identity, SnapshotPublisher};
+use quad_learner::publisher::{self, Identity, Kept, SnapshotPublisher};
 use quad_learner::run_dir::RunDir;
 use quad_learner::scoreboard::{Rules, Scoreboard};
-use quad_learner::train::TrainedPolicy;
 use quad_learner::wire::Wire;
 use quad_protocol::{
     EpisodeScore, Hash, Job, JobReply, JobRequest, Message, Name, Origin, Progress, RecordedScores, ScoreReply,
@@ -48,7 +47,9 @@ fn name(text: &str) -> Name {
 fn tensors(step: u64) -> Vec<u8> {
     let bytes = vec![step as u8; 200_000];
     let tensor = TensorView::new(Dtype::U8, vec![bytes.len()], &bytes).unwrap();
-    safetensors::serialize([("weights", tensor)], None).unwrap()
+    let shape = "{\"kind\":\"gaussian\",\"observation_dim\":11,\"action_dim\":3,\"hidden\":8}";
+    let metadata = HashMap::from([("policy".to_owned(), shape.to_owned())]);
+    safetensors::serialize([("weights", tensor)], Some(metadata)).unwrap()
 }
 
 /// The file that is published of them.
@@ -80,8 +81,9 @@ impl Bench {
         let state = Hub::new(run.clone(), plan, Scoreboard::new(rules), log, metrics.clone(), notify.clone());
         let (hub, messages) = inbox();
         std::thread::spawn(move || state.run(&messages));
-        let identity = Identity { run: run.clone(), incarnation: INCARNATION, task, plan, candidates: 3 };
-        let state = SnapshotPublisher::new(identity, run_dir.clone(), metrics.clone(), hub.clone(), notify);
+        let identity = Identity { run: run.clone(), incarnation: INCARNATION, task };
+        let past = BTreeMap::new();
+        let state = SnapshotPublisher::new(identity, run_dir.clone(), metrics.clone(), hub.clone(), notify, past);
         let (publisher, messages) = inbox();
         std::thread::spawn(move || state.run(&messages));
 
@@ -97,9 +99,10 @@ impl Bench {
     }
 
     async fn snapshot(&mut self, step: u64) {
-        let policy =
-            TrainedPolicy { step, policy: PolicyFile { kind: "diffusion", bytes: tensors(step) }, evaluate: true };
-        self.publisher.send(publisher::Event::Trained(policy));
+        let tensors = file(step);
+        self.run_dir.write_snapshot(step, &tensors).unwrap();
+        let kept = Kept { step, kind: "diffusion", hash: Hash::of(&tensors), tensors };
+        self.publisher.send(publisher::Event::Kept(kept));
         self.until(|notice| matches!(notice, Notice::Published { step: published } if *published == step)).await;
     }
 

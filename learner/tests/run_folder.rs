@@ -297,10 +297,48 @@ fn a_run_without_scores_has_a_report_too() {
 fn a_folder_with_a_run_in_it_is_not_overwritten() {
     let folder = tempfile::tempdir().unwrap();
     let path = folder.path().join("a");
-    RunDir::check_free(&path).unwrap();
+    assert!(!RunDir::is_occupied(&path));
     RunDir::create(&path, &config("a", 0)).unwrap();
     assert!(matches!(RunDir::create(&path, &config("a", 1)), Err(RunDirError::Occupied(_))));
-    assert_eq!(RunDir::open(&path).unwrap().1, config("a", 0));
+    let (run, found) = RunDir::open(&path).unwrap();
+    assert_eq!(found, config("a", 0));
+
+    // Set aside, it is still there, and so is one that was set aside before.
+    for _ in 0..2 {
+        RunDir::open(&path).unwrap().0.set_aside().unwrap();
+        RunDir::create(&path, &config("a", 2)).unwrap();
+    }
+    assert_eq!(RunDir::open(&folder.path().join("a.old1")).unwrap().1, config("a", 0));
+    assert_eq!(RunDir::open(&folder.path().join("a.old2")).unwrap().1, config("a", 2));
+    drop(run);
+}
+
+#[test]
+fn one_learner_at_a_time_works_in_a_folder() {
+    let folder = tempfile::tempdir().unwrap();
+    let run = RunDir::create(&folder.path().join("a"), &config("a", 0)).unwrap();
+    let log = run.score_log().unwrap();
+    assert!(matches!(run.score_log(), Err(RunDirError::InUse(path)) if path == run.path()));
+    drop(log);
+    run.score_log().unwrap();
+}
+
+#[test]
+fn metrics_of_steps_that_come_again_are_cut_off() {
+    let folder = tempfile::tempdir().unwrap();
+    let run = RunDir::create(&folder.path().join("a"), &config("a", 0)).unwrap();
+    let row = |step: u64| serde_json::json!({ "step": step, "seconds": step as f64 / 10.0, "eta": 1.0 });
+    let (mut log, seconds) = run.metrics_log(0).unwrap();
+    assert_eq!(seconds, 0.0);
+    log.append(&[row(100), row(200), row(300)]).unwrap();
+    drop(log);
+    let (mut log, seconds) = run.metrics_log(250).unwrap();
+    assert_eq!(seconds, 20.0);
+    log.append(&[row(300)]).unwrap();
+    let text = std::fs::read_to_string(run.path().join("metrics.jsonl")).unwrap();
+    let steps: Vec<_> =
+        text.lines().map(|line| serde_json::from_str::<serde_json::Value>(line).unwrap()["step"].clone()).collect();
+    assert_eq!(steps, [100, 200, 300]);
 }
 
 #[test]
@@ -314,6 +352,13 @@ fn scores_survive_a_reopened_log_and_an_unfinished_line_is_left_out() {
     text.push_str("{\"step\":1,");
     std::fs::write(&path, &text).unwrap();
     assert_eq!(run.read_scores().unwrap(), [line(1, 1, 0.1), line(1, 2, 0.2)]);
+
+    // Whoever goes on cuts it off first, however long it is.
+    for tail in ["", &"x".repeat(200_000)] {
+        std::fs::write(&path, format!("{text}{tail}")).unwrap();
+        run.score_log().unwrap().append(&[line(1, 3, 0.3)]).unwrap();
+        assert_eq!(run.read_scores().unwrap(), [line(1, 1, 0.1), line(1, 2, 0.2), line(1, 3, 0.3)]);
+    }
 
     std::fs::write(&path, text + "\n").unwrap();
     let error = run.read_scores().unwrap_err().to_string();

@@ -59,8 +59,8 @@ impl Bench {
             lease: LEASE,
         };
         let mut board = Scoreboard::new(rules);
-        board.add_evaluation(2000, hash(2000), &Vec::from_iter(11..=17));
-        board.add_evaluation(1000, hash(1000), &Vec::from_iter(1..=7));
+        board.add_evaluation(2000, hash(2000), &Vec::from_iter(11..=17)).unwrap();
+        board.add_evaluation(1000, hash(1000), &Vec::from_iter(1..=7)).unwrap();
         Self { board, start: Instant::now() }
     }
 
@@ -289,7 +289,7 @@ fn a_report_that_is_not_of_this_job_is_refused() {
 fn an_evaluation_asked_for_twice_is_one() {
     let mut bench = Bench::new();
     let job = bench.job("a", 0);
-    bench.board.add_evaluation(1000, hash(1000), &Vec::from_iter(1..=7));
+    bench.board.add_evaluation(1000, hash(1000), &Vec::from_iter(1..=7)).unwrap();
     assert_eq!((bench.board.pending(), bench.job("b", 0).seeds), (14, vec![6, 7]));
     assert_eq!(job.seeds.len(), 5);
 }

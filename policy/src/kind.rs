@@ -64,6 +64,16 @@ impl Description {
         }
     }
 
+    /// What a safetensors file says that it is.
+    ///
+    /// # Errors
+    /// No such file, or one that says nothing of the kind.
+    pub fn read(file: &[u8]) -> Result<Self, PolicyError> {
+        let (_, metadata) = SafeTensors::read_metadata(file)?;
+        let described = metadata.metadata().as_ref().and_then(|metadata| metadata.get(DESCRIPTION));
+        Ok(serde_json::from_str(described.ok_or(PolicyError::NoDescription)?)?)
+    }
+
     /// A safetensors file of a policy's weights that says what they are: always the same bytes for the same numbers.
     ///
     /// # Errors
@@ -84,9 +94,7 @@ impl Description {
 /// # Errors
 /// A file that is not what it should be, or a kind of policy that is not known here.
 pub fn load_policy(bytes: &[u8], precision: Precision) -> Result<Box<dyn Policy>, PolicyError> {
-    let (_, metadata) = SafeTensors::read_metadata(bytes)?;
-    let described = metadata.metadata().as_ref().and_then(|metadata| metadata.get(DESCRIPTION));
-    let description = serde_json::from_str(described.ok_or(PolicyError::NoDescription)?)?;
+    let description = Description::read(bytes)?;
     let mut tensors = read_tensors(bytes)?;
     let policy: Box<dyn Policy> = match description {
         Description::Diffusion(shape) => Box::new(DiffusionPolicy::load(shape, &mut tensors, precision)?),

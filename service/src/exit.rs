@@ -21,10 +21,7 @@ impl<T, E: Into<anyhow::Error>> Hint<T> for Result<T, E> {
     type Error = E;
 
     fn hint(self, hint: impl fmt::Display) -> anyhow::Result<T> {
-        self.map_err(|error| {
-            let error = error.into();
-            if error.is::<Hinted>() { error } else { Hinted { error, hint: hint.to_string() }.into() }
-        })
+        self.map_err(|error| hinted(error, hint))
     }
 
     fn hint_of<H: fmt::Display>(self, hint: impl FnOnce(&E) -> H) -> anyhow::Result<T> {
@@ -34,6 +31,12 @@ impl<T, E: Into<anyhow::Error>> Hint<T> for Result<T, E> {
             None => self.map_err(Into::into),
         }
     }
+}
+
+/// An error with advice, which is shown below it; one that has advice already keeps that.
+pub fn hinted(error: impl Into<anyhow::Error>, hint: impl fmt::Display) -> anyhow::Error {
+    let error = error.into();
+    if error.is::<Hinted>() { error } else { Hinted { error, hint: hint.to_string() }.into() }
 }
 
 /// An error with advice; everything else is the error's own.

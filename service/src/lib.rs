@@ -16,7 +16,7 @@ mod metrics_server;
 mod session;
 mod shutdown;
 
-pub use exit::{Hint, run_main};
+pub use exit::{Hint, hinted, run_main};
 pub use logging::init_logging;
 pub use metrics_server::{BindError, MetricsServer, serve_metrics};
 pub use session::{Endpoints, SessionError, open_session, parse_endpoint, reachable_at};

@@ -1,22 +1,48 @@
 //! The signals that end a process.
 
 use std::pin::pin;
+use std::time::Duration;
 
 use tokio::signal::unix::{Signal, SignalKind, signal};
+use tokio::sync::oneshot;
 use tracing::{info, warn};
+
+/// A process that was told to end has so long for it: less than the 10 s after which Docker kills.
+const LEAVE_WITHIN: Duration = Duration::from_secs(9);
+/// What a shell reports of a process that SIGINT has ended.
+const ENDED_AT_ONCE: i32 = 130;
 
 /// Becomes ready at the first SIGINT (Ctrl-C) or SIGTERM after this call, even if it is not awaited by then.
 ///
-/// From this call on, the two signals do not end the process by themselves any more. Needs a tokio runtime.
+/// From this call on, the first of the two signals does not end the process by itself any more. The second one does, at
+/// once, with exit code 130; and so does the process itself if it is still there 9 s after the first, whatever it waits
+/// for. Needs a tokio runtime, and lasts as long as that.
 pub fn shutdown_signal() -> impl Future<Output = ()> + Send {
-    let (interrupt, terminate) = (listen(SignalKind::interrupt()), listen(SignalKind::terminate()));
-    async move {
-        let (interrupt, terminate) = (pin!(received(interrupt)), pin!(received(terminate)));
-        let name = tokio::select! {
-            () = interrupt => "SIGINT",
-            () = terminate => "SIGTERM",
-        };
+    let (mut interrupt, mut terminate) = (listen(SignalKind::interrupt()), listen(SignalKind::terminate()));
+    let (tell, told) = oneshot::channel();
+    tokio::spawn(async move {
+        let name = either(&mut interrupt, &mut terminate).await;
         info!("received {name}");
+        tell.send(()).ok();
+        match tokio::time::timeout(LEAVE_WITHIN, either(&mut interrupt, &mut terminate)).await {
+            Ok(again) => warn!("received {again} after {name}: ending at once"),
+            Err(_) => warn!("{} s after {name} something still hangs: ending at once", LEAVE_WITHIN.as_secs()),
+        }
+        std::process::exit(ENDED_AT_ONCE);
+    });
+    async move {
+        if told.await.is_err() {
+            // Nobody listens to signals any more, so none will come.
+            std::future::pending::<()>().await;
+        }
+    }
+}
+
+async fn either(interrupt: &mut Option<Signal>, terminate: &mut Option<Signal>) -> &'static str {
+    let (interrupt, terminate) = (pin!(received(interrupt)), pin!(received(terminate)));
+    tokio::select! {
+        () = interrupt => "SIGINT",
+        () = terminate => "SIGTERM",
     }
 }
 
@@ -25,9 +51,9 @@ fn listen(kind: SignalKind) -> Option<Signal> {
     signal(kind).inspect_err(|error| warn!("cannot prepare for a clean shutdown: {error}")).ok()
 }
 
-async fn received(signal: Option<Signal>) {
+async fn received(signal: &mut Option<Signal>) {
     match signal {
-        Some(mut signal) => {
+        Some(signal) => {
             signal.recv().await;
         }
         None => std::future::pending().await,

@@ -128,6 +128,8 @@ impl Scratch {
     pub fn learner_with(&self, run: &str, setting: Setting, arguments: &[&str]) -> Learner {
         let preset = self.preset(run, setting);
         let run_dir = self.path().join(run);
+        // An earlier learner's in the same folder.
+        fs::remove_file(run_dir.join("endpoints.json")).ok();
         let mut command = Command::new(binary("learner"));
         command.arg("train").arg("--preset").arg(preset).arg("--dataset").arg(self.dataset());
         command.arg("--run-dir").arg(&run_dir).args(["--metrics", "127.0.0.1:0"]).args(arguments);

@@ -1,6 +1,6 @@
 //! Runs that are alike but for their seed, and what becomes of those that are not.
 
-use std::collections::{BTreeMap, BTreeSet};
+use std::collections::BTreeSet;
 
 use quad_dataset::catalogue::{self, Checksum};
 use serde::Serialize;
@@ -10,7 +10,7 @@ use super::published::{self, Published};
 use super::run::RunReport;
 use crate::config::{self, Experiment};
 use crate::device::Device;
-use crate::presets;
+use crate::settings::{self, Settings, differences};
 
 /// Runs that differ in their seed alone: in preset, data, device, precision and every hyper-parameter they agree.
 #[derive(Clone, Debug, PartialEq, Serialize)]
@@ -48,9 +48,6 @@ pub struct GroupReport {
     /// What is published for the task.
     pub published: Vec<Published>,
 }
-
-/// Everything that runs must share to be averaged over their seeds, by dotted key.
-type Settings = BTreeMap<String, String>;
 
 /// Sorts runs into groups, in the order in which they are given.
 pub(super) fn groups(runs: &[RunReport]) -> Vec<GroupReport> {
@@ -111,36 +108,18 @@ fn group(runs: &[&RunReport], differs: Vec<String>) -> GroupReport {
     }
 }
 
+/// Everything that runs must share to be averaged over their seeds.
 fn settings(run: &RunReport) -> Settings {
-    let mut settings = experiment(&run.config.experiment);
-    let mut dataset = flat(&run.config.dataset);
-    // The same file may lie in several places. Where the hash of its contents is known, it says all.
-    dataset.remove("path");
-    if dataset.contains_key("sha256") {
-        dataset.retain(|key, _| key == "sha256");
-    }
-    settings.extend(dataset.into_iter().map(|(key, value)| (format!("dataset.{key}"), value)));
-    settings.insert("device".to_owned(), run.config.run.device.name().to_owned());
+    let mut settings = settings::of_run(&run.config);
+    settings.remove("seed");
     settings.insert("scored in".to_owned(), run.scored_in.clone());
     settings
 }
 
-/// What is set, but for the seed, and for the name of the dataset, which says less than its contents.
 fn experiment(experiment: &Experiment) -> Settings {
-    let mut settings = flat(experiment);
-    settings.retain(|key, _| key != "seed" && key != "dataset");
+    let mut settings = settings::of_experiment(experiment);
+    settings.remove("seed");
     settings
-}
-
-fn flat(value: &impl Serialize) -> Settings {
-    // Everything here was read from TOML, so it can be written.
-    let table = toml::Table::try_from(value).unwrap_or_default();
-    presets::keys(&table).into_iter().map(|(key, value)| (key, value.to_string())).collect()
-}
-
-/// The keys at which two settings differ.
-fn differences<'a>(a: &'a Settings, b: &'a Settings) -> impl Iterator<Item = &'a String> {
-    a.keys().chain(b.keys()).filter(|key| a.get(*key) != b.get(*key))
 }
 
 /// Whether a run learnt from the dataset of that name, whatever it was called on the command line.

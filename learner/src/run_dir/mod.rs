@@ -5,18 +5,29 @@
 //! endpoints.json                     where this learner can be reached; written as soon as it listens
 //! metrics.jsonl                      training metrics, a line every hundred gradient steps
 //! scores.jsonl                       a line per scored episode, written before the evaluator gets its acknowledgement
-//! snapshots/step_000003000.safetensors   target actor and target critics
+//! snapshots/step_000003000.safetensors   target actor and target critics; written before the evaluation of it begins
+//! checkpoints/step_000003000_….safetensors   the newest three states of the training, to go on from
 //! report.json, learning_curve.svg    written at the end
 //! ```
+//!
+//! The learner that works in the folder holds a lock on `scores.jsonl`.
 
-use std::fs::{self, File, OpenOptions};
-use std::io::{self, Write};
+mod checkpoints;
+mod durable;
+mod log;
+
+use std::fs;
+use std::io;
 use std::path::{Path, PathBuf};
 
 use quad_protocol::{EpisodeScore, ScoreReport};
 use serde::{Deserialize, Serialize};
 
 use crate::config::RunConfig;
+pub use checkpoints::Checkpoint;
+use checkpoints::Checkpoints;
+use durable::replace;
+pub use log::Log;
 
 /// A run folder that cannot be used.
 #[derive(Debug, thiserror::Error)]
@@ -24,6 +35,9 @@ pub enum RunDirError {
     /// There is a run in it.
     #[error("there is already a run in {0}")]
     Occupied(PathBuf),
+    /// Another learner works in it.
+    #[error("another learner is at work in {0}")]
+    InUse(PathBuf),
     /// Reading or writing failed.
     #[error("cannot {action} {path}")]
     Io {
@@ -92,6 +106,12 @@ impl ScoreLine {
             evaluator: report.evaluator.to_string(),
         }
     }
+
+    /// The episode of the line.
+    pub fn episode(&self) -> EpisodeScore {
+        let Self { seed, episode_return, length, score, .. } = *self;
+        EpisodeScore { seed, episode_return, length, score }
+    }
 }
 
 /// The folder of one run.
@@ -101,21 +121,42 @@ pub struct RunDir {
 }
 
 impl RunDir {
-    /// Fails if there is a run in the folder, as [`create`](Self::create) would, but changes nothing.
-    pub fn check_free(path: &Path) -> Result<(), RunDirError> {
-        if path.join("config.toml").exists() { Err(RunDirError::Occupied(path.to_owned())) } else { Ok(()) }
+    /// Whether there is a run in the folder.
+    pub fn is_occupied(path: &Path) -> bool {
+        path.join("config.toml").exists()
     }
 
     /// Makes the folder and saves the configuration.
+    ///
+    /// # Errors
+    /// There is a run in it, or it cannot be written to.
     pub fn create(path: &Path, config: &RunConfig) -> Result<Self, RunDirError> {
-        Self::check_free(path)?;
+        if Self::is_occupied(path) {
+            return Err(RunDirError::Occupied(path.to_owned()));
+        }
         let run = Self { path: path.to_owned() };
         let snapshots = path.join("snapshots");
         fs::create_dir_all(&snapshots).map_err(io_error("create", &snapshots))?;
         let target = path.join("config.toml");
         let text = toml::to_string(config).map_err(|error| content(&target, None, &error))?;
         replace(&target, text.as_bytes())?;
+        durable::synchronise_folder(path).map_err(io_error("write", path))?;
         Ok(run)
+    }
+
+    /// Renames the folder to one that says that it is older; gives the new path.
+    pub fn set_aside(self) -> Result<PathBuf, RunDirError> {
+        let name = self.path.file_name().unwrap_or_default().to_string_lossy();
+        let mut number = 1;
+        let aside = loop {
+            let candidate = self.path.with_file_name(format!("{name}.old{number}"));
+            if !candidate.exists() {
+                break candidate;
+            }
+            number += 1;
+        };
+        fs::rename(&self.path, &aside).map_err(io_error("rename", &self.path))?;
+        Ok(aside)
     }
 
     /// A folder that a learner has written; reads its configuration.
@@ -141,6 +182,15 @@ impl RunDir {
         self.write_json("endpoints.json", endpoints)
     }
 
+    /// Forgets where an earlier learner could be reached.
+    pub fn remove_endpoints(&self) -> Result<(), RunDirError> {
+        let path = self.path.join("endpoints.json");
+        match fs::remove_file(&path) {
+            Err(error) if error.kind() == io::ErrorKind::NotFound => Ok(()),
+            removed => removed.map_err(io_error("remove", &path)),
+        }
+    }
+
     /// Writes a value as indented JSON; a reader sees the old file or the new one, never half of it.
     pub fn write_json(&self, name: &str, value: &impl Serialize) -> Result<(), RunDirError> {
         let path = self.path.join(name);
@@ -153,7 +203,7 @@ impl RunDir {
         self.path.join("snapshots").join(format!("step_{step:09}.safetensors"))
     }
 
-    /// Saves the snapshot of a gradient step.
+    /// Saves the snapshot of a gradient step. It survives a power cut from then on.
     pub fn write_snapshot(&self, step: u64, tensors: &[u8]) -> Result<(), RunDirError> {
         replace(&self.snapshot_path(step), tensors)
     }
@@ -164,14 +214,55 @@ impl RunDir {
         fs::read(&path).map_err(io_error("read", &path))
     }
 
-    /// `scores.jsonl`, opened for appending. Each append is synchronised, so acknowledged scores survive a crash.
+    /// The gradient steps of which there are snapshots, in ascending order.
+    pub fn snapshots(&self) -> Result<Vec<u64>, RunDirError> {
+        let folder = self.path.join("snapshots");
+        let entries = fs::read_dir(&folder).map_err(io_error("read", &folder))?;
+        let step = |entry: io::Result<fs::DirEntry>| {
+            let name = entry.ok()?.file_name();
+            name.to_str()?.strip_prefix("step_")?.strip_suffix(".safetensors")?.parse().ok()
+        };
+        let mut steps: Vec<u64> = entries.filter_map(step).collect();
+        steps.sort_unstable();
+        Ok(steps)
+    }
+
+    /// Saves a state of the training, durably, and removes those that are older than the newest three.
+    pub fn write_checkpoint(&self, checkpoint: &Checkpoint) -> Result<(), RunDirError> {
+        Checkpoints::of_run(&self.path).save(checkpoint)
+    }
+
+    /// The newest state of the training that is not damaged; none if there is none.
+    pub fn newest_checkpoint(&self) -> Result<Option<Checkpoint>, RunDirError> {
+        Checkpoints::of_run(&self.path).newest()
+    }
+
+    /// `scores.jsonl`, opened for appending and locked. Each append is synchronised, so acknowledged scores survive a crash.
+    ///
+    /// # Errors
+    /// [`RunDirError::InUse`] if another learner works in this folder.
     pub fn score_log(&self) -> Result<Log, RunDirError> {
         Log::open(self.path.join("scores.jsonl"), true)
     }
 
-    /// `metrics.jsonl`, opened for appending.
-    pub fn metrics_log(&self) -> Result<Log, RunDirError> {
-        Log::open(self.path.join("metrics.jsonl"), false)
+    /// `metrics.jsonl`, opened for appending, without the lines after `step`: a learner that goes on from there writes them
+    /// again. Also gives the seconds of training that its last line tells.
+    pub fn metrics_log(&self, step: u64) -> Result<(Log, f64), RunDirError> {
+        #[derive(Deserialize)]
+        struct Line {
+            step: u64,
+            seconds: f64,
+        }
+        let mut log = Log::open(self.path.join("metrics.jsonl"), false)?;
+        let mut seconds = 0.0;
+        log.keep_while(|line| match serde_json::from_str::<Line>(line) {
+            Ok(line) if line.step <= step => {
+                seconds = line.seconds;
+                true
+            }
+            _ => false,
+        })?;
+        Ok((log, seconds))
     }
 
     /// The lines of `scores.jsonl`; none if nothing was scored yet. A last line that is not complete yet is left out.
@@ -187,53 +278,6 @@ impl RunDir {
         };
         complete.lines().enumerate().map(parse).collect()
     }
-}
-
-/// A file of JSON lines that only grows.
-#[derive(Debug)]
-pub struct Log {
-    path: PathBuf,
-    file: File,
-    length: u64,
-    synchronise: bool,
-}
-
-impl Log {
-    fn open(path: PathBuf, synchronise: bool) -> Result<Self, RunDirError> {
-        let opened = OpenOptions::new().create(true).append(true).open(&path);
-        let file = opened.map_err(io_error("open", &path))?;
-        let length = file.metadata().map_err(io_error("open", &path))?.len();
-        Ok(Self { path, file, length, synchronise })
-    }
-
-    /// Appends lines: all of them, or none if it fails.
-    pub fn append<T: Serialize>(&mut self, lines: &[T]) -> Result<(), RunDirError> {
-        let mut text = Vec::new();
-        for line in lines {
-            serde_json::to_writer(&mut text, line).map_err(|error| content(&self.path, None, &error))?;
-            text.push(b'\n');
-        }
-        let written = self.file.write_all(&text).and_then(|()| match self.synchronise {
-            true => self.file.sync_data(),
-            false => Ok(()),
-        });
-        if let Err(error) = written {
-            // Half a line would make the next one unreadable.
-            self.file.set_len(self.length).ok();
-            return Err(io_error("write", &self.path)(error));
-        }
-        self.length += text.len() as u64;
-        Ok(())
-    }
-}
-
-/// Writes beside the target, then renames.
-fn replace(target: &Path, bytes: &[u8]) -> Result<(), RunDirError> {
-    let mut name = target.file_name().unwrap_or_default().to_owned();
-    name.push(".partial");
-    let partial = target.with_file_name(name);
-    let written = fs::write(&partial, bytes).and_then(|()| fs::rename(&partial, target));
-    written.map_err(io_error("write", target))
 }
 
 fn io_error(action: &'static str, path: &Path) -> impl FnOnce(io::Error) -> RunDirError {

@@ -1,0 +1,148 @@
+//! A run folder that is there already: whether this learner may go on in it, and what an earlier one left.
+
+use std::collections::{BTreeMap, BTreeSet};
+use std::path::PathBuf;
+
+use anyhow::{anyhow, bail};
+use quad_protocol::{EpisodeScore, Hash};
+use quad_service::{Hint, hinted};
+use tracing::{info, warn};
+
+use crate::config::{Experiment, RunConfig};
+use crate::run_dir::{Checkpoint, Log, RunDir, RunDirError, ScoreLine};
+use crate::settings;
+
+/// The folder of a run that has begun, locked.
+pub struct Begun {
+    dir: RunDir,
+    config: RunConfig,
+    scores: Log,
+}
+
+/// What a run has reached so far; nothing for one that begins.
+#[derive(Default)]
+pub struct Past {
+    /// Where the training goes on.
+    pub checkpoint: Option<Checkpoint>,
+    /// The snapshots on disk that evaluations may be of, by step.
+    pub snapshots: BTreeMap<u64, Hash>,
+    /// The scores on disk, by step.
+    pub scores: BTreeMap<u64, Earlier>,
+}
+
+/// The scores of one step that an earlier learner wrote down.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Earlier {
+    /// Hash of the snapshot that was scored, as text.
+    pub weights: String,
+    /// Each seed once.
+    pub episodes: Vec<EpisodeScore>,
+}
+
+/// Opens and locks the folder if there is a run in it.
+///
+/// # Errors
+/// Another learner is at work there, or a file is not what a learner writes.
+pub fn open(path: PathBuf) -> anyhow::Result<Option<Begun>> {
+    if !RunDir::is_occupied(&path) {
+        return Ok(None);
+    }
+    let (dir, config) = RunDir::open(&path)?;
+    let scores = dir.score_log().hint("wait for its end, or choose another --run-dir")?;
+    Ok(Some(Begun { dir, config, scores }))
+}
+
+impl Begun {
+    /// That the run is the one that `config` describes.
+    ///
+    /// # Errors
+    /// Every setting that differs.
+    pub fn check_same(&self, config: &RunConfig) -> anyhow::Result<()> {
+        let (old, new) = (settings::of_run(&self.config), settings::of_run(config));
+        let value = |settings: &settings::Settings, key: &String| settings.get(key).cloned();
+        let line = |key: &String| {
+            let [old, new] = [&old, &new].map(|side| value(side, key).unwrap_or_else(|| "not set".to_owned()));
+            format!("{key}: {old} there, {new} here")
+        };
+        let differences: Vec<_> = settings::differences(&old, &new).map(line).collect();
+        if !differences.is_empty() {
+            let (path, differences) = (self.dir.path().display(), differences.join("; "));
+            let error = anyhow!("there is a run of another configuration in {path} ({differences})");
+            return Err(hinted(
+                error,
+                "choose another --run-dir; or --fresh, which renames that folder and begins anew",
+            ));
+        }
+        if self.config.run.version != config.run.version {
+            let (old, new) = (&self.config.run.version, &config.run.version);
+            warn!("the run was begun by version {old}, this is {new}: its numbers may go on differently");
+        }
+        Ok(())
+    }
+
+    /// Renames the folder, so that another run can begin in its place.
+    pub fn set_aside(self) -> Result<(), RunDirError> {
+        let aside = self.dir.set_aside()?;
+        info!("the run that was there is now {}", aside.display());
+        Ok(())
+    }
+
+    /// The folder, its log of scores, and what the run has reached.
+    ///
+    /// # Errors
+    /// A file cannot be read, or its contents are none that a learner writes.
+    pub fn go_on(self, experiment: &Experiment) -> anyhow::Result<(RunDir, Log, Past)> {
+        let Self { dir, scores, .. } = self;
+        dir.remove_endpoints()?;
+        let past = Past::read(&dir, experiment)?;
+        info!("{}", past.summary(&dir));
+        Ok((dir, scores, past))
+    }
+}
+
+impl Past {
+    fn read(dir: &RunDir, experiment: &Experiment) -> anyhow::Result<Self> {
+        let checkpoint = dir.newest_checkpoint()?;
+        let step = checkpoint.as_ref().map_or(0, |checkpoint| checkpoint.step);
+        let scores = by_step(dir.read_scores()?)?;
+        let mut snapshots = BTreeMap::new();
+        for of in dir.snapshots()?.into_iter().filter(|of| experiment.is_evaluated(*of)) {
+            // One that the training comes by again, and that nobody has looked at, will be made again.
+            if of <= step || scores.contains_key(&of) {
+                snapshots.insert(of, Hash::of(&dir.read_snapshot(of)?));
+            }
+        }
+        for (of, earlier) in &scores {
+            let missing = !snapshots.contains_key(of) && *of <= step;
+            if missing && earlier.episodes.len() < experiment.episodes as usize {
+                warn!("the snapshot of step {of} is gone: its evaluation stays incomplete");
+            }
+        }
+        Ok(Self { checkpoint, snapshots, scores })
+    }
+
+    fn summary(&self, dir: &RunDir) -> String {
+        let step = self.checkpoint.as_ref().map_or(0, |checkpoint| checkpoint.step);
+        let scores: usize = self.scores.values().map(|earlier| earlier.episodes.len()).sum();
+        format!("the run in {} goes on after step {step}; {scores} episodes are scored", dir.path().display())
+    }
+}
+
+/// The scores of each step, which all are of the same weights, with each seed once.
+fn by_step(lines: Vec<ScoreLine>) -> anyhow::Result<BTreeMap<u64, Earlier>> {
+    let mut scores: BTreeMap<u64, Earlier> = BTreeMap::new();
+    let mut seen = BTreeSet::new();
+    for line in lines {
+        let (step, seed) = (line.step, line.seed);
+        let earlier =
+            scores.entry(step).or_insert_with(|| Earlier { weights: line.weights.clone(), episodes: Vec::new() });
+        if earlier.weights != line.weights {
+            bail!("scores.jsonl has scores of two different snapshots of step {step}");
+        }
+        if !seen.insert((step, seed)) {
+            bail!("scores.jsonl has two scores of step {step}, seed {seed}");
+        }
+        earlier.episodes.push(line.episode());
+    }
+    Ok(scores)
+}

@@ -1,0 +1,40 @@
+//! Files that are whole whatever happens: the old contents or the new ones, also after a power cut.
+
+use std::ffi::OsString;
+use std::fs::{self, File};
+use std::io::{self, Write};
+use std::path::{Path, PathBuf};
+
+use super::{RunDirError, io_error};
+
+/// Replaces the file `target`: written beside it, synchronised, renamed, and the folder synchronised, without which a power
+/// cut could undo the renaming.
+pub(super) fn replace(target: &Path, bytes: &[u8]) -> Result<(), RunDirError> {
+    let partial = partial(target);
+    write_synchronised(&partial, bytes)
+        .and_then(|()| fs::rename(&partial, target))
+        .and_then(|()| synchronise_folder(target))
+        .inspect_err(|_| {
+            // On a full disk the half file would keep others from being written.
+            fs::remove_file(&partial).ok();
+        })
+        .map_err(io_error("write", target))
+}
+
+fn partial(target: &Path) -> PathBuf {
+    let mut name = OsString::from(target.file_name().unwrap_or_default());
+    name.push(".partial");
+    target.with_file_name(name)
+}
+
+fn write_synchronised(path: &Path, bytes: &[u8]) -> io::Result<()> {
+    let mut file = File::create(path)?;
+    file.write_all(bytes)?;
+    file.sync_all()
+}
+
+/// Makes the names in the folder that `path` lies in durable.
+pub(super) fn synchronise_folder(path: &Path) -> io::Result<()> {
+    let folder = path.parent().filter(|folder| !folder.as_os_str().is_empty()).unwrap_or(Path::new("."));
+    File::open(folder)?.sync_all()
+}

@@ -1,0 +1,164 @@
+//! A learner that is killed, stopped or short of disk goes on where it was: the same weights and the same scores.
+#![allow(clippy::unwrap_used, clippy::expect_used)]
+
+use std::collections::BTreeMap;
+use std::fs;
+use std::path::Path;
+use std::time::{Duration, Instant};
+
+use quad_tests::system::{Learner, Scratch, Setting, free_port};
+use quad_tests::{PATIENCE, eventually};
+use rand::{Rng, SeedableRng};
+use rand_chacha::ChaCha8Rng;
+
+/// A few seconds of training with evaluations all along.
+const LONG: Setting = Setting { steps: 3000, eval_interval: 300, episodes: 4, candidates: 2, hidden: 64, seed: 5 };
+const CHECKPOINTS: [&str; 2] = ["--checkpoint-seconds", "0"];
+
+/// The scores of a run, whoever measured them: (step, seed) to (weights, return as bits).
+fn scores(learner: &Learner) -> BTreeMap<(u64, u64), (String, u64)> {
+    let scores = learner.scores();
+    let count = scores.len();
+    let by_key: BTreeMap<_, _> = scores
+        .iter()
+        .map(|score| (score.key(), (score.text("weights").to_owned(), score.number("return").to_bits())))
+        .collect();
+    assert_eq!(by_key.len(), count, "a (step, seed) has two scores");
+    by_key
+}
+
+/// The files of a folder, name by name.
+fn files(folder: &Path) -> BTreeMap<String, Vec<u8>> {
+    let entries = fs::read_dir(folder).unwrap().map(|entry| entry.unwrap());
+    entries.map(|entry| (entry.file_name().into_string().unwrap(), fs::read(entry.path()).unwrap())).collect()
+}
+
+/// A run that nothing happens to.
+fn undisturbed(scratch: &Scratch) -> Learner {
+    let mut learner = scratch.learner("undisturbed", LONG);
+    let _evaluator = scratch.evaluator("calm", &learner.endpoint());
+    let status = learner.process.wait(PATIENCE);
+    assert!(status.success(), "the learner ended with {status}");
+    learner.assert_complete(&LONG);
+    learner
+}
+
+/// That the last snapshot, the last checkpoint and all scores are those of another run of the same seed.
+fn assert_same(learner: &Learner, other: &Learner) {
+    learner.assert_complete(&LONG);
+    assert!(files(&learner.run_dir.join("snapshots")) == files(&other.run_dir.join("snapshots")), "snapshots differ");
+    let last = |learner: &Learner| files(&learner.run_dir.join("checkpoints")).pop_last().unwrap();
+    assert!(last(learner) == last(other), "the last checkpoints differ");
+    assert_eq!(scores(learner), scores(other));
+}
+
+#[test]
+fn a_learner_killed_at_any_moment_ends_with_the_weights_and_scores_of_one_left_alone() {
+    let scratch = Scratch::new();
+    let calm = undisturbed(&scratch);
+    let endpoint = format!("tcp/127.0.0.1:{}", free_port());
+    let _evaluator = scratch.evaluator("loyal", &endpoint);
+    let mut moments = ChaCha8Rng::seed_from_u64(1);
+    let arguments = [&["--listen", &endpoint][..], &CHECKPOINTS].concat();
+    let mut gone_on = 0;
+    for _ in 0..10 {
+        let mut learner = scratch.learner_with("run", LONG, &arguments);
+        std::thread::sleep(Duration::from_millis(moments.random_range(50..1500)));
+        learner.process.kill();
+        gone_on += usize::from(learner.process.log().contains("goes on after step"));
+        scores(&learner);
+    }
+    assert!(gone_on > 5, "only {gone_on} of ten lives went on from another one");
+    let mut learner = scratch.learner_with("run", LONG, &arguments);
+    let status = learner.process.wait(PATIENCE);
+    assert!(status.success(), "the learner ended with {status}");
+    assert_same(&learner, &calm);
+
+    // A run that is complete is so at once.
+    let mut again = scratch.learner_with("run", LONG, &arguments);
+    assert!(again.process.wait(PATIENCE).success());
+    assert!(again.process.out().contains("mean score of the last 3 evaluations"), "{}", again.process.out());
+    assert_same(&again, &calm);
+}
+
+#[test]
+fn a_stopped_learner_goes_on_from_its_very_step() {
+    let scratch = Scratch::new();
+    let setting = Setting { steps: 100_000_000, ..LONG };
+    let learner = |arguments: &[&str]| {
+        scratch.learner_with("run", setting, &[&["--listen", "tcp/127.0.0.1:0"], arguments].concat())
+    };
+    let step_of = |learner: &Learner| -> u64 {
+        let line = learner.process.wait_for_log("goes on after step", PATIENCE);
+        let step = line.split("goes on after step ").nth(1).unwrap().split(';').next().unwrap();
+        step.parse().unwrap()
+    };
+    let mut first = learner(&[]);
+    first.process.wait_for_log("snapshot handed to evaluation", PATIENCE);
+    let (duration, status) = first.process.terminate(PATIENCE);
+    assert_eq!(status.code(), Some(1));
+    assert!(duration < Duration::from_secs(10), "it took {duration:?} to leave");
+    assert!(first.process.log().contains("the same command goes on from there"), "{}", first.process.log());
+
+    let mut second = learner(&[]);
+    let step = step_of(&second);
+    assert!(step >= 300, "{step}");
+    // A damaged checkpoint falls back to the one before, here to the very beginning.
+    second.process.kill();
+    let (name, mut bytes) = files(&second.run_dir.join("checkpoints")).pop_last().unwrap();
+    bytes.truncate(bytes.len() / 2);
+    fs::write(second.run_dir.join("checkpoints").join(name), bytes).unwrap();
+    let mut third = learner(&[]);
+    assert!(step_of(&third) < step);
+    assert!(third.process.log().contains("is damaged"), "{}", third.process.log());
+    third.process.terminate(PATIENCE);
+
+    // Another configuration is refused with what differs, and changes nothing; begun anew, the old one is kept.
+    let mut other = learner(&["--seed", "6"]);
+    assert_eq!(other.process.wait(PATIENCE).code(), Some(1));
+    let log = other.process.log();
+    assert!(log.contains("seed: 5 there, 6 here") && log.contains("--fresh"), "{log}");
+    let fresh = learner(&["--seed", "6", "--fresh"]);
+    fresh.process.wait_for_log("snapshot handed to evaluation", PATIENCE);
+    assert!(scratch.path().join("run.old1/config.toml").exists());
+    assert!(!fresh.process.log().contains("goes on after step"));
+
+    // While it is at work, nobody else may be.
+    let mut twin = learner(&["--seed", "6"]);
+    assert_eq!(twin.process.wait(PATIENCE).code(), Some(1));
+    assert!(twin.process.log().contains("another learner is at work"), "{}", twin.process.log());
+}
+
+#[test]
+fn weights_that_come_out_otherwise_for_a_scored_step_end_the_run() {
+    let scratch = Scratch::new();
+    let mut learner = scratch.learner("run", LONG);
+    let _evaluator = scratch.evaluator("one", &learner.endpoint());
+    eventually("there are scores", PATIENCE, || (!learner.scores().is_empty()).then_some(()));
+    learner.process.kill();
+    let before = fs::read(learner.run_dir.join("scores.jsonl")).unwrap();
+    // As if the scores were of another machine's bits: no checkpoint, and a snapshot that training will not make again.
+    fs::remove_dir_all(learner.run_dir.join("checkpoints")).ok();
+    let weights = learner.scores()[0].text("weights").to_owned();
+    let changed = String::from_utf8(before).unwrap().replace(&weights, &"0".repeat(64));
+    fs::write(learner.run_dir.join("scores.jsonl"), &changed).unwrap();
+    let mut learner = scratch.learner("run", LONG);
+    assert_eq!(learner.process.wait(PATIENCE).code(), Some(1));
+    assert!(learner.process.log().contains("were scored before"), "{}", learner.process.log());
+    assert!(learner.process.log().contains("hint: another kind of processor"), "{}", learner.process.log());
+}
+
+#[test]
+fn a_second_signal_ends_the_learner_at_once() {
+    let scratch = Scratch::new();
+    let setting = Setting { steps: 100_000_000, ..LONG };
+    let mut learner = scratch.learner("run", setting);
+    learner.process.wait_for_log("snapshot handed to evaluation", PATIENCE);
+    // With one signal it would wait for the end of the session.
+    let start = Instant::now();
+    learner.process.signal("INT");
+    learner.process.signal("INT");
+    let status = learner.process.wait(PATIENCE);
+    assert!(start.elapsed() < Duration::from_secs(2), "{:?}", start.elapsed());
+    assert!(matches!(status.code(), Some(1 | 130)), "{status}");
+}
