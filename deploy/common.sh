@@ -33,6 +33,7 @@ make_scratch() {
 start_learner() {
   local run=$1
   shift
+  rm -f "$run/endpoints.json" # an earlier learner's
   target/release/learner train --run-dir "$run" --listen tcp/127.0.0.1:0 "$@" &
   learner=$!
   until [ -e "$run/endpoints.json" ]; do

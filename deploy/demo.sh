@@ -2,7 +2,9 @@
 # The demonstration: from a file of mediocre Hopper data to a policy that hops, by a learner and two evaluators over Zenoh.
 #
 # Sets up what is missing, builds, records the dataset if it is not there, trains, and ends with the run's table and
-# learning curve. Run again, it skips what is done. Ctrl-C stops everything.
+# learning curve. Run again, it skips what is done: a run that was interrupted goes on where it was. Ctrl-C stops everything.
+#
+#   deploy/demo.sh [--fresh]        --fresh: begin another run; the one that is there is kept under another name
 set -euo pipefail
 cd "$(dirname "$0")/.."
 . deploy/common.sh
@@ -25,19 +27,13 @@ if [ ! -e "$DATASET" ]; then
   $BIN/evaluator collect --env hopper --out "$DATASET"
 fi
 
-if [ -e "$RUN/complete" ]; then
+if [ -e "$RUN/complete" ] && [ $# -eq 0 ]; then
   $BIN/learner report "$RUN"
   echo "learning curve: $RUN/learning_curve.svg"
   echo "run folder: $RUN"
-  say "this run is complete; for another one, move $RUN away and run this again"
+  say "this run is complete; for another one: deploy/demo.sh --fresh"
   exit
 fi
-if [ -e "$RUN" ]; then
-  aside=$RUN.interrupted-$(date +%Y%m%d-%H%M%S)
-  mv "$RUN" "$aside"
-  say "an earlier run did not reach its end: it is now $aside, and a new one begins"
-fi
-mkdir "$RUN"
 
 learner=
 evaluators=() # process ids
@@ -54,7 +50,7 @@ trap 'exit 130' INT
 trap 'exit 143' TERM
 
 # Without the lock's descriptor: whatever outlives this script must not keep the lock.
-start_learner "$RUN" --preset $PRESET --dataset $DATASET 9>&-
+start_learner "$RUN" --preset $PRESET --dataset $DATASET "$@" 9>&-
 for ((i = 1; i <= EVALUATORS; i++)); do
   $BIN/evaluator serve --name "evaluator-$i" --connect "$endpoint" --metrics 127.0.0.1:0 \
     >"$RUN/evaluator-$i.log" 2>&1 9>&- &
@@ -74,7 +70,7 @@ while true; do
 done
 
 if [ "$status" -ne 0 ]; then
-  say "the learner ended with status $status; run this again to begin anew"
+  say "the learner ended with status $status; run this again to go on where it was"
   exit "$status"
 fi
 touch "$RUN/complete"

@@ -240,6 +240,13 @@ impl Experiment {
         self.eval_interval > 0 && (step == self.steps || step.is_multiple_of(self.eval_interval))
     }
 
+    /// The steps whose policies are evaluated, in ascending order.
+    pub fn evaluated_steps(&self) -> impl Iterator<Item = u64> {
+        let regular = (1..=self.steps.checked_div(self.eval_interval).unwrap_or(0)).map(|n| n * self.eval_interval);
+        let last = self.eval_interval > 0 && !self.steps.is_multiple_of(self.eval_interval);
+        regular.chain(last.then_some(self.steps))
+    }
+
     /// The figures that tell runs apart, in one line.
     ///
     /// # Errors

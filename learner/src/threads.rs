@@ -286,3 +286,20 @@ fn write_rows(rows: &Receiver<Row>, mut log: Log) {
         }
     }
 }
+
+#[cfg(test)]
+#[allow(clippy::unwrap_used)]
+mod tests {
+    use super::*;
+    use tokio::sync::mpsc::unbounded_channel;
+
+    #[test]
+    fn a_thread_that_panics_fails_the_run_and_says_so_at_its_end() {
+        let (notify, mut notices) = unbounded_channel();
+        let thread = spawn("hub", &notify, || panic!("a test's own {}", "panic")).unwrap();
+        let Some(Notice::Failed(error)) = notices.blocking_recv() else { panic!("no notice") };
+        assert!(error.to_string().contains("`hub` panicked") && error.to_string().contains("a test's own panic"));
+        assert!(finish("hub", thread).is_err());
+        finish("hub", spawn("hub", &notify, || ()).unwrap()).unwrap();
+    }
+}

@@ -80,6 +80,9 @@ fn a_report_summarises_complete_evaluations() {
     assert_eq!((fifth.score.mean, fifth.mean_return, fifth.mean_length, fifth.complete), (10.0, 100.0, 5.0, true));
     assert!((fifth.score.std.unwrap() - 2f64.sqrt()).abs() < 1e-12);
     assert_eq!((report.mean_last_3, report.mean_last_5), (Some(8.0), Some(6.0)));
+    // Evaluations are due every 2000 of 20,000 steps; these are of the first six thousand.
+    let missing: Vec<_> = report.missing.iter().map(|missing| (missing.step, missing.episodes)).collect();
+    assert_eq!((missing[0], missing[1], missing.len()), ((6000, 1), (8000, 2), 8));
     let table = report.table();
     for text in [
         "10.00 ± 1.41",
@@ -88,6 +91,7 @@ fn a_report_summarises_complete_evaluations() {
         "last 5 evaluations: 6.00",
         "dataset:            10.70",
         "in f32",
+        "15 episodes of steps 6000 to 20000 have no score",
     ] {
         assert!(table.contains(text), "{text} is missing in\n{table}");
     }

@@ -31,6 +31,15 @@ pub struct EvaluationReport {
     pub mean_length: f64,
 }
 
+/// Episodes of an evaluation that have no score.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize)]
+pub struct Missing {
+    /// Gradient step of the snapshot.
+    pub step: u64,
+    /// How many.
+    pub episodes: usize,
+}
+
 /// One run.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct RunReport {
@@ -58,6 +67,8 @@ pub struct RunReport {
     pub dataset_score: f64,
     /// Its evaluations by step.
     pub evaluations: Vec<EvaluationReport>,
+    /// What has no score, or not yet, by step.
+    pub missing: Vec<Missing>,
     /// Mean score of the last 3 complete evaluations; absent if they are fewer.
     pub mean_last_3: Option<f64>,
     /// The same of the last 5.
@@ -96,6 +107,9 @@ impl RunReport {
                 evaluation(step, &Vec::from_iter(episodes.into_values()), experiment.episodes)
             })
             .collect();
+        let scored = |step| evaluations.iter().find(|e| e.step == step).map_or(0, |e| e.episodes);
+        let missing = |step| Missing { step, episodes: (experiment.episodes as usize).saturating_sub(scored(step)) };
+        let missing = experiment.evaluated_steps().map(missing).filter(|missing| missing.episodes > 0).collect();
         let complete: Vec<_> = evaluations.iter().filter(|e| e.complete).map(|e| (e.step, e.score.mean)).collect();
         let mean = |evaluations: &[(u64, f64)]| {
             let scores: Vec<_> = evaluations.iter().map(|(_, score)| *score).collect();
@@ -120,6 +134,7 @@ impl RunReport {
             mean_last_5: last(5),
             mean_last_50000_steps: final_steps.and_then(in_final_steps),
             evaluations,
+            missing,
             config,
         }
     }
@@ -149,6 +164,15 @@ impl RunReport {
         text.push_str(&if self.normalised { with_returns.render(Style::Text) } else { table.render(Style::Text) });
         if self.evaluations.is_empty() {
             text.push_str("(no evaluation has a score yet)\n");
+        }
+        if let (Some(first), Some(last)) = (self.missing.first(), self.missing.last()) {
+            let episodes: usize = self.missing.iter().map(|missing| missing.episodes).sum();
+            let steps = if first == last {
+                format!("step {}", first.step)
+            } else {
+                format!("steps {} to {}", first.step, last.step)
+            };
+            writeln!(text, "{episodes} episodes of {steps} have no score").ok();
         }
         text.push('\n');
         let figures = [

@@ -1,0 +1,104 @@
+//! A disk that is full or hangs delays what is kept, and ends neither the training nor what was kept before.
+#![allow(clippy::unwrap_used, clippy::expect_used, clippy::print_stderr)]
+
+use std::fs;
+use std::path::{Path, PathBuf};
+use std::process::Command;
+use std::thread::sleep;
+use std::time::Duration;
+
+use quad_tests::system::{Learner, Scratch, Setting};
+use quad_tests::{PATIENCE, eventually, http};
+
+const SETTING: Setting = Setting { steps: 4000, eval_interval: 500, episodes: 4, candidates: 2, hidden: 32, seed: 2 };
+const LISTEN: [&str; 4] = ["--listen", "tcp/127.0.0.1:0", "--checkpoint-seconds", "0"];
+
+/// A disk of a few megabytes, unmounted when dropped.
+struct SmallDisk {
+    path: PathBuf,
+}
+
+impl SmallDisk {
+    fn mount(path: PathBuf) -> Option<Self> {
+        fs::create_dir_all(&path).unwrap();
+        let mounted = Command::new("mount").args(["-t", "tmpfs", "-o", "size=6m", "tmpfs"]).arg(&path).output();
+        mounted.is_ok_and(|output| output.status.success()).then_some(Self { path })
+    }
+}
+
+impl Drop for SmallDisk {
+    fn drop(&mut self) {
+        Command::new("umount").arg("--lazy").arg(&self.path).status().ok();
+    }
+}
+
+fn metric(learner: &Learner, name: &str) -> Option<f64> {
+    Some(http::sum(&http::metrics(&learner.metrics())?, &format!("quad_learner_{name}"), ""))
+}
+
+fn wait_for_metric(learner: &Learner, name: &str, wanted: impl Fn(f64) -> bool) -> f64 {
+    eventually(name, PATIENCE, || metric(learner, name).filter(|value| wanted(*value)))
+}
+
+/// As many bytes as the disk has left.
+fn fill(path: &Path) {
+    let mut file = fs::File::create(path).unwrap();
+    let block = vec![0; 4096];
+    while std::io::Write::write_all(&mut file, &block).is_ok() {}
+}
+
+#[test]
+fn a_full_disk_delays_scores_and_checkpoints_until_there_is_room() {
+    let scratch = Scratch::new();
+    let Some(disk) = SmallDisk::mount(scratch.path().join("run")) else {
+        eprintln!("skipped: mounting a tmpfs needs the rights of root");
+        return;
+    };
+    // Long enough for the disk to be full in the middle of it.
+    let setting = Setting { steps: 20_000, eval_interval: 2_000, hidden: 64, ..SETTING };
+    let mut learner = scratch.learner_with("run", setting, &LISTEN);
+    let _evaluator = scratch.evaluator("one", &learner.endpoint());
+    eventually("there are scores", PATIENCE, || (!learner.scores().is_empty()).then_some(()));
+    fill(&disk.path.join("filler"));
+    wait_for_metric(&learner, "disk_trouble", |trouble| trouble == 1.0);
+    let (steps, scores) = (metric(&learner, "gradient_steps_total").unwrap(), learner.scores().len());
+    learner.process.wait_for_log("No space left on device", PATIENCE);
+    wait_for_metric(&learner, "gradient_steps_total", |now| now == setting.steps as f64 || now > steps + 100.0);
+    assert!(learner.scores().len() <= scores + 8, "a score counts as kept though there was no room for it");
+
+    fs::remove_file(disk.path.join("filler")).unwrap();
+    learner.process.wait_for_log("takes what is saved again", PATIENCE);
+    let status = learner.process.wait(PATIENCE);
+    assert!(status.success(), "the learner ended with {status}");
+    learner.assert_complete(&setting);
+}
+
+#[test]
+fn a_disk_that_hangs_holds_up_neither_training_nor_the_end() {
+    let scratch = Scratch::new();
+    let mut learner = scratch.learner_with("run", SETTING, &LISTEN);
+    learner.process.wait_for_log("snapshot handed to evaluation", PATIENCE);
+    learner.process.terminate(PATIENCE);
+
+    // Who opens a pipe to write into it waits until somebody reads from it.
+    let kept = fs::read_dir(learner.run_dir.join("snapshots")).unwrap().count() as u64;
+    let next = (kept + 1) * SETTING.eval_interval;
+    assert!(next < SETTING.steps, "the training was over too soon");
+    let pipe = learner.snapshot(next).with_extension("safetensors.partial");
+    assert!(Command::new("mkfifo").arg(&pipe).status().unwrap().success());
+    let mut learner = scratch.learner_with("run", SETTING, &LISTEN);
+    learner.process.wait_for_log("goes on after step", PATIENCE);
+    wait_for_metric(&learner, "gradient_steps_total", |steps| steps == SETTING.steps as f64);
+    sleep(Duration::from_millis(200));
+    assert!(!learner.snapshot(next).exists(), "the disk did not hang");
+    let (duration, status) = learner.process.terminate(PATIENCE);
+    assert!(duration < Duration::from_secs(10), "it took {duration:?} to leave");
+    assert!(!status.success());
+
+    fs::remove_file(&pipe).unwrap();
+    let mut learner = scratch.learner_with("run", SETTING, &LISTEN);
+    let _evaluator = scratch.evaluator("one", &learner.endpoint());
+    let status = learner.process.wait(PATIENCE);
+    assert!(status.success(), "the learner ended with {status}");
+    learner.assert_complete(&SETTING);
+}
