@@ -53,6 +53,8 @@ pub enum Command {
     Datasets(DatasetsCommand),
     /// Print the evaluations of finished or running runs, summaries over their seeds, and what the paper has for their tasks
     Report(ReportArgs),
+    /// Check by a run's folder alone that each episode is scored once, with the weights that are kept there
+    Verify(VerifyArgs),
 }
 
 /// Arguments of `learner train`.
@@ -192,6 +194,17 @@ pub struct InspectArgs {
     /// Print JSON instead of a page
     #[arg(long)]
     pub json: bool,
+}
+
+/// Arguments of `learner verify`.
+#[derive(Debug, Args)]
+pub struct VerifyArgs {
+    /// Folder of a run that has reached its end
+    #[arg(value_name = "DIR")]
+    pub dir: PathBuf,
+    /// Folder of a run of the same configuration: what both have scored must be equal, bit for bit
+    #[arg(long, value_name = "DIR")]
+    pub same_as: Option<PathBuf>,
 }
 
 /// Arguments of `learner report`.

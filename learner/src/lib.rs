@@ -16,7 +16,7 @@
 //! - [`scoreboard`] is the hub's state without any I/O.
 //! - [`wire`] declares everything on Zenoh; its callbacks fill an [`inbox`]; [`notice`] is what threads tell the main loop.
 //! - [`run_dir`] is the folder of a run, [`metrics`] are for Prometheus, [`display`] shows progress on the terminal.
-//! - [`report`] and [`plot`] summarise the scores as tables and as a picture.
+//! - [`report`] and [`plot`] summarise the scores as tables and as a picture; [`verify`] checks them against the folder.
 
 #![deny(unsafe_code)]
 
@@ -47,4 +47,5 @@ pub mod scoreboard;
 pub mod settings;
 pub mod threads;
 pub mod train;
+pub mod verify;
 pub mod wire;

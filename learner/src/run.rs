@@ -13,7 +13,7 @@ use tokio::sync::mpsc;
 use toml::Table;
 use tracing::{debug, info, warn};
 
-use crate::cli::{Cli, Command, DatasetsCommand, InspectArgs, PresetsArgs, ReportArgs, TrainArgs};
+use crate::cli::{Cli, Command, DatasetsCommand, InspectArgs, PresetsArgs, ReportArgs, TrainArgs, VerifyArgs};
 use crate::conduct::{Conductor, Ending, open_network};
 use crate::config::{self, DatasetInfo, Experiment, RunConfig, RunInfo};
 use crate::datasets::{self, LocalDataset, Source};
@@ -25,6 +25,7 @@ use crate::report::{Report, RunReport};
 use crate::resume::{self, Begun, Past};
 use crate::run_dir::{Log, RunDir};
 use crate::threads::{Run, Threads};
+use crate::verify;
 
 /// Where evaluators look by default.
 const DEFAULT_ENDPOINT: &str = "tcp/127.0.0.1:7447";
@@ -38,6 +39,7 @@ pub fn run(cli: &Cli) -> anyhow::Result<()> {
         Command::Presets(args) => list_presets(args),
         Command::Datasets(command) => datasets(command),
         Command::Report(args) => report(args),
+        Command::Verify(args) => verify(args),
     }
 }
 
@@ -68,6 +70,18 @@ fn report(args: &ReportArgs) -> anyhow::Result<()> {
         _ => report.text(),
     };
     print(text.trim_end())?;
+    Ok(())
+}
+
+fn verify(args: &VerifyArgs) -> anyhow::Result<()> {
+    let mut findings = vec![(String::new(), verify::verify(&args.dir)?)];
+    if let Some(other) = &args.same_as {
+        findings.push((format!("compared with {}: ", other.display()), verify::compare(&args.dir, other)?));
+    }
+    for (about, found) in &findings {
+        print(&format!("{about}{found}"))?;
+    }
+    anyhow::ensure!(findings.iter().all(|(_, found)| found.all_held()), "not everything held");
     Ok(())
 }
 

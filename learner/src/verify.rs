@@ -1,0 +1,121 @@
+//! `learner verify`: reads a run's folder and nothing else, and says whether what a run promises has held.
+
+use std::collections::{BTreeMap, BTreeSet};
+use std::fmt;
+use std::path::Path;
+
+use quad_protocol::{Hash, episode_seeds};
+
+use crate::run_dir::{RunDir, RunDirError, ScoreLine};
+use crate::settings;
+
+/// Findings of one kind that are listed one by one; the rest is counted.
+const LISTED: usize = 5;
+
+/// What was found in a folder.
+#[derive(Debug, Default, PartialEq)]
+pub struct Findings {
+    /// Episodes that have a score.
+    pub scored: usize,
+    /// Of how many.
+    pub expected: usize,
+    /// What is wrong, kind by kind.
+    pub wrong: BTreeMap<&'static str, Vec<String>>,
+}
+
+impl Findings {
+    /// Whether every promise has held.
+    pub fn all_held(&self) -> bool {
+        self.wrong.is_empty()
+    }
+
+    fn add(&mut self, kind: &'static str, what: String) {
+        self.wrong.entry(kind).or_default().push(what);
+    }
+}
+
+impl fmt::Display for Findings {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        write!(f, "{} of {} episodes are scored", self.scored, self.expected)?;
+        for (kind, found) in &self.wrong {
+            let listed = found.iter().take(LISTED).cloned().collect::<Vec<_>>().join("; ");
+            let more = if found.len() > LISTED { "; …" } else { "" };
+            write!(f, "\n{kind} ({}): {listed}{more}", found.len())?;
+        }
+        Ok(())
+    }
+}
+
+/// Checks that each episode of each evaluation of a run is scored exactly once, with the weights that are on disk.
+///
+/// # Errors
+/// There is no run in the folder, or a file cannot be read.
+pub fn verify(path: &Path) -> Result<Findings, RunDirError> {
+    let (dir, config) = RunDir::open(path)?;
+    let experiment = &config.experiment;
+    let mut planned: BTreeMap<u64, BTreeSet<u64>> = experiment
+        .evaluated_steps()
+        .map(|step| (step, BTreeSet::from_iter(episode_seeds(experiment.seed, step, experiment.episodes))))
+        .collect();
+    let mut found = Findings { expected: planned.values().map(BTreeSet::len).sum(), ..Findings::default() };
+    let mut hashes: BTreeMap<u64, Option<String>> = BTreeMap::new();
+    let mut seen = BTreeSet::new();
+    for ScoreLine { step, seed, weights, episode_return, score, .. } in dir.read_scores()? {
+        let name = format!("step {step}, seed {seed}");
+        let hash = hashes
+            .entry(step)
+            .or_insert_with(|| dir.read_snapshot(step).ok().map(|tensors| Hash::of(&tensors).to_string()));
+        match hash {
+            None => found.add("scored, but the snapshot is gone", name.clone()),
+            Some(hash) if *hash != weights => found.add("scored with other weights than are on disk", name.clone()),
+            Some(_) => {}
+        }
+        if !(episode_return.is_finite() && score.is_finite()) {
+            found.add("not a number", name.clone());
+        }
+        if !seen.insert((step, seed)) {
+            found.add("scored twice", name);
+        } else if planned.get_mut(&step).is_some_and(|seeds| seeds.remove(&seed)) {
+            found.scored += 1;
+        } else {
+            found.add("no episode of this run", name);
+        }
+    }
+    for (step, seeds) in planned {
+        for seed in seeds {
+            found.add("without a score", format!("step {step}, seed {seed}"));
+        }
+    }
+    Ok(found)
+}
+
+/// Checks that two runs of one configuration have the same scores, bit for bit, of the same weights. What one of them does
+/// not have is not compared.
+///
+/// # Errors
+/// As [`verify`].
+pub fn compare(path: &Path, other: &Path) -> Result<Findings, RunDirError> {
+    let mut found = Findings::default();
+    let [(dir, config), (other_dir, other_config)] = [RunDir::open(path)?, RunDir::open(other)?];
+    let [a, b] = [&config, &other_config].map(settings::of_run);
+    for key in settings::differences(&a, &b) {
+        found.add("settings that differ", key.clone());
+    }
+    let by_key = |lines: Vec<ScoreLine>| -> BTreeMap<(u64, u64), ScoreLine> {
+        lines.into_iter().map(|line| ((line.step, line.seed), line)).collect()
+    };
+    let [ours, theirs] = [by_key(dir.read_scores()?), by_key(other_dir.read_scores()?)];
+    found.expected = ours.len();
+    for (key @ (step, seed), line) in &ours {
+        let Some(same) = theirs.get(key) else { continue };
+        found.scored += 1;
+        let name = format!("step {step}, seed {seed}");
+        let bits = |line: &ScoreLine| (line.episode_return.to_bits(), line.length);
+        if line.weights != same.weights {
+            found.add("weights that differ", name);
+        } else if line.precision == same.precision && bits(line) != bits(same) {
+            found.add("scores that differ", name);
+        }
+    }
+    Ok(found)
+}
