@@ -13,10 +13,10 @@ use quad_learner::publisher::{self, Identity, SnapshotPublisher};
 use quad_learner::run_dir::RunDir;
 use quad_learner::scoreboard::{Rules, Scoreboard};
 use quad_learner::train::TrainedPolicy;
-use quad_learner::wire::Wire;
+use quad_learner::wire::{Life, Wire};
 use quad_protocol::{
-    EpisodeScore, Hash, Job, JobReply, JobRequest, Message, Name, Origin, Progress, RecordedScores, ScoreReply,
-    ScoreReport, Snapshot, decode, encode, keys,
+    CannotAct, EpisodeScore, Hash, Job, JobReply, JobRequest, Message, Name, Origin, Progress, RecordedScores,
+    ScoreReply, ScoreReport, Snapshot, decode, encode, keys,
 };
 use quad_service::{Endpoints, open_session};
 use safetensors::Dtype;
@@ -88,7 +88,8 @@ impl Bench {
         let port = TcpListener::bind("127.0.0.1:0").unwrap().local_addr().unwrap().port();
         let endpoint = format!("tcp/127.0.0.1:{port}");
         let session = open_session(&Endpoints { listen: vec![endpoint.clone()], connect: Vec::new() }).await.unwrap();
-        let wire = Wire::declare(session, &run, &hub, &publisher, &metrics, || Ok(())).await.unwrap();
+        let life = Life { run: run.clone(), incarnation: INCARNATION };
+        let wire = Wire::declare(session, life, &hub, &publisher, &metrics, || Ok(())).await.unwrap();
         Self { run, run_dir, endpoint, metrics, notices, publisher, hub, _wire: wire, _folder: folder }
     }
 
@@ -160,11 +161,23 @@ async fn ask<A: Message>(session: &Session, key: String, payload: Option<Vec<u8>
     })
 }
 
+fn claim_message(evaluator: &str, attempt: u64) -> JobRequest {
+    JobRequest::Claim {
+        evaluator: name(evaluator),
+        attempt,
+        environments: vec!["hopper".into()],
+        precision: name("f32"),
+    }
+}
+
+async fn ask_for_job(session: &Session, run: &Name, request: &JobRequest) -> JobReply {
+    ask(session, keys::jobs(run), Some(encode(request).unwrap())).await.unwrap().unwrap()
+}
+
 async fn claim(session: &Session, run: &Name, evaluator: &str) -> Option<Job> {
-    let request = JobRequest { evaluator: name(evaluator), environments: vec!["hopper".into()] };
-    match ask(session, keys::jobs(run), Some(encode(&request).unwrap())).await?.unwrap() {
+    match ask_for_job(session, run, &claim_message(evaluator, 1)).await {
         JobReply::Job(job) => Some(job),
-        JobReply::Wait { .. } => None,
+        _ => None,
     }
 }
 
@@ -198,6 +211,23 @@ fn report(job: &Job, evaluator: &str) -> ScoreReport {
     }
 }
 
+fn progress(job: &Job, evaluator: &str, steps_done: u64) -> Progress {
+    Progress {
+        evaluator: name(evaluator),
+        run: job.run.clone(),
+        incarnation: job.incarnation,
+        job: job.id,
+        step: job.step,
+        episodes_done: 0,
+        episodes_total: 2,
+        steps_done,
+        environment_steps: 40,
+        episodes: 1,
+        proof: Hash::of(b"none"),
+    }
+    .signed(&job.lease)
+}
+
 async fn deliver(session: &Session, report: &ScoreReport) -> ScoreReply {
     ask(session, keys::scores(&report.run), Some(encode(report).unwrap())).await.unwrap().unwrap()
 }
@@ -208,10 +238,13 @@ async fn a_policy_that_cannot_act_ends_the_run_with_the_reason() {
     let client = bench.client().await;
     bench.snapshot(1000).await;
     let job = claim_eventually(&client, &bench.run, "a").await;
-    let reason = Some("a value of a candidate is not a number (NaN)".to_owned());
-    let broken = ScoreReport { episodes: Vec::new(), cannot_act: reason, ..report(&job, "a") };
-    let stranger = ScoreReport { evaluator: name("b"), ..broken.clone() };
-    assert!(matches!(deliver(&client, &stranger).await, ScoreReply::Refused { .. }), "it has no such job");
+    let reason = "a value of a candidate is not a number (NaN)".to_owned();
+    let complaint = CannotAct::signed(reason, job.weights, &job.lease);
+    let forged = CannotAct { proof: Hash::of(b"guessed"), ..complaint.clone() };
+    let broken = ScoreReport { episodes: Vec::new(), cannot_act: Some(complaint), ..report(&job, "a") };
+    let stranger = ScoreReport { cannot_act: Some(forged), ..broken.clone() };
+    assert!(matches!(deliver(&client, &stranger).await, ScoreReply::Refused { .. }), "it has not the job's lease");
+    assert_eq!(bench.rejected("wrong_proof"), 1);
     deliver(&client, &broken).await;
     bench.until(|notice| matches!(notice, Notice::Failed(error) if error.to_string().contains("step 1000 cannot act: a value")))
         .await;
@@ -230,9 +263,9 @@ async fn a_job_goes_out_and_its_scores_are_on_disk_before_the_thanks() {
 
     let recorded = deliver(&client, &report(&job, "a")).await;
     assert_eq!(bench.lines(), 2);
-    assert!(matches!(recorded, ScoreReply::Recorded { new: 2, duplicates: 0 }));
+    assert!(matches!(recorded, ScoreReply::Recorded { incarnation: INCARNATION, new: 2, duplicates: 0 }));
     let again = deliver(&client, &report(&job, "a")).await;
-    assert!(matches!(again, ScoreReply::Recorded { new: 0, duplicates: 2 }));
+    assert!(matches!(again, ScoreReply::Recorded { new: 0, duplicates: 2, .. }));
     assert_eq!((bench.lines(), bench.metrics.evaluation.scores_duplicate.get()), (2, 2));
 
     let sample = tokio::time::timeout(PATIENCE, watched.recv_async()).await.unwrap().unwrap();
@@ -279,8 +312,7 @@ async fn garbage_is_counted_by_reason_and_answered_with_an_error() {
     let mut bench = Bench::start().await;
     let client = bench.client().await;
     bench.snapshot(10).await;
-    let request = JobRequest { evaluator: name("a"), environments: vec!["hopper".into()] };
-    let good = encode(&request).unwrap();
+    let good = encode(&claim_message("a", 1)).unwrap();
     let mut newer = good.clone();
     newer[4] ^= 0xff;
     for key in [keys::jobs(&bench.run), keys::scores(&bench.run)] {
@@ -298,7 +330,7 @@ async fn garbage_is_counted_by_reason_and_answered_with_an_error() {
 
     let job = claim_eventually(&client, &bench.run, "a").await;
     let wrong = ScoreReport { weights: Hash::of(b"others"), ..report(&job, "a") };
-    let ScoreReply::Refused { reason } = deliver(&client, &wrong).await else { panic!("accepted") };
+    let ScoreReply::Refused { reason, .. } = deliver(&client, &wrong).await else { panic!("accepted") };
     assert!(reason.contains("other weights"), "{reason}");
     assert_eq!((bench.rejected("unknown_weights"), bench.lines()), (1, 0));
     assert!(matches!(deliver(&client, &report(&job, "a")).await, ScoreReply::Recorded { new: 2, .. }));
@@ -324,19 +356,12 @@ async fn jobs_of_evaluators_that_die_or_fall_silent_go_to_others() {
     assert_eq!(silent.seeds, lost.seeds);
     let working = claim_eventually(&client, &bench.run, "working").await;
     assert!(claim(&client, &bench.run, "a").await.is_none());
-    let progress = Progress {
-        evaluator: name("working"),
-        run: bench.run.clone(),
-        job: working.id,
-        step: 10,
-        episodes_done: 1,
-        episodes_total: 2,
-        environment_steps: 40,
-        episodes: 1,
-    };
     let start = Instant::now();
+    let mut steps = 0;
     let again = loop {
-        client.put(keys::progress(&bench.run, &name("working")), encode(&progress).unwrap()).await.unwrap();
+        steps += 1;
+        let message = encode(&progress(&working, "working", steps)).unwrap();
+        client.put(keys::progress(&bench.run, &name("working")), message).await.unwrap();
         if let Some(job) = claim(&client, &bench.run, "a").await {
             break job;
         }

@@ -20,7 +20,7 @@ pub(crate) use bincode::{Decode, Encode};
 use crate::{Hash, JobReply, JobRequest, Name, Progress, RecordedScores, Schema, ScoreReply, ScoreReport, Snapshot};
 
 /// Version of keys, messages and encoding. Frames of another version are refused.
-pub const PROTOCOL_VERSION: u16 = 3;
+pub const PROTOCOL_VERSION: u16 = 4;
 
 const MAGIC: &[u8; 4] = b"QUAD";
 const HEADER_LENGTH: usize = MAGIC.len() + size_of::<u16>() + size_of::<u8>();
@@ -218,6 +218,12 @@ pub fn decode_from<M: Message>(length: usize, mut frame: impl Read) -> Result<M,
     }
     message.verify()?;
     Ok(message)
+}
+
+/// The encoding of what is not a message of its own, without a header.
+pub(crate) fn fields<T: Encode>(value: &T) -> Vec<u8> {
+    // Writing to memory cannot fail, and none of our types refuses to be encoded.
+    bincode::encode_to_vec(value, FIXED).unwrap_or_default()
 }
 
 fn body_error(error: DecodeError) -> CodecError {

@@ -4,7 +4,7 @@
 use std::sync::atomic::{AtomicUsize, Ordering};
 use std::time::Duration;
 
-use quad_protocol::{Hash, Job, JobReply, JobRequest, Name, Schema, Snapshot, decode, encode, keys};
+use quad_protocol::{Hash, Job, JobReply, JobRequest, Lease, Name, Schema, Snapshot, decode, encode, keys};
 use quad_tests::router::router;
 use quad_tests::system::{Scratch, Setting, free_port};
 use quad_tests::{PATIENCE, eventually, http};
@@ -28,6 +28,11 @@ fn garbage(real: &[u8]) -> Vec<Vec<u8>> {
     ]
 }
 
+fn claim(evaluator: &str, attempt: u64) -> JobRequest {
+    let (evaluator, precision) = (Name::new(evaluator).unwrap(), Name::new("f32").unwrap());
+    JobRequest::Claim { evaluator, attempt, environments: vec!["hopper".to_owned()], precision }
+}
+
 /// A run whose learner answers claims with nonsense of every kind, one after another.
 async fn haunt(session: &Session) -> impl Sized {
     let ghost = Name::new("ghost").unwrap();
@@ -36,6 +41,7 @@ async fn haunt(session: &Session) -> impl Sized {
         let (run, environment) = (run.clone(), environment.to_owned());
         encode(&JobReply::Job(Job {
             id: 1,
+            lease: Lease::random(),
             run,
             incarnation: 1,
             step: 1,
@@ -71,8 +77,8 @@ async fn haunt(session: &Session) -> impl Sized {
         zenoh::Wait::wait(query.reply(key, answer)).unwrap();
     });
     let queryable = queryable.await.unwrap();
-    let token = session.liveliness().declare_token(keys::live_learner(&ghost)).await.unwrap();
-    let nameless = session.liveliness().declare_token("quad/not a name/live/learner").await.unwrap();
+    let token = session.liveliness().declare_token(keys::live_learner(&ghost, 1)).await.unwrap();
+    let nameless = session.liveliness().declare_token("quad/not a name/live/learner/1").await.unwrap();
     (queryable, token, nameless)
 }
 
@@ -90,7 +96,7 @@ async fn nonsense_on_every_key_is_counted_and_survived() {
     let replies = session.get(keys::weights_at(&run, first)).await.unwrap();
     let snapshot = replies.recv_async().await.unwrap().into_result().unwrap().payload().to_bytes().into_owned();
     decode::<Snapshot>(&snapshot).unwrap();
-    let request = JobRequest { evaluator: Name::new("stranger").unwrap(), environments: vec!["hopper".to_owned()] };
+    let request = claim("stranger", 1);
     let payloads = garbage(&snapshot).into_iter().chain(garbage(&encode(&request).unwrap()));
     let _ghost = haunt(&session).await;
     for payload in payloads {
