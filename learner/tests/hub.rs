@@ -15,7 +15,7 @@ use quad_learner::scoreboard::{Rules, Scoreboard};
 use quad_learner::train::TrainedPolicy;
 use quad_learner::wire::{Life, Wire};
 use quad_protocol::{
-    CannotAct, EpisodeScore, Hash, Job, JobReply, JobRequest, Message, Name, Origin, Progress, RecordedScores,
+    CannotAct, EpisodeScore, Hash, Job, JobReply, JobRequest, Lease, Message, Name, Origin, Progress, RecordedScores,
     ScoreReply, ScoreReport, Snapshot, decode, encode, keys,
 };
 use quad_service::{Endpoints, open_session};
@@ -46,7 +46,7 @@ fn name(text: &str) -> Name {
 }
 
 fn tensors(step: u64) -> Vec<u8> {
-    let bytes = vec![step as u8; 200_000];
+    let bytes = vec![step as u8; 1_000_000];
     let tensor = TensorView::new(Dtype::U8, vec![bytes.len()], &bytes).unwrap();
     safetensors::serialize([("weights", tensor)], None).unwrap()
 }
@@ -378,4 +378,93 @@ async fn jobs_of_evaluators_that_die_or_fall_silent_go_to_others() {
     assert_eq!((bench.lines(), bench.metrics.evaluation.scores_duplicate.get()), (4, 2));
     bench.hub.send(hub::Event::TrainingCompleted);
     bench.until(|notice| matches!(notice, Notice::Settled)).await;
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn a_claim_is_answered_twice_with_one_job_which_can_be_handed_back() {
+    let mut bench = Bench::start().await;
+    let client = bench.client().await;
+    bench.snapshot(10).await;
+    let job = claim_eventually(&client, &bench.run, "a").await;
+    assert_eq!(claim(&client, &bench.run, "a").await.as_ref(), Some(&job));
+    assert_eq!(bench.metrics.evaluation.jobs_handed_out.get(), 1);
+    let other = ask_for_job(&client, &bench.run, &claim_message("a", 2)).await;
+    assert!(matches!(other, JobReply::Wait { incarnation: INCARNATION, .. }), "{other:?}");
+
+    let hand_back = |lease| JobRequest::HandBack { evaluator: name("a"), job: job.id, lease };
+    for (lease, expected) in [(Lease::random(), false), (job.lease.clone(), true), (job.lease.clone(), false)] {
+        let reply = ask_for_job(&client, &bench.run, &hand_back(lease)).await;
+        assert!(matches!(reply, JobReply::HandedBack { accepted, .. } if accepted == expected), "{reply:?}");
+    }
+    assert_eq!(bench.metrics.evaluation.jobs_handed_back.get(), 1);
+    assert_eq!(claim_eventually(&client, &bench.run, "b").await.seeds, job.seeds);
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn progress_that_was_heard_or_guessed_does_not_hold_a_job() {
+    let mut bench = Bench::start().await;
+    let client = bench.client().await;
+    bench.snapshot(10).await;
+    let job = claim_eventually(&client, &bench.run, "a").await;
+    let heard = progress(&job, "a", 10);
+    let guessed = Progress { steps_done: 1 << 40, ..heard.clone() };
+    let start = Instant::now();
+    while bench.metrics.evaluation.jobs_expired.get() == 0 {
+        for message in [&heard, &guessed] {
+            client.put(keys::progress(&bench.run, &name("a")), encode(message).unwrap()).await.unwrap();
+        }
+        assert!(start.elapsed() < PATIENCE, "the lease never ends");
+        tokio::time::sleep(LEASE / 20).await;
+    }
+    assert!(bench.rejected("wrong_proof") > 5 && bench.rejected("not_advanced") > 5);
+}
+
+/// Asks for weights a hundred times, and then reads nothing: the process stops itself.
+async fn reads_nothing(endpoint: String) {
+    let endpoints = Endpoints { listen: Vec::new(), connect: vec![endpoint] };
+    let session = open_session(&endpoints).await.unwrap();
+    for _ in 0..100 {
+        let key = keys::weights_at(&name("bench"), 10);
+        session.get(key).timeout(PATIENCE).callback(drop).await.unwrap();
+    }
+    let stop = format!("kill -STOP {}", std::process::id());
+    std::process::Command::new("sh").args(["-c", &stop]).status().unwrap();
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn a_peer_that_reads_nothing_delays_nobody() {
+    const STRANGER: &str = "QUAD_TEST_STRANGER";
+    if let Ok(endpoint) = std::env::var(STRANGER) {
+        return reads_nothing(endpoint).await;
+    }
+    let mut bench = Bench::start().await;
+    let client = bench.client().await;
+    bench.snapshot(10).await;
+    let mut command = std::process::Command::new(std::env::current_exe().unwrap());
+    command.args(["--exact", "a_peer_that_reads_nothing_delays_nobody"]).env(STRANGER, &bench.endpoint);
+    let mut stranger = command.stdout(std::process::Stdio::null()).spawn().unwrap();
+    let state = || std::fs::read_to_string(format!("/proc/{}/stat", stranger.id())).unwrap();
+    let start = Instant::now();
+    while !state().contains(") T ") {
+        assert!(start.elapsed() < PATIENCE, "{}", state());
+        tokio::time::sleep(Duration::from_millis(5)).await;
+    }
+
+    // For as long as Zenoh waits before it closes the connection.
+    let (start, mut slowest, mut step) = (Instant::now(), Duration::ZERO, 10);
+    while start.elapsed() < Duration::from_secs(6) {
+        let asked = Instant::now();
+        claim(&client, &bench.run, "a").await.expect("always the same job");
+        step += 10;
+        bench.snapshot(step).await;
+        let snapshot: Snapshot = ask(&client, keys::weights_at(&bench.run, step), None).await.unwrap().unwrap();
+        assert_eq!(snapshot.step, step);
+        slowest = slowest.max(asked.elapsed());
+        tokio::time::sleep(Duration::from_millis(100)).await;
+    }
+    stranger.kill().unwrap();
+    stranger.wait().unwrap();
+    // A snapshot is published with some patience for each subscriber, and there are other tests beside this one.
+    assert!(slowest < Duration::from_secs(2), "{slowest:?}");
+    assert!(bench.rejected("busy") > 0, "more was asked than is kept waiting");
 }

@@ -26,8 +26,8 @@ const HEARTBEAT: Duration = Duration::from_secs(1);
 const KEEP_SCORES: Duration = Duration::from_secs(600);
 /// Memory for the snapshots that were published, of all runs together, bytes; the largest that there may be fits.
 const SNAPSHOTS: usize = 256 << 20;
-/// How long it may take to hand back a job that could not be done.
-const HAND_BACK: Duration = Duration::from_secs(5);
+/// How long it may take to hand back a job that could not be done; other runs wait meanwhile.
+const HAND_BACK: Duration = Duration::from_secs(1);
 
 /// The job that is being done, for whoever has to hand it back when the worker is to end.
 pub type Held = Arc<Mutex<Option<HandBack>>>;
