@@ -6,7 +6,7 @@ use std::time::Duration;
 
 use anyhow::Context;
 use quad_dataset::Task;
-use quad_protocol::{Hash, Name, Origin, Schema, Snapshot, encode, keys};
+use quad_protocol::{Hash, Name, Origin, Schema, Snapshot, WeightsRequest, decode, encode, keys};
 use tokio::sync::mpsc::UnboundedSender;
 use tracing::debug;
 use zenoh::Wait;
@@ -147,12 +147,17 @@ impl SnapshotPublisher {
             return;
         };
         let key = keys::weights_at(&self.identity.run, step);
+        let request = question.payload().map(|payload| decode::<WeightsRequest>(&payload.to_bytes()));
+        let asker = match request {
+            Some(Ok(request)) => Asker::Evaluator(request.evaluator),
+            _ => Asker::Stranger,
+        };
         if let Some((_, bytes)) = self.newest.as_ref().filter(|(newest, _)| *newest == step) {
-            question.answer(Asker::ForWeights, Ok((key, bytes.clone())));
+            question.answer(asker, Ok((key, bytes.clone())));
             return;
         }
         let (identity, kind, run_dir) = (self.identity.clone(), self.kind, self.run_dir.clone());
-        question.answer_with(Asker::ForWeights, move || {
+        question.answer_with(asker, move || {
             let bytes = saved(identity, kind, &run_dir, step, hash);
             bytes.map(|bytes| (key, bytes)).map_err(|error| format!("{error:#}"))
         });

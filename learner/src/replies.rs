@@ -2,8 +2,9 @@
 //! closes the connection; even to drop a query says "no more answers" to the peer. So neither happens on the threads that own
 //! the state, nor on Zenoh's own: they only put their answers into this bounded queue.
 //!
-//! It is shared fairly among those who ask, as far as they can be told apart: by their names in what they ask. Questions for
-//! weights, which have none, and messages that cannot be read share one place each.
+//! It is shared fairly among those who ask, as far as they can be told apart: by the names that they give. Whoever gives none
+//! shares a place with all others who do not. (One who gives many names can take all places, for five seconds with each
+//! connection; against that only access control helps.)
 
 use std::collections::VecDeque;
 use std::mem;
@@ -31,9 +32,7 @@ const MOST_WAITING_OF_ONE: usize = 64;
 pub enum Asker {
     /// An evaluator, by the name that it gives.
     Evaluator(Name),
-    /// Whoever asks for weights.
-    ForWeights,
-    /// Whoever sent something that is refused.
+    /// Whoever gives no name, or sent something that is refused.
     Stranger,
     /// Whoever gets no answer.
     Nobody,
@@ -44,8 +43,8 @@ impl Asker {
     fn most_threads(&self) -> usize {
         match self {
             Self::Evaluator(_) => 2,
-            Self::ForWeights => 4,
-            Self::Stranger | Self::Nobody => 1,
+            Self::Stranger => 2,
+            Self::Nobody => 1,
         }
     }
 }

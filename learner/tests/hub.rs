@@ -16,7 +16,7 @@ use quad_learner::train::TrainedPolicy;
 use quad_learner::wire::{Life, Wire};
 use quad_protocol::{
     CannotAct, EpisodeScore, Hash, Job, JobReply, JobRequest, Lease, Message, Name, Origin, Progress, RecordedScores,
-    ScoreReply, ScoreReport, Snapshot, decode, encode, keys,
+    ScoreReply, ScoreReport, Snapshot, WeightsRequest, decode, encode, keys,
 };
 use quad_service::{Endpoints, open_session};
 use safetensors::Dtype;
@@ -450,6 +450,7 @@ async fn a_peer_that_reads_nothing_delays_nobody() {
         tokio::time::sleep(Duration::from_millis(5)).await;
     }
 
+    let request = encode(&WeightsRequest { evaluator: name("a") }).unwrap();
     // For as long as Zenoh waits before it closes the connection.
     let (start, mut slowest, mut step) = (Instant::now(), Duration::ZERO, 10);
     while start.elapsed() < Duration::from_secs(6) {
@@ -457,7 +458,8 @@ async fn a_peer_that_reads_nothing_delays_nobody() {
         claim(&client, &bench.run, "a").await.expect("always the same job");
         step += 10;
         bench.snapshot(step).await;
-        let snapshot: Snapshot = ask(&client, keys::weights_at(&bench.run, step), None).await.unwrap().unwrap();
+        let snapshot: Snapshot =
+            ask(&client, keys::weights_at(&bench.run, step), Some(request.clone())).await.unwrap().unwrap();
         assert_eq!(snapshot.step, step);
         slowest = slowest.max(asked.elapsed());
         tokio::time::sleep(Duration::from_millis(100)).await;

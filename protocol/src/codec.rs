@@ -17,7 +17,10 @@ use bincode::error::{DecodeError, EncodeError};
 
 pub(crate) use bincode::{Decode, Encode};
 
-use crate::{Hash, JobReply, JobRequest, Name, Progress, RecordedScores, Schema, ScoreReply, ScoreReport, Snapshot};
+use crate::{
+    Hash, JobReply, JobRequest, Name, Progress, RecordedScores, Schema, ScoreReply, ScoreReport, Snapshot,
+    WeightsRequest,
+};
 
 /// Version of keys, messages and encoding. Frames of another version are refused.
 pub const PROTOCOL_VERSION: u16 = 4;
@@ -87,6 +90,10 @@ impl Message for RecordedScores {
 
 impl Message for Progress {
     const KIND: u8 = 7;
+}
+
+impl Message for WeightsRequest {
+    const KIND: u8 = 8;
 }
 
 /// Why bytes are not the expected message, or a message cannot be sent.

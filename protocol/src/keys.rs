@@ -3,7 +3,7 @@
 //! | key | verb | message |
 //! |---|---|---|
 //! | `quad/<run>/weights` | learner publishes | [`Snapshot`](crate::Snapshot) |
-//! | `quad/<run>/weights/<step>` | learner answers | nothing → [`Snapshot`](crate::Snapshot) |
+//! | `quad/<run>/weights/<step>` | learner answers | [`WeightsRequest`](crate::WeightsRequest) or nothing → [`Snapshot`](crate::Snapshot) |
 //! | `quad/<run>/jobs` | learner answers | [`JobRequest`](crate::JobRequest) → [`JobReply`](crate::JobReply) |
 //! | `quad/<run>/scores` | learner answers | [`ScoreReport`](crate::ScoreReport) → [`ScoreReply`](crate::ScoreReply) |
 //! | `quad/<run>/scores/<step>` | learner publishes | [`RecordedScores`](crate::RecordedScores) |

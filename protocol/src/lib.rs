@@ -38,4 +38,4 @@ pub use origin::{Origin, OriginError};
 pub use progress::Progress;
 pub use score::{CannotAct, EpisodeScore, RecordedScores, ScoreReply, ScoreReport};
 pub use seeds::episode_seeds;
-pub use snapshot::{Schema, Snapshot};
+pub use snapshot::{Schema, Snapshot, WeightsRequest};

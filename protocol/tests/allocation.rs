@@ -82,6 +82,7 @@ fn claimed_lengths_are_not_believed() {
     claim_too_much(&Snapshot { run: name(), incarnation: 1, step: 2, schema, hash, tensors });
     let environments = vec![environment(); 3];
     claim_too_much(&JobRequest::Claim { evaluator: name(), attempt: 1, environments, precision: name() });
+    claim_too_much(&WeightsRequest { evaluator: name() });
     claim_too_much(&JobReply::Job(job));
     claim_too_much(&ScoreReport {
         evaluator: name(),

@@ -10,7 +10,7 @@ use proptest::sample::Index;
 use quad_protocol::*;
 
 /// So many without the variable: a second or two.
-const MUTATIONS: u32 = 20_000;
+const MUTATIONS: u32 = 200_000;
 
 fn mutations() -> u32 {
     std::env::var("QUAD_MUTATIONS").ok().map_or(MUTATIONS, |text| text.parse().expect("QUAD_MUTATIONS is a number"))
@@ -77,6 +77,7 @@ fn frames() -> Vec<Vec<u8>> {
         .unwrap(),
         encode(&ScoreReply::Recorded { incarnation: 1, new: 2, duplicates: 3 }).unwrap(),
         encode(&ScoreReply::Refused { incarnation: 1, reason: text() }).unwrap(),
+        encode(&WeightsRequest { evaluator: name() }).unwrap(),
         encode(&RecordedScores { run: name(), step: 1, weights, evaluator: name(), episodes }).unwrap(),
         encode(&progress.signed(&lease)).unwrap(),
     ]
@@ -149,5 +150,6 @@ proptest! {
         decode_as::<ScoreReply>(&frame);
         decode_as::<RecordedScores>(&frame);
         decode_as::<Progress>(&frame);
+        decode_as::<WeightsRequest>(&frame);
     }
 }

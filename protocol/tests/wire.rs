@@ -211,6 +211,9 @@ proptest! {
     fn job_requests(message in job_request()) { withstands_the_wire(&message)?; }
 
     #[test]
+    fn weights_requests(evaluator in name()) { withstands_the_wire(&WeightsRequest { evaluator })?; }
+
+    #[test]
     fn job_replies(message in job_reply()) { withstands_the_wire(&message)?; }
 
     #[test]
@@ -265,6 +268,7 @@ proptest! {
         check::<ScoreReply>(&body);
         check::<RecordedScores>(&body);
         check::<Progress>(&body);
+        check::<WeightsRequest>(&body);
     }
 }
 

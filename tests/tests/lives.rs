@@ -121,7 +121,7 @@ async fn scores_measured_for_one_life_are_delivered_to_the_next() {
     {
         let heard = heard.lock().unwrap();
         assert_eq!(heard.attempts[0], heard.attempts[1], "a claim without an answer is the same claim again");
-        assert!(heard.progress.first().is_some_and(|first| first.steps_done == 0), "it tells that it has begun");
+        assert!(heard.progress.first().is_some_and(|first| first.steps_done == 0), "{:?}", heard.progress);
         assert!(heard.progress.windows(2).all(|two| two[0].steps_done <= two[1].steps_done));
     }
     let page = evaluator.metrics();

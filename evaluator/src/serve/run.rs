@@ -5,7 +5,9 @@ use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use anyhow::Context;
-use quad_protocol::{Hash, Job, JobReply, JobRequest, Name, Progress, ScoreReply, ScoreReport, Snapshot, encode, keys};
+use quad_protocol::{
+    Hash, Job, JobReply, JobRequest, Name, Progress, ScoreReply, ScoreReport, Snapshot, WeightsRequest, encode, keys,
+};
 use rand::Rng;
 use tokio::sync::Notify;
 use tracing::{debug, info, warn};
@@ -14,7 +16,7 @@ use zenoh::liveliness::LivelinessToken;
 
 use super::budget::Budget;
 use super::discovery::Found;
-use super::query::{AskError, ask};
+use super::query::ask;
 use super::snapshots::SnapshotReceiver;
 use crate::metrics::{JobOutcome, Metrics};
 
@@ -215,18 +217,19 @@ impl RunClient {
     }
 
     /// The snapshot that `job` names: as it was published, or asked for where that was missed.
-    pub async fn snapshot(&self, job: &Job) -> Result<Arc<Snapshot>, AskError> {
+    pub async fn snapshot(&self, job: &Job) -> anyhow::Result<Arc<Snapshot>> {
         if let Some(snapshot) = self.snapshots.get(job) {
             return Ok(snapshot);
         }
         let key = keys::weights_at(&self.run, job.step);
+        let request = encode(&WeightsRequest { evaluator: self.identity.evaluator.clone() })?;
         let wanted = (job.run.clone(), job.incarnation, job.step, job.weights);
         let fitting = move |found: &Snapshot| {
             let (run, incarnation, step, weights) = &wanted;
             let is_it = (&found.run, &found.incarnation, &found.step) == (run, incarnation, step);
             if is_it && found.hash == *weights { Ok(()) } else { Err("other_snapshot") }
         };
-        let snapshot: Snapshot = ask(&self.session, key, Vec::new(), WEIGHTS_TIMEOUT, &self.metrics, fitting).await?;
+        let snapshot: Snapshot = ask(&self.session, key, request, WEIGHTS_TIMEOUT, &self.metrics, fitting).await?;
         self.metrics.snapshots_received.inc();
         Ok(Arc::new(snapshot))
     }
