@@ -19,7 +19,7 @@ use crate::report::Spread;
 use crate::run_dir::{RunDir, RunEndpoints};
 use crate::threads::Threads;
 use crate::train::Outcome;
-use crate::wire::Wire;
+use crate::wire::{Life, Wire};
 
 /// Listening takes milliseconds. A session that takes longer waits for a router; training starts without it.
 const SESSION_PATIENCE: Duration = Duration::from_secs(1);
@@ -69,6 +69,8 @@ pub enum Ending {
 pub struct Conductor {
     /// Name of the run.
     pub run: Name,
+    /// Which start of the learner this is.
+    pub incarnation: u64,
     /// Its folder.
     pub run_dir: RunDir,
     /// Its metrics.
@@ -166,7 +168,8 @@ impl Conductor {
         let endpoints = RunEndpoints { zenoh: self.reachable_at.clone(), metrics: self.metrics_address.clone() };
         let ready = || Ok(self.run_dir.write_endpoints(&endpoints)?);
         let (hub, publisher) = (&self.threads.hub, &self.threads.publisher);
-        let wire = Wire::declare(session, &self.run, hub, publisher, &self.metrics, ready).await?;
+        let life = Life { run: self.run.clone(), incarnation: self.incarnation };
+        let wire = Wire::declare(session, life, hub, publisher, &self.metrics, ready).await?;
         let (zenoh, metrics) = (endpoints.zenoh.join(", "), &endpoints.metrics);
         self.display.say(&format!("run {} is at {zenoh}, its metrics at http://{metrics}/metrics", self.run));
         Ok(wire)
@@ -179,6 +182,10 @@ impl Conductor {
             Notice::EvaluatorLeft(name, 0) => format!("evaluator {name} has left"),
             Notice::EvaluatorLeft(name, jobs) => {
                 format!("evaluator {name} has left; its {jobs} unfinished jobs go to others")
+            }
+            Notice::EvaluatorsChanged { joined, left } => format!("{joined} more evaluators came and {left} left"),
+            Notice::GivenUp(episodes) => {
+                format!("{} episodes are given up: each took too many evaluators with it", episodes.len())
             }
             Notice::JobsExpired(jobs) => format!("{jobs} jobs made no progress; they go to others"),
             Notice::Evaluated { step, scores } => {

@@ -1,28 +1,34 @@
 //! The thread that owns the scoreboard: it hands out jobs, records scores, and follows which evaluators are connected. A
-//! single thread needs no locks, and its messages are small, so none delays the next one for long.
+//! single thread needs no locks, and its messages are small, so none delays the next one for long. Others send its answers.
+
+mod announcer;
+mod rejection;
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::time::{Duration, Instant};
 
 use anyhow::anyhow;
 use quad_protocol::{
-    CodecError, EpisodeScore, Hash, JobReply, JobRequest, Message, Name, Progress, RecordedScores, ScoreReply,
-    ScoreReport, decode, encode, episode_seeds, keys,
+    EpisodeScore, Hash, JobReply, JobRequest, Message, Name, Progress, RecordedScores, ScoreReply, ScoreReport, decode,
+    encode, episode_seeds, keys,
 };
 use quad_service::hinted;
 use tokio::sync::mpsc::UnboundedSender;
-use tracing::{debug, error};
+use tracing::{debug, error, warn};
 use zenoh::bytes::ZBytes;
 use zenoh::qos::CongestionControl;
-use zenoh::query::Query;
 use zenoh::sample::{Sample, SampleKind};
 use zenoh::{Session, Wait};
 
 use crate::inbox::Messages;
 use crate::metrics::Metrics;
 use crate::notice::Notice;
-use crate::run_dir::{Log, RunDirError, ScoreLine};
-use crate::scoreboard::{OtherWeights, Refusal, Scoreboard};
+use crate::replies::{Asker, Question};
+use crate::run_dir::{Log, ScoreLine};
+use crate::scoreboard::{Claim, Lost, OtherWeights, Scoreboard};
+
+use announcer::Announcer;
+use rejection::Rejection;
 
 /// How often expired leases are looked for.
 const TICK: Duration = Duration::from_millis(250);
@@ -45,14 +51,16 @@ pub enum Event {
     TrainingCompleted,
     /// The Zenoh session is open.
     Online(Session),
-    /// An evaluator asks for a job.
-    Claim(Query),
+    /// An evaluator asks for a job, or hands one back.
+    Job(Question),
     /// An evaluator delivers scores.
-    Report(Query),
+    Report(Question),
     /// An evaluator reports a job's progress.
     Progress(Sample),
     /// A liveliness token of an evaluator came or went.
     Liveliness(Sample),
+    /// Another learner has the run's name: what to say of it.
+    Twin(anyhow::Error),
     /// End, after the messages sent before this one are handled.
     Stop,
 }
@@ -74,40 +82,11 @@ pub struct Hub {
     scores: Log,
     metrics: Metrics,
     notices: UnboundedSender<Notice>,
+    announcer: Announcer,
     session: Option<Session>,
     present: BTreeSet<Name>,
     last_seen: BTreeMap<Name, Instant>,
     training_completed: bool,
-}
-
-/// Why a message from the wire was not accepted.
-#[derive(Debug, thiserror::Error)]
-enum Rejection {
-    #[error("the message is empty")]
-    Empty,
-    #[error("the message cannot be read: {0}")]
-    Codec(#[from] CodecError),
-    #[error("refused: {0}")]
-    Refused(#[from] Refusal),
-    #[error("an evaluator announces itself under a name that is not allowed")]
-    Name,
-    #[error("there are too many evaluators")]
-    Crowd,
-    #[error("the scores could not be saved, try again: {0}")]
-    Disk(#[from] RunDirError),
-}
-
-impl Rejection {
-    fn label(&self) -> &'static str {
-        match self {
-            Self::Empty => "empty",
-            Self::Codec(error) => error.label(),
-            Self::Refused(refusal) => refusal.label(),
-            Self::Name => "invalid_name",
-            Self::Crowd => "too_many_evaluators",
-            Self::Disk(_) => "not_saved",
-        }
-    }
 }
 
 impl Hub {
@@ -126,6 +105,7 @@ impl Hub {
             scoreboard,
             scores,
             metrics,
+            announcer: Announcer::new(notices.clone()),
             notices,
             session: None,
             present: BTreeSet::new(),
@@ -147,7 +127,9 @@ impl Hub {
                 ticked = Instant::now();
                 self.tick(ticked);
             }
-            self.metrics.evaluation.episodes_pending.set(self.scoreboard.pending() as i64);
+            let evaluation = &self.metrics.evaluation;
+            evaluation.episodes_pending.set(self.scoreboard.pending() as i64);
+            evaluation.episodes_missing.set(self.scoreboard.missing().len() as i64);
         }
     }
 
@@ -167,14 +149,15 @@ impl Hub {
                 self.settle();
             }
             Event::Online(session) => self.session = Some(session),
-            Event::Claim(query) => {
-                let reply = parse(query.payload()).map(|request| self.claim(&request));
-                self.answer(&query, keys::jobs(&self.run), reply);
+            Event::Job(question) => {
+                let reply = parse(question.payload()).map(|request| self.job(request));
+                self.answer(question, keys::jobs(&self.run), reply);
             }
-            Event::Report(query) => {
+            Event::Report(question) => {
                 let mut completed = None;
-                let reply = parse(query.payload()).and_then(|report| self.report(&report, &mut completed));
-                self.answer(&query, keys::scores(&self.run), reply);
+                let reply = parse(question.payload())
+                    .and_then(|report: ScoreReport| Ok((self.report(&report, &mut completed)?, report.evaluator)));
+                self.answer(question, keys::scores(&self.run), reply);
                 if let Some(notice) = completed {
                     self.notices.send(notice).ok();
                 }
@@ -190,34 +173,57 @@ impl Hub {
                     self.reject(&rejection);
                 }
             }
+            Event::Twin(error) => {
+                self.notices.send(Notice::Failed(error)).ok();
+            }
             Event::Stop => {}
         }
     }
 
-    fn claim(&mut self, request: &JobRequest) -> JobReply {
-        let reply = self.scoreboard.claim(request, Instant::now());
-        if let JobReply::Job(job) = &reply {
-            debug!(job = job.id, step = job.step, evaluator = %request.evaluator, "handed out");
-            self.metrics.evaluation.jobs_handed_out.inc();
+    /// The answer, and whom it is for.
+    fn job(&mut self, request: JobRequest) -> (JobReply, Name) {
+        match request {
+            JobRequest::Claim { evaluator, attempt, environments, precision } => {
+                let claim = Claim { evaluator: &evaluator, attempt, environments: &environments };
+                let handed_out = self.scoreboard.handed_out();
+                let reply = self.scoreboard.claim(claim, Instant::now());
+                if let JobReply::Job(job) = &reply {
+                    debug!(job = job.id, step = job.step, %evaluator, %precision, "handed out");
+                }
+                // The same job a second time is not counted.
+                let new = self.scoreboard.handed_out() - handed_out;
+                self.metrics.evaluation.jobs_handed_out.inc_by(new);
+                (reply, evaluator)
+            }
+            JobRequest::HandBack { evaluator, job, lease } => {
+                let accepted = self.scoreboard.hand_back(&evaluator, job, &lease);
+                self.metrics.evaluation.jobs_handed_back.inc_by(accepted.into());
+                (JobReply::HandedBack { incarnation: self.scoreboard.incarnation(), accepted }, evaluator)
+            }
         }
-        reply
     }
 
     /// Checks the scores, writes the new ones to disk, counts them. Only then does the caller acknowledge the report.
     fn report(&mut self, report: &ScoreReport, completed: &mut Option<Notice>) -> Result<ScoreReply, Rejection> {
-        let screened = match self.scoreboard.screen(report) {
-            Ok(screened) => screened,
+        let incarnation = self.scoreboard.incarnation();
+        let screened = match report.cannot_act {
+            Some(_) => self.scoreboard.screen_complaint(report).map(|()| None),
+            None => self.scoreboard.screen(report).map(Some),
+        };
+        let screened = match screened {
+            Ok(Some(screened)) => screened,
+            Ok(None) => {
+                let reason = report.cannot_act.as_ref().map(|complaint| complaint.reason.as_str()).unwrap_or_default();
+                let (step, evaluator) = (report.step, &report.evaluator);
+                let broken = anyhow!("the policy of step {step} cannot act: {reason} (evaluator {evaluator})");
+                self.notices.send(Notice::Failed(broken)).ok();
+                return Ok(ScoreReply::Recorded { incarnation, new: 0, duplicates: 0 });
+            }
             Err(refusal) => {
                 self.reject(&Rejection::Refused(refusal));
-                return Ok(ScoreReply::Refused { reason: refusal.to_string() });
+                return Ok(ScoreReply::Refused { incarnation, reason: refusal.to_string() });
             }
         };
-        if let Some(reason) = &report.cannot_act {
-            let (step, evaluator) = (report.step, &report.evaluator);
-            let broken = anyhow!("the policy of step {step} cannot act: {reason} (evaluator {evaluator})");
-            self.notices.send(Notice::Failed(broken)).ok();
-            return Ok(ScoreReply::Recorded { new: 0, duplicates: 0 });
-        }
         if !screened.new.is_empty() {
             let lines: Vec<_> = screened.new.iter().map(|score| ScoreLine::new(report, score)).collect();
             // If this fails nothing is counted, so the scores are new again when the evaluator delivers them once more.
@@ -227,12 +233,13 @@ impl Hub {
         let evaluation = &self.metrics.evaluation;
         evaluation.scores_recorded.inc_by(screened.new.len() as u64);
         evaluation.scores_duplicate.inc_by(screened.duplicates.into());
-        evaluation.jobs_completed.inc_by(recorded.job_completed.into());
+        evaluation.jobs_completed.inc_by(recorded.jobs_completed as u64);
         if let Some(scores) = recorded.evaluation_completed {
             self.show(report.step, &scores);
             *completed = Some(Notice::Evaluated { step: report.step, scores });
         }
-        let reply = ScoreReply::Recorded { new: screened.new.len() as u32, duplicates: screened.duplicates };
+        let (new, duplicates) = (screened.new.len() as u32, screened.duplicates);
+        let reply = ScoreReply::Recorded { incarnation, new, duplicates };
         if !screened.new.is_empty() {
             self.publish(report, screened.new);
         }
@@ -280,14 +287,14 @@ impl Hub {
             SampleKind::Put if self.present.len() >= MOST_EVALUATORS => return Err(Rejection::Crowd),
             SampleKind::Put => {
                 if self.present.insert(evaluator.clone()) {
-                    self.notices.send(Notice::EvaluatorJoined(evaluator)).ok();
+                    self.announcer.joined(evaluator);
                 }
             }
             SampleKind::Delete => {
                 if self.present.remove(&evaluator) {
                     let lost = self.scoreboard.evaluator_gone(&evaluator);
-                    self.metrics.evaluation.jobs_expired.inc_by(lost as u64);
-                    self.notices.send(Notice::EvaluatorLeft(evaluator, lost)).ok();
+                    self.announcer.left(evaluator, lost.jobs);
+                    self.lost(lost);
                 }
             }
         }
@@ -296,11 +303,12 @@ impl Hub {
     }
 
     fn tick(&mut self, now: Instant) {
+        self.announcer.tick(now);
         let expired = self.scoreboard.expire(now);
-        if expired > 0 {
-            self.metrics.evaluation.jobs_expired.inc_by(expired as u64);
-            self.notices.send(Notice::JobsExpired(expired)).ok();
+        if expired.jobs > 0 {
+            self.notices.send(Notice::JobsExpired(expired.jobs)).ok();
         }
+        self.lost(expired);
         let (present, metrics) = (&self.present, &self.metrics.evaluators);
         self.last_seen.retain(|evaluator, seen| {
             let keep = present.contains(evaluator) || now.duration_since(*seen) < FORGET_AFTER;
@@ -309,6 +317,17 @@ impl Hub {
             }
             keep
         });
+    }
+
+    fn lost(&mut self, lost: Lost) {
+        self.metrics.evaluation.jobs_expired.inc_by(lost.jobs as u64);
+        if !lost.given_up.is_empty() {
+            for (step, seed) in &lost.given_up {
+                warn!(step, seed, "an episode is given up: too many evaluators were lost with it");
+            }
+            self.notices.send(Notice::GivenUp(lost.given_up)).ok();
+            self.settle();
+        }
     }
 
     fn settle(&mut self) {
@@ -326,16 +345,14 @@ impl Hub {
         self.metrics.reject(rejection.label());
     }
 
-    fn answer<M: Message>(&self, query: &Query, key: String, reply: Result<M, Rejection>) {
-        let sent = match reply.and_then(|message| Ok(encode(&message)?)) {
-            Ok(bytes) => query.reply(key, bytes).wait(),
+    fn answer<M: Message>(&self, question: Question, key: String, reply: Result<(M, Name), Rejection>) {
+        let encoded = reply.and_then(|(message, evaluator)| Ok((encode(&message)?, evaluator)));
+        match encoded {
+            Ok((bytes, evaluator)) => question.answer(Asker::Evaluator(evaluator), Ok((key, bytes.into()))),
             Err(rejection) => {
                 self.reject(&rejection);
-                query.reply_err(rejection.to_string()).wait()
+                question.answer(Asker::Stranger, Err(rejection.to_string()));
             }
-        };
-        if let Err(error) = sent {
-            debug!(%error, "an answer could not be sent");
         }
     }
 }

@@ -8,6 +8,8 @@ use std::time::Duration;
 
 /// Most messages from the network that may wait. With `MOST_BYTES` it bounds the memory that they can take.
 const MOST_WAITING: usize = 256;
+/// The same for what Zenoh itself tells of who comes and goes, which takes little room and is not sent again.
+const MOST_CHANGES_WAITING: usize = 4096;
 /// Largest payload of a message to the learner; a score report of a job is a few hundred bytes.
 pub const MOST_BYTES: usize = 256 * 1024;
 
@@ -15,7 +17,30 @@ pub const MOST_BYTES: usize = 256 * 1024;
 #[derive(Debug)]
 pub struct Inbox<T> {
     sender: Sender<Envelope<T>>,
-    waiting: Arc<AtomicUsize>,
+    waiting: Arc<Waiting>,
+}
+
+#[derive(Debug, Default)]
+struct Waiting {
+    messages: AtomicUsize,
+    changes: AtomicUsize,
+}
+
+#[derive(Clone, Copy, Debug)]
+enum Source {
+    Process,
+    Message,
+    Change,
+}
+
+impl Waiting {
+    fn of(&self, source: Source) -> Option<(&AtomicUsize, usize)> {
+        match source {
+            Source::Process => None,
+            Source::Message => Some((&self.messages, MOST_WAITING)),
+            Source::Change => Some((&self.changes, MOST_CHANGES_WAITING)),
+        }
+    }
 }
 
 // Not derived, because that would ask for `T: Clone`.
@@ -29,35 +54,46 @@ impl<T> Clone for Inbox<T> {
 #[derive(Debug)]
 pub struct Messages<T> {
     receiver: Receiver<Envelope<T>>,
-    waiting: Arc<AtomicUsize>,
+    waiting: Arc<Waiting>,
 }
 
 #[derive(Debug)]
 struct Envelope<T> {
     message: T,
-    from_wire: bool,
+    source: Source,
 }
 
 /// A queue that is bounded for messages from the network.
 pub fn inbox<T>() -> (Inbox<T>, Messages<T>) {
     let (sender, receiver) = mpsc::channel();
-    let waiting = Arc::new(AtomicUsize::new(0));
+    let waiting = Arc::new(Waiting::default());
     (Inbox { sender, waiting: waiting.clone() }, Messages { receiver, waiting })
 }
 
 impl<T> Inbox<T> {
     /// Sends a message from inside this process: always accepted, never blocks; lost if the receiver is gone.
     pub fn send(&self, message: T) {
-        self.sender.send(Envelope { message, from_wire: false }).ok();
+        self.sender.send(Envelope { message, source: Source::Process }).ok();
     }
 
     /// Sends a message from the network; gives it back if too many wait already. Never blocks.
     pub fn offer(&self, message: T) -> Result<(), T> {
-        if self.waiting.fetch_add(1, Ordering::Relaxed) >= MOST_WAITING {
-            self.waiting.fetch_sub(1, Ordering::Relaxed);
+        self.offer_from(Source::Message, message)
+    }
+
+    /// The same for a change of who is connected.
+    pub fn offer_change(&self, message: T) -> Result<(), T> {
+        self.offer_from(Source::Change, message)
+    }
+
+    fn offer_from(&self, source: Source, message: T) -> Result<(), T> {
+        if let Some((waiting, most)) = self.waiting.of(source)
+            && waiting.fetch_add(1, Ordering::Relaxed) >= most
+        {
+            waiting.fetch_sub(1, Ordering::Relaxed);
             return Err(message);
         }
-        self.sender.send(Envelope { message, from_wire: true }).map_err(|unsent| unsent.0.message)
+        self.sender.send(Envelope { message, source }).map_err(|unsent| unsent.0.message)
     }
 }
 
@@ -66,8 +102,8 @@ impl<T> Messages<T> {
     pub fn next(&self, timeout: Duration) -> Result<Option<T>, Disconnected> {
         match self.receiver.recv_timeout(timeout) {
             Ok(envelope) => {
-                if envelope.from_wire {
-                    self.waiting.fetch_sub(1, Ordering::Relaxed);
+                if let Some((waiting, _)) = self.waiting.of(envelope.source) {
+                    waiting.fetch_sub(1, Ordering::Relaxed);
                 }
                 Ok(Some(envelope.message))
             }
@@ -94,6 +130,9 @@ mod tests {
         let received: Vec<_> = std::iter::from_fn(|| messages.next(Duration::ZERO).unwrap()).collect();
         assert_eq!(received.len(), MOST_WAITING + 1);
         assert_eq!(received.last(), Some(&7777));
+        let changes = (0..MOST_CHANGES_WAITING + 10).filter(|&n| inbox.offer_change(n).is_ok()).count();
+        assert_eq!(changes, MOST_CHANGES_WAITING);
+        assert_eq!(std::iter::from_fn(|| messages.next(Duration::ZERO).unwrap()).count(), changes);
         assert!(inbox.offer(1).is_ok(), "there is room again");
         drop(inbox);
         assert_eq!(messages.next(Duration::ZERO), Ok(Some(1)));

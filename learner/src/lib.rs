@@ -14,7 +14,8 @@
 //! - [`agent`] runs one of the [`algorithms`], each a file to be read beside its paper, with an [`optimiser`] and the
 //!   [`random`] numbers of its seed, on a thread pool that is kept awake (`pool`).
 //! - [`scoreboard`] is the hub's state without any I/O.
-//! - [`wire`] declares everything on Zenoh; its callbacks fill an [`inbox`]; [`notice`] is what threads tell the main loop.
+//! - [`wire`] declares everything on Zenoh; its callbacks fill an [`inbox`], and [`replies`] answers without anybody waiting
+//!   for a peer that does not read; [`notice`] is what threads tell the main loop.
 //! - [`run_dir`] is the folder of a run, [`metrics`] are for Prometheus, [`display`] shows progress on the terminal.
 //! - [`report`] and [`plot`] summarise the scores as tables and as a picture; [`verify`] checks them against the folder.
 
@@ -39,6 +40,7 @@ mod pool;
 pub mod presets;
 pub mod publisher;
 pub mod random;
+pub mod replies;
 pub mod report;
 pub mod resume;
 pub mod run;

@@ -54,7 +54,9 @@ pub struct EvaluationMetrics {
     pub jobs_handed_out: IntCounter,
     pub jobs_completed: IntCounter,
     pub jobs_expired: IntCounter,
+    pub jobs_handed_back: IntCounter,
     pub episodes_pending: IntGauge,
+    pub episodes_missing: IntGauge,
     pub scores_recorded: IntCounter,
     pub scores_duplicate: IntCounter,
     pub score: Gauge,
@@ -143,6 +145,11 @@ impl Metrics {
             jobs_handed_out: jobs.get_metric_with_label_values(&["handed_out"])?,
             jobs_completed: jobs.get_metric_with_label_values(&["completed"])?,
             jobs_expired: jobs.get_metric_with_label_values(&["expired"])?,
+            jobs_handed_back: jobs.get_metric_with_label_values(&["handed_back"])?,
+            episodes_missing: make.count(
+                "episodes_missing",
+                "Episodes that are not handed out any more, after too many lost evaluators",
+            )?,
             episodes_pending: make.count("episodes_pending", "Episodes of evaluations that have no score yet")?,
             scores_recorded: make.counter("scores_recorded_total", "Episodes scored, each counted once")?,
             scores_duplicate: make.counter("scores_duplicate_total", "Scores delivered for episodes that had one")?,
@@ -231,12 +238,15 @@ mod tests {
         let progress = Progress {
             evaluator: Name::new("e1").unwrap(),
             run,
+            incarnation: 1,
             job: 1,
             step: 2,
             episodes_done: 0,
             episodes_total: 5,
+            steps_done: 7,
             environment_steps: 77,
             episodes: 3,
+            proof: quad_protocol::Hash::of(b"none"),
         };
         metrics.evaluators.observe(&progress);
         let families = registry.gather();

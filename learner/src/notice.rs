@@ -14,6 +14,15 @@ pub enum Notice {
     EvaluatorJoined(Name),
     /// An evaluator left; this many jobs that it had not finished were taken back.
     EvaluatorLeft(Name, usize),
+    /// So many others connected and left, in some seconds.
+    EvaluatorsChanged {
+        /// How many connected.
+        joined: usize,
+        /// How many left.
+        left: usize,
+    },
+    /// Episodes, by step and seed, that are not handed out any more: too many evaluators were lost with them.
+    GivenUp(Vec<(u64, u64)>),
     /// This many jobs were taken back because their leases ran out.
     JobsExpired(usize),
     /// All episodes of an evaluation are scored.
@@ -28,7 +37,7 @@ pub enum Notice {
         /// Episodes that have no score yet.
         pending: usize,
     },
-    /// All gradient steps are done, and no score is outstanding.
+    /// All gradient steps are done, and no score is outstanding that may still come.
     Settled,
     /// The disk does not take what is to be kept; what it says.
     DiskTrouble(String),

@@ -7,18 +7,18 @@ use std::time::Duration;
 use anyhow::Context;
 use quad_dataset::Task;
 use quad_policy::Description;
-use quad_protocol::{Hash, Name, Schema, Snapshot, encode, keys};
+use quad_protocol::{Hash, Name, Schema, Snapshot, WeightsRequest, decode, encode, keys};
 use tokio::sync::mpsc::UnboundedSender;
 use tracing::debug;
 use zenoh::Wait;
 use zenoh::bytes::ZBytes;
 use zenoh::pubsub::Publisher;
-use zenoh::query::Query;
 
 use crate::hub;
 use crate::inbox::{Inbox, Messages};
 use crate::metrics::Metrics;
 use crate::notice::Notice;
+use crate::replies::{Asker, Question};
 use crate::run_dir::RunDir;
 
 /// Longest wait for a message. The thread does nothing between messages, so the value does not matter.
@@ -34,7 +34,7 @@ pub enum Event {
     /// The Zenoh session is open; publish with this.
     Online(Publisher<'static>),
     /// An evaluator asks for `weights/<step>`.
-    Query(Query),
+    Query(Question),
     /// End, after the messages sent before this one are handled.
     Stop,
 }
@@ -105,7 +105,7 @@ impl SnapshotPublisher {
                 }
                 Some(Event::TrainingCompleted) => self.hub.send(hub::Event::TrainingCompleted),
                 Some(Event::Online(publisher)) => self.publisher = Some(publisher),
-                Some(Event::Query(query)) => self.answer(&query),
+                Some(Event::Query(question)) => self.answer(question),
                 Some(Event::Stop) => return,
             }
         }
@@ -113,7 +113,7 @@ impl SnapshotPublisher {
 
     fn publish(&mut self, snapshot: Kept) -> anyhow::Result<()> {
         let Kept { step, kind, hash, tensors } = snapshot;
-        let bytes = ZBytes::from(encode(&self.message(step, kind, hash, tensors))?);
+        let bytes = ZBytes::from(encode(&message(self.identity.clone(), kind, step, hash, tensors))?);
         self.hashes.insert(step, hash);
         self.newest = Some((step, bytes.clone()));
         // The jobs must exist first: evaluators ask for one as soon as the snapshot arrives.
@@ -129,43 +129,48 @@ impl SnapshotPublisher {
         Ok(())
     }
 
-    fn message(&self, step: u64, kind: &str, hash: Hash, tensors: Vec<u8>) -> Snapshot {
-        let Identity { run, incarnation, task } = self.identity.clone();
-        let schema = Schema {
-            environment: task.environment,
-            observation_dim: task.observation_dim as u32,
-            action_dim: task.action_dim as u32,
-            policy: kind.to_owned(),
-        };
-        Snapshot { run, incarnation, step, schema, hash, tensors }
-    }
-
-    fn answer(&self, query: &Query) {
-        let asked = keys::step_of(query.key_expr().as_str());
+    /// Whatever takes time is left to the thread that sends the answer.
+    fn answer(&self, question: Question) {
+        let asked = question.key().and_then(|key| keys::step_of(key.as_str()));
         let Some((&step, &hash)) = asked.and_then(|step| self.hashes.get_key_value(&step)) else {
             self.metrics.reject("unknown_step");
-            query.reply_err("there is no snapshot of that step").wait().ok();
+            question.answer(Asker::Stranger, Err("there is no snapshot of that step".to_owned()));
             return;
         };
-        let sent = match self.bytes(step, hash) {
-            Ok(bytes) => query.reply(keys::weights_at(&self.identity.run, step), bytes).wait(),
-            Err(error) => query.reply_err(format!("{error:#}")).wait(),
+        let key = keys::weights_at(&self.identity.run, step);
+        let request = question.payload().map(|payload| decode::<WeightsRequest>(&payload.to_bytes()));
+        let asker = match request {
+            Some(Ok(request)) => Asker::Evaluator(request.evaluator),
+            _ => Asker::Stranger,
         };
-        if let Err(error) = sent {
-            debug!(%error, step, "the answer to a question for weights could not be sent");
+        if let Some((_, bytes)) = self.newest.as_ref().filter(|(newest, _)| *newest == step) {
+            question.answer(asker, Ok((key, bytes.clone())));
+            return;
         }
+        let (identity, run_dir) = (self.identity.clone(), self.run_dir.clone());
+        question.answer_with(asker, move || {
+            let bytes = saved(identity, &run_dir, step, hash);
+            bytes.map(|bytes| (key, bytes)).map_err(|error| format!("{error:#}"))
+        });
     }
+}
 
-    fn bytes(&self, step: u64, hash: Hash) -> anyhow::Result<ZBytes> {
-        if let Some((newest, bytes)) = &self.newest
-            && *newest == step
-        {
-            return Ok(bytes.clone());
-        }
-        let tensors = self.run_dir.read_snapshot(step)?;
-        anyhow::ensure!(Hash::of(&tensors) == hash, "the saved snapshot of step {step} was changed");
-        let kind = Description::read(&tensors)?.kind();
-        let bytes = encode(&self.message(step, kind, hash, tensors)).context("cannot encode the snapshot")?;
-        Ok(ZBytes::from(bytes))
-    }
+fn message(identity: Identity, kind: &str, step: u64, hash: Hash, tensors: Vec<u8>) -> Snapshot {
+    let Identity { run, incarnation, task } = identity;
+    let schema = Schema {
+        environment: task.environment,
+        observation_dim: task.observation_dim as u32,
+        action_dim: task.action_dim as u32,
+        policy: kind.to_owned(),
+    };
+    Snapshot { run, incarnation, step, schema, hash, tensors }
+}
+
+/// A snapshot from the disk.
+fn saved(identity: Identity, run_dir: &RunDir, step: u64, hash: Hash) -> anyhow::Result<ZBytes> {
+    let tensors = run_dir.read_snapshot(step)?;
+    anyhow::ensure!(Hash::of(&tensors) == hash, "the saved snapshot of step {step} was changed");
+    let kind = Description::read(&tensors)?.kind();
+    let bytes = encode(&message(identity, kind, step, hash, tensors)).context("cannot encode the snapshot")?;
+    Ok(ZBytes::from(bytes))
 }

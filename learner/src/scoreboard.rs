@@ -1,14 +1,22 @@
 //! The state of all evaluations, without any I/O: which episodes wait, which are handed out and to whom, and the scores.
 //!
 //! An evaluation is a snapshot (step and hash) with a list of episode seeds. Jobs hand out some of its episodes under a
-//! lease that progress extends; when the lease runs out or the evaluator leaves, they are handed out again. For each
-//! (step, seed) the first score that is delivered counts, and no other. The current time is an argument, for tests.
+//! lease that progress extends; when the lease runs out or the evaluator leaves, they are handed out again, unless that has
+//! happened too often. For each (step, seed) the first score that is delivered counts, and no other, whoever delivers it. The
+//! current time is an argument, for tests. `job` has the rules of a lease, `refusal` why a message is not accepted.
 
-use std::collections::BTreeMap;
+mod job;
+mod refusal;
+
+use std::collections::{BTreeMap, BTreeSet};
 use std::time::{Duration, Instant};
 
 use quad_dataset::Task;
-use quad_protocol::{EpisodeScore, Hash, Job, JobReply, JobRequest, Name, Progress, ScoreReport};
+use quad_protocol::{EpisodeScore, Hash, Job, JobReply, Lease, Name, Progress, ScoreReport};
+
+use job::OpenJob;
+pub use refusal::Refusal;
+use refusal::require;
 
 use crate::resume::Earlier;
 
@@ -16,6 +24,8 @@ use crate::resume::Earlier;
 const ASK_AGAIN: Duration = Duration::from_millis(500);
 /// The same for an evaluator that does not have the run's environment.
 const NOT_FOR_YOU: Duration = Duration::from_secs(10);
+/// An episode whose evaluator was lost so often is not handed out any more: it may be what they are lost of.
+const MOST_ATTEMPTS: u32 = 20;
 /// Largest relative difference between a score and the one computed from its return; it allows for rounding only.
 const SCORE_TOLERANCE: f64 = 1e-6;
 
@@ -43,7 +53,9 @@ pub struct Rules {
 pub struct Scoreboard {
     rules: Rules,
     evaluations: BTreeMap<u64, Evaluation>,
-    jobs: BTreeMap<u64, JobRecord>,
+    /// The jobs that are open.
+    jobs: BTreeMap<u64, OpenJob>,
+    next_job: u64,
     /// Scores of an earlier life, by step, whose evaluation has not been asked for in this one.
     earlier: BTreeMap<u64, Earlier>,
 }
@@ -70,23 +82,19 @@ struct Evaluation {
 struct Episode {
     seed: u64,
     state: EpisodeState,
+    /// How often an evaluator that had it was lost.
+    lost: u32,
 }
 
 #[derive(Debug)]
 enum EpisodeState {
     Waiting,
-    HandedOut { job: u64 },
+    HandedOut {
+        job: u64,
+    },
+    /// Not handed out any more. Its score is still welcome.
+    GivenUp,
     Scored(EpisodeScore),
-}
-
-/// A job that was handed out. Kept for the whole run, so that late and repeated reports can still be checked.
-#[derive(Debug)]
-struct JobRecord {
-    evaluator: Name,
-    step: u64,
-    seeds: Vec<u64>,
-    /// `None` once it is completed or its episodes were given back.
-    lease_until: Option<Instant>,
 }
 
 /// A report that passed every check, split into new scores and scores that are recorded already.
@@ -101,61 +109,46 @@ pub struct Screened {
 /// What a report completed.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct Recorded {
-    /// The report's job has no episode left to score.
-    pub job_completed: bool,
+    /// Jobs that have no episode left to score: the report's, or another's that came too late.
+    pub jobs_completed: usize,
     /// All episodes of its evaluation are scored: their scores.
     pub evaluation_completed: Option<Vec<EpisodeScore>>,
 }
 
-/// Why a message about a job is not accepted.
-#[derive(Clone, Copy, Debug, PartialEq, thiserror::Error)]
-pub enum Refusal {
-    /// For another run.
-    #[error("it is for another run")]
-    Run,
-    /// From before the learner's restart.
-    #[error("it is from another incarnation of the learner")]
-    Incarnation,
-    /// No such job was handed out.
-    #[error("no such job was handed out")]
-    Job,
-    /// The job was handed out to somebody else.
-    #[error("the job was handed out to another evaluator")]
-    Evaluator,
-    /// Not the step of the job.
-    #[error("the job is about another step")]
-    Step,
-    /// Not the weights of the job.
-    #[error("the job is about other weights")]
-    Weights,
-    /// An episode that the job does not contain, or the same one twice.
-    #[error("seed {0} is not in the job, or twice in the report")]
-    Seed(u64),
-    /// An episode with values that no episode of the environment can have.
-    #[error("the episode with seed {0} has an impossible length, return or score")]
-    Episode(u64),
+/// Jobs that were taken back.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct Lost {
+    /// How many.
+    pub jobs: usize,
+    /// Step and seed of the episodes that are not handed out any more, because they were lost too often.
+    pub given_up: Vec<(u64, u64)>,
 }
 
-impl Refusal {
-    /// The reason as a metric's label.
-    pub fn label(&self) -> &'static str {
-        match self {
-            Self::Run => "unknown_run",
-            Self::Incarnation => "unknown_incarnation",
-            Self::Job => "unknown_job",
-            Self::Evaluator => "wrong_evaluator",
-            Self::Step => "unknown_step",
-            Self::Weights => "unknown_weights",
-            Self::Seed(_) => "unknown_seed",
-            Self::Episode(_) => "impossible_episode",
-        }
-    }
+/// Who wants a job: the fields of a claim.
+#[derive(Clone, Copy, Debug)]
+pub struct Claim<'a> {
+    /// Its name.
+    pub evaluator: &'a Name,
+    /// The same number, if it asks the same again.
+    pub attempt: u64,
+    /// The environments that it has.
+    pub environments: &'a [String],
 }
 
 impl Scoreboard {
     /// An empty one.
     pub fn new(rules: Rules) -> Self {
-        Self { rules, evaluations: BTreeMap::new(), jobs: BTreeMap::new(), earlier: BTreeMap::new() }
+        Self { rules, evaluations: BTreeMap::new(), jobs: BTreeMap::new(), next_job: 1, earlier: BTreeMap::new() }
+    }
+
+    /// Which start of the learner this is.
+    pub fn incarnation(&self) -> u64 {
+        self.rules.incarnation
+    }
+
+    /// How many jobs were handed out so far.
+    pub fn handed_out(&self) -> u64 {
+        self.next_job - 1
     }
 
     /// Takes over the scores of an earlier life. They count as soon as the evaluation of their step is asked for.
@@ -186,7 +179,7 @@ impl Scoreboard {
         let scores = self.earlier.remove(&step).map(|earlier| earlier.episodes).unwrap_or_default();
         let episode = |&seed| {
             let score = scores.iter().find(|score| score.seed == seed);
-            Episode { seed, state: score.map_or(EpisodeState::Waiting, |score| EpisodeState::Scored(*score)) }
+            Episode { seed, state: score.map_or(EpisodeState::Waiting, |score| EpisodeState::Scored(*score)), lost: 0 }
         };
         let evaluation = Evaluation { weights, episodes: seeds.iter().map(episode).collect() };
         let complete = evaluation.scores();
@@ -194,82 +187,119 @@ impl Scoreboard {
         Ok(complete)
     }
 
-    /// Episodes that have no score yet.
+    /// Episodes that have no score yet, and may still get one: without those that are [`missing`](Self::missing).
     pub fn pending(&self) -> usize {
-        let scored = |episode: &&Episode| !matches!(episode.state, EpisodeState::Scored(_));
-        self.evaluations.values().map(|evaluation| evaluation.episodes.iter().filter(scored).count()).sum()
+        let open = |episode: &&Episode| matches!(episode.state, EpisodeState::Waiting | EpisodeState::HandedOut { .. });
+        self.evaluations.values().map(|evaluation| evaluation.episodes.iter().filter(open).count()).sum()
     }
 
-    /// Hands out a job: waiting episodes of the oldest step that has any.
-    pub fn claim(&mut self, request: &JobRequest, now: Instant) -> JobReply {
-        let wait = |time: Duration| JobReply::Wait { milliseconds: time.as_millis() as u64 };
-        let rules = &self.rules;
-        if !request.environments.contains(&rules.task.environment) {
+    /// Step and seed of the episodes that have no score and are not handed out any more.
+    pub fn missing(&self) -> Vec<(u64, u64)> {
+        let missing = |episode: &&Episode| matches!(episode.state, EpisodeState::GivenUp);
+        let of = |(&step, evaluation): (&u64, &Evaluation)| {
+            evaluation.episodes.iter().filter(missing).map(|episode| (step, episode.seed)).collect::<Vec<_>>()
+        };
+        self.evaluations.iter().flat_map(of).collect()
+    }
+
+    /// Hands out a job: waiting episodes of the oldest step that has any. An evaluator has one job at a time; asked the same
+    /// again, because the answer was lost, the answer is the same.
+    pub fn claim(&mut self, claim: Claim<'_>, now: Instant) -> JobReply {
+        let incarnation = self.rules.incarnation;
+        let wait = |time: Duration| JobReply::Wait { incarnation, milliseconds: time.as_millis() as u64 };
+        if !claim.environments.contains(&self.rules.task.environment) {
             return wait(NOT_FOR_YOU);
         }
-        let id = self.jobs.keys().next_back().map_or(1, |newest| newest + 1);
+        if let Some((&id, job)) = self.jobs.iter().find(|(_, job)| job.evaluator == *claim.evaluator) {
+            return match job.attempt == claim.attempt {
+                true => self.message(id, job).map_or(wait(ASK_AGAIN), JobReply::Job),
+                false => wait(ASK_AGAIN),
+            };
+        }
+        let id = self.next_job;
         for (&step, evaluation) in &mut self.evaluations {
             let waiting = evaluation.episodes.iter_mut().filter(|e| matches!(e.state, EpisodeState::Waiting));
             let mut seeds = Vec::new();
-            for episode in waiting.take(rules.job_episodes) {
+            for episode in waiting.take(self.rules.job_episodes) {
                 episode.state = EpisodeState::HandedOut { job: id };
                 seeds.push(episode.seed);
             }
             if seeds.is_empty() {
                 continue;
             }
-            let lease_until = Some(now + rules.lease);
-            let record = JobRecord { evaluator: request.evaluator.clone(), step, seeds: seeds.clone(), lease_until };
-            self.jobs.insert(id, record);
-            return JobReply::Job(Job {
-                id,
-                run: rules.run.clone(),
-                incarnation: rules.incarnation,
-                step,
-                weights: evaluation.weights,
-                environment: rules.task.environment.clone(),
-                instance: rules.instance,
-                seeds,
-                candidates: rules.candidates,
-                lease_milliseconds: rules.lease.as_millis() as u64,
-            });
+            let job = OpenJob::new(claim.evaluator.clone(), claim.attempt, (step, seeds), self.rules.lease, now);
+            let message = self.message(id, &job);
+            self.jobs.insert(id, job);
+            self.next_job += 1;
+            return message.map_or(wait(ASK_AGAIN), JobReply::Job);
         }
         wait(ASK_AGAIN)
     }
 
-    /// Extends the lease of the job that an evaluator is at.
-    pub fn progress(&mut self, progress: &Progress, now: Instant) -> Result<(), Refusal> {
-        require(progress.run == self.rules.run, Refusal::Run)?;
-        let job = self.jobs.get_mut(&progress.job).ok_or(Refusal::Job)?;
-        require(job.evaluator == progress.evaluator, Refusal::Evaluator)?;
-        if job.lease_until.is_some() {
-            job.lease_until = Some(now + self.rules.lease);
-        }
-        Ok(())
+    /// The job as it is handed out.
+    fn message(&self, id: u64, job: &OpenJob) -> Option<Job> {
+        let rules = &self.rules;
+        Some(Job {
+            id,
+            lease: job.lease.clone(),
+            run: rules.run.clone(),
+            incarnation: rules.incarnation,
+            step: job.step,
+            weights: self.evaluations.get(&job.step)?.weights,
+            environment: rules.task.environment.clone(),
+            instance: rules.instance,
+            seeds: job.seeds.clone(),
+            candidates: rules.candidates,
+            lease_milliseconds: rules.lease.as_millis() as u64,
+        })
     }
 
-    /// Checks a report against the job it answers, and says what in it is new. Changes nothing: the caller writes the
-    /// new scores down first, then calls [`record`](Self::record).
+    /// Takes a job back from an evaluator that will not do it; says whether it had it.
+    pub fn hand_back(&mut self, evaluator: &Name, id: u64, lease: &Lease) -> bool {
+        let has = self.jobs.get(&id).is_some_and(|job| job.evaluator == *evaluator && job.lease == *lease);
+        if has && let Some(job) = self.jobs.remove(&id) {
+            self.release(id, &job, 0);
+        }
+        has
+    }
+
+    /// Extends the lease of the job that an evaluator is at, if the job is further than before.
+    pub fn progress(&mut self, progress: &Progress, now: Instant) -> Result<(), Refusal> {
+        require(progress.run == self.rules.run, Refusal::Run)?;
+        require(progress.incarnation == self.rules.incarnation, Refusal::Incarnation)?;
+        let job = self.jobs.get_mut(&progress.job).ok_or(Refusal::Job)?;
+        job.advance(progress, self.rules.lease, now)
+    }
+
+    /// Checks a report against the evaluation that it is about, and says what in it is new. Changes nothing: the caller writes
+    /// the new scores down first, then calls [`record`](Self::record).
     pub fn screen(&self, report: &ScoreReport) -> Result<Screened, Refusal> {
         require(report.run == self.rules.run, Refusal::Run)?;
+        let evaluation = self.evaluations.get(&report.step).ok_or(Refusal::Step)?;
+        require(evaluation.weights == report.weights, Refusal::Weights)?;
+        let mut screened = Screened { new: Vec::new(), duplicates: 0 };
+        let mut seen = BTreeSet::new();
+        for score in &report.episodes {
+            require(seen.insert(score.seed), Refusal::Seed(score.seed))?;
+            let episode = evaluation.episode(score.seed).ok_or(Refusal::Seed(score.seed))?;
+            require(self.is_possible(score), Refusal::Episode(score.seed))?;
+            match episode.state {
+                EpisodeState::Scored(_) => screened.duplicates += 1,
+                _ => screened.new.push(*score),
+            }
+        }
+        Ok(screened)
+    }
+
+    /// Checks a report that says why there are no scores. It ends the run, so only whoever has the job may send it.
+    pub fn screen_complaint(&self, report: &ScoreReport) -> Result<(), Refusal> {
+        self.screen(report)?;
         require(report.incarnation == self.rules.incarnation, Refusal::Incarnation)?;
         let job = self.jobs.get(&report.job).ok_or(Refusal::Job)?;
         require(job.evaluator == report.evaluator, Refusal::Evaluator)?;
         require(job.step == report.step, Refusal::Step)?;
-        let evaluation = self.evaluations.get(&report.step).ok_or(Refusal::Step)?;
-        require(evaluation.weights == report.weights, Refusal::Weights)?;
-        let mut screened = Screened { new: Vec::new(), duplicates: 0 };
-        for (index, score) in report.episodes.iter().enumerate() {
-            let repeated = report.episodes[..index].iter().any(|earlier| earlier.seed == score.seed);
-            require(job.seeds.contains(&score.seed) && !repeated, Refusal::Seed(score.seed))?;
-            require(self.is_possible(score), Refusal::Episode(score.seed))?;
-            match evaluation.episode(score.seed).map(|episode| &episode.state) {
-                Some(EpisodeState::Scored(_)) => screened.duplicates += 1,
-                Some(_) => screened.new.push(*score),
-                None => return Err(Refusal::Seed(score.seed)),
-            }
-        }
-        Ok(screened)
+        let signed = report.cannot_act.as_ref().is_some_and(|reason| reason.is_signed(report.weights, &job.lease));
+        require(signed, Refusal::Proof)
     }
 
     fn is_possible(&self, score: &EpisodeScore) -> bool {
@@ -284,47 +314,50 @@ impl Scoreboard {
 
     /// Counts the new scores of a report that [`screen`](Self::screen) let pass.
     pub fn record(&mut self, report: &ScoreReport, new: &[EpisodeScore]) -> Recorded {
-        let (Some(evaluation), Some(job)) = (self.evaluations.get_mut(&report.step), self.jobs.get_mut(&report.job))
-        else {
-            return Recorded::default();
-        };
+        let Some(evaluation) = self.evaluations.get_mut(&report.step) else { return Recorded::default() };
         for score in new {
             if let Some(episode) = evaluation.episodes.iter_mut().find(|episode| episode.seed == score.seed) {
                 episode.state = EpisodeState::Scored(*score);
             }
         }
         let done = |seed| evaluation.episode(seed).is_some_and(|e| matches!(e.state, EpisodeState::Scored(_)));
-        let job_completed = job.lease_until.is_some() && job.seeds.iter().copied().all(done);
-        if job_completed {
-            job.lease_until = None;
-        }
+        let open = self.jobs.len();
+        self.jobs.retain(|_, job| job.step != report.step || !job.seeds.iter().copied().all(done));
         let evaluation_completed = if new.is_empty() { None } else { evaluation.scores() };
-        Recorded { job_completed, evaluation_completed }
+        Recorded { jobs_completed: open - self.jobs.len(), evaluation_completed }
     }
 
-    /// Takes back the jobs whose lease has run out; says how many.
-    pub fn expire(&mut self, now: Instant) -> usize {
-        self.give_back(|job| job.lease_until.is_some_and(|until| until <= now))
+    /// Takes back the jobs whose lease has run out.
+    pub fn expire(&mut self, now: Instant) -> Lost {
+        self.take_back(|job| job.is_lost(now))
     }
 
-    /// Takes back the jobs of an evaluator that is gone; says how many.
-    pub fn evaluator_gone(&mut self, evaluator: &Name) -> usize {
-        self.give_back(|job| job.lease_until.is_some() && job.evaluator == *evaluator)
+    /// Takes back the job of an evaluator that is gone.
+    pub fn evaluator_gone(&mut self, evaluator: &Name) -> Lost {
+        self.take_back(|job| job.evaluator == *evaluator)
     }
 
-    fn give_back(&mut self, lost: impl Fn(&JobRecord) -> bool) -> usize {
-        let mut count = 0;
-        for (&id, job) in self.jobs.iter_mut().filter(|(_, job)| lost(job)) {
-            count += 1;
-            job.lease_until = None;
-            let Some(evaluation) = self.evaluations.get_mut(&job.step) else { continue };
-            for episode in &mut evaluation.episodes {
-                if matches!(episode.state, EpisodeState::HandedOut { job } if job == id) {
-                    episode.state = EpisodeState::Waiting;
+    fn take_back(&mut self, lost: impl Fn(&OpenJob) -> bool) -> Lost {
+        let jobs: Vec<(u64, OpenJob)> = self.jobs.extract_if(.., |_, job| lost(job)).collect();
+        let given_up = jobs.iter().flat_map(|(id, job)| self.release(*id, job, 1)).collect();
+        Lost { jobs: jobs.len(), given_up }
+    }
+
+    /// Lets the episodes of a job that has ended wait for the next; gives those that were lost too often.
+    fn release(&mut self, id: u64, job: &OpenJob, lost: u32) -> Vec<(u64, u64)> {
+        let mut given_up = Vec::new();
+        let Some(evaluation) = self.evaluations.get_mut(&job.step) else { return given_up };
+        for episode in &mut evaluation.episodes {
+            if matches!(episode.state, EpisodeState::HandedOut { job } if job == id) {
+                episode.lost += lost;
+                episode.state = EpisodeState::Waiting;
+                if episode.lost >= MOST_ATTEMPTS {
+                    episode.state = EpisodeState::GivenUp;
+                    given_up.push((job.step, episode.seed));
                 }
             }
         }
-        count
+        given_up
     }
 }
 
@@ -341,8 +374,4 @@ impl Evaluation {
         };
         self.episodes.iter().map(score).collect()
     }
-}
-
-fn require(holds: bool, refusal: Refusal) -> Result<(), Refusal> {
-    if holds { Ok(()) } else { Err(refusal) }
 }

@@ -12,10 +12,10 @@ use quad_learner::notice::Notice;
 use quad_learner::publisher::{self, Identity, Kept, SnapshotPublisher};
 use quad_learner::run_dir::RunDir;
 use quad_learner::scoreboard::{Rules, Scoreboard};
-use quad_learner::wire::Wire;
+use quad_learner::wire::{Life, Wire};
 use quad_protocol::{
-    EpisodeScore, Hash, Job, JobReply, JobRequest, Message, Name, Origin, Progress, RecordedScores, ScoreReply,
-    ScoreReport, Snapshot, decode, encode, keys,
+    CannotAct, EpisodeScore, Hash, Job, JobReply, JobRequest, Lease, Message, Name, Origin, Progress, RecordedScores,
+    ScoreReply, ScoreReport, Snapshot, WeightsRequest, decode, encode, keys,
 };
 use quad_service::{Endpoints, open_session};
 use safetensors::Dtype;
@@ -45,7 +45,7 @@ fn name(text: &str) -> Name {
 }
 
 fn tensors(step: u64) -> Vec<u8> {
-    let bytes = vec![step as u8; 200_000];
+    let bytes = vec![step as u8; 1_000_000];
     let tensor = TensorView::new(Dtype::U8, vec![bytes.len()], &bytes).unwrap();
     let shape = "{\"kind\":\"gaussian\",\"observation_dim\":11,\"action_dim\":3,\"hidden\":8}";
     let metadata = HashMap::from([("policy".to_owned(), shape.to_owned())]);
@@ -90,7 +90,8 @@ impl Bench {
         let port = TcpListener::bind("127.0.0.1:0").unwrap().local_addr().unwrap().port();
         let endpoint = format!("tcp/127.0.0.1:{port}");
         let session = open_session(&Endpoints { listen: vec![endpoint.clone()], connect: Vec::new() }).await.unwrap();
-        let wire = Wire::declare(session, &run, &hub, &publisher, &metrics, || Ok(())).await.unwrap();
+        let life = Life { run: run.clone(), incarnation: INCARNATION };
+        let wire = Wire::declare(session, life, &hub, &publisher, &metrics, || Ok(())).await.unwrap();
         Self { run, run_dir, endpoint, metrics, notices, publisher, hub, _wire: wire, _folder: folder }
     }
 
@@ -163,11 +164,23 @@ async fn ask<A: Message>(session: &Session, key: String, payload: Option<Vec<u8>
     })
 }
 
+fn claim_message(evaluator: &str, attempt: u64) -> JobRequest {
+    JobRequest::Claim {
+        evaluator: name(evaluator),
+        attempt,
+        environments: vec!["hopper".into()],
+        precision: name("f32"),
+    }
+}
+
+async fn ask_for_job(session: &Session, run: &Name, request: &JobRequest) -> JobReply {
+    ask(session, keys::jobs(run), Some(encode(request).unwrap())).await.unwrap().unwrap()
+}
+
 async fn claim(session: &Session, run: &Name, evaluator: &str) -> Option<Job> {
-    let request = JobRequest { evaluator: name(evaluator), environments: vec!["hopper".into()] };
-    match ask(session, keys::jobs(run), Some(encode(&request).unwrap())).await?.unwrap() {
+    match ask_for_job(session, run, &claim_message(evaluator, 1)).await {
         JobReply::Job(job) => Some(job),
-        JobReply::Wait { .. } => None,
+        _ => None,
     }
 }
 
@@ -201,6 +214,23 @@ fn report(job: &Job, evaluator: &str) -> ScoreReport {
     }
 }
 
+fn progress(job: &Job, evaluator: &str, steps_done: u64) -> Progress {
+    Progress {
+        evaluator: name(evaluator),
+        run: job.run.clone(),
+        incarnation: job.incarnation,
+        job: job.id,
+        step: job.step,
+        episodes_done: 0,
+        episodes_total: 2,
+        steps_done,
+        environment_steps: 40,
+        episodes: 1,
+        proof: Hash::of(b"none"),
+    }
+    .signed(&job.lease)
+}
+
 async fn deliver(session: &Session, report: &ScoreReport) -> ScoreReply {
     ask(session, keys::scores(&report.run), Some(encode(report).unwrap())).await.unwrap().unwrap()
 }
@@ -211,10 +241,13 @@ async fn a_policy_that_cannot_act_ends_the_run_with_the_reason() {
     let client = bench.client().await;
     bench.snapshot(1000).await;
     let job = claim_eventually(&client, &bench.run, "a").await;
-    let reason = Some("a value of a candidate is not a number (NaN)".to_owned());
-    let broken = ScoreReport { episodes: Vec::new(), cannot_act: reason, ..report(&job, "a") };
-    let stranger = ScoreReport { evaluator: name("b"), ..broken.clone() };
-    assert!(matches!(deliver(&client, &stranger).await, ScoreReply::Refused { .. }), "it has no such job");
+    let reason = "a value of a candidate is not a number (NaN)".to_owned();
+    let complaint = CannotAct::signed(reason, job.weights, &job.lease);
+    let forged = CannotAct { proof: Hash::of(b"guessed"), ..complaint.clone() };
+    let broken = ScoreReport { episodes: Vec::new(), cannot_act: Some(complaint), ..report(&job, "a") };
+    let stranger = ScoreReport { cannot_act: Some(forged), ..broken.clone() };
+    assert!(matches!(deliver(&client, &stranger).await, ScoreReply::Refused { .. }), "it has not the job's lease");
+    assert_eq!(bench.rejected("wrong_proof"), 1);
     deliver(&client, &broken).await;
     bench.until(|notice| matches!(notice, Notice::Failed(error) if error.to_string().contains("step 1000 cannot act: a value")))
         .await;
@@ -233,9 +266,9 @@ async fn a_job_goes_out_and_its_scores_are_on_disk_before_the_thanks() {
 
     let recorded = deliver(&client, &report(&job, "a")).await;
     assert_eq!(bench.lines(), 2);
-    assert!(matches!(recorded, ScoreReply::Recorded { new: 2, duplicates: 0 }));
+    assert!(matches!(recorded, ScoreReply::Recorded { incarnation: INCARNATION, new: 2, duplicates: 0 }));
     let again = deliver(&client, &report(&job, "a")).await;
-    assert!(matches!(again, ScoreReply::Recorded { new: 0, duplicates: 2 }));
+    assert!(matches!(again, ScoreReply::Recorded { new: 0, duplicates: 2, .. }));
     assert_eq!((bench.lines(), bench.metrics.evaluation.scores_duplicate.get()), (2, 2));
 
     let sample = tokio::time::timeout(PATIENCE, watched.recv_async()).await.unwrap().unwrap();
@@ -282,8 +315,7 @@ async fn garbage_is_counted_by_reason_and_answered_with_an_error() {
     let mut bench = Bench::start().await;
     let client = bench.client().await;
     bench.snapshot(10).await;
-    let request = JobRequest { evaluator: name("a"), environments: vec!["hopper".into()] };
-    let good = encode(&request).unwrap();
+    let good = encode(&claim_message("a", 1)).unwrap();
     let mut newer = good.clone();
     newer[4] ^= 0xff;
     for key in [keys::jobs(&bench.run), keys::scores(&bench.run)] {
@@ -301,7 +333,7 @@ async fn garbage_is_counted_by_reason_and_answered_with_an_error() {
 
     let job = claim_eventually(&client, &bench.run, "a").await;
     let wrong = ScoreReport { weights: Hash::of(b"others"), ..report(&job, "a") };
-    let ScoreReply::Refused { reason } = deliver(&client, &wrong).await else { panic!("accepted") };
+    let ScoreReply::Refused { reason, .. } = deliver(&client, &wrong).await else { panic!("accepted") };
     assert!(reason.contains("other weights"), "{reason}");
     assert_eq!((bench.rejected("unknown_weights"), bench.lines()), (1, 0));
     assert!(matches!(deliver(&client, &report(&job, "a")).await, ScoreReply::Recorded { new: 2, .. }));
@@ -327,19 +359,12 @@ async fn jobs_of_evaluators_that_die_or_fall_silent_go_to_others() {
     assert_eq!(silent.seeds, lost.seeds);
     let working = claim_eventually(&client, &bench.run, "working").await;
     assert!(claim(&client, &bench.run, "a").await.is_none());
-    let progress = Progress {
-        evaluator: name("working"),
-        run: bench.run.clone(),
-        job: working.id,
-        step: 10,
-        episodes_done: 1,
-        episodes_total: 2,
-        environment_steps: 40,
-        episodes: 1,
-    };
     let start = Instant::now();
+    let mut steps = 0;
     let again = loop {
-        client.put(keys::progress(&bench.run, &name("working")), encode(&progress).unwrap()).await.unwrap();
+        steps += 1;
+        let message = encode(&progress(&working, "working", steps)).unwrap();
+        client.put(keys::progress(&bench.run, &name("working")), message).await.unwrap();
         if let Some(job) = claim(&client, &bench.run, "a").await {
             break job;
         }
@@ -356,4 +381,95 @@ async fn jobs_of_evaluators_that_die_or_fall_silent_go_to_others() {
     assert_eq!((bench.lines(), bench.metrics.evaluation.scores_duplicate.get()), (4, 2));
     bench.hub.send(hub::Event::TrainingCompleted);
     bench.until(|notice| matches!(notice, Notice::Settled)).await;
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn a_claim_is_answered_twice_with_one_job_which_can_be_handed_back() {
+    let mut bench = Bench::start().await;
+    let client = bench.client().await;
+    bench.snapshot(10).await;
+    let job = claim_eventually(&client, &bench.run, "a").await;
+    assert_eq!(claim(&client, &bench.run, "a").await.as_ref(), Some(&job));
+    assert_eq!(bench.metrics.evaluation.jobs_handed_out.get(), 1);
+    let other = ask_for_job(&client, &bench.run, &claim_message("a", 2)).await;
+    assert!(matches!(other, JobReply::Wait { incarnation: INCARNATION, .. }), "{other:?}");
+
+    let hand_back = |lease| JobRequest::HandBack { evaluator: name("a"), job: job.id, lease };
+    for (lease, expected) in [(Lease::random(), false), (job.lease.clone(), true), (job.lease.clone(), false)] {
+        let reply = ask_for_job(&client, &bench.run, &hand_back(lease)).await;
+        assert!(matches!(reply, JobReply::HandedBack { accepted, .. } if accepted == expected), "{reply:?}");
+    }
+    assert_eq!(bench.metrics.evaluation.jobs_handed_back.get(), 1);
+    assert_eq!(claim_eventually(&client, &bench.run, "b").await.seeds, job.seeds);
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn progress_that_was_heard_or_guessed_does_not_hold_a_job() {
+    let mut bench = Bench::start().await;
+    let client = bench.client().await;
+    bench.snapshot(10).await;
+    let job = claim_eventually(&client, &bench.run, "a").await;
+    let heard = progress(&job, "a", 10);
+    let guessed = Progress { steps_done: 1 << 40, ..heard.clone() };
+    let start = Instant::now();
+    while bench.metrics.evaluation.jobs_expired.get() == 0 {
+        for message in [&heard, &guessed] {
+            client.put(keys::progress(&bench.run, &name("a")), encode(message).unwrap()).await.unwrap();
+        }
+        assert!(start.elapsed() < PATIENCE, "the lease never ends");
+        tokio::time::sleep(LEASE / 20).await;
+    }
+    assert!(bench.rejected("wrong_proof") > 5 && bench.rejected("not_advanced") > 5);
+}
+
+/// Asks for weights a hundred times, and then reads nothing: the process stops itself.
+async fn reads_nothing(endpoint: String) {
+    let endpoints = Endpoints { listen: Vec::new(), connect: vec![endpoint] };
+    let session = open_session(&endpoints).await.unwrap();
+    for _ in 0..100 {
+        let key = keys::weights_at(&name("bench"), 10);
+        session.get(key).timeout(PATIENCE).callback(drop).await.unwrap();
+    }
+    let stop = format!("kill -STOP {}", std::process::id());
+    std::process::Command::new("sh").args(["-c", &stop]).status().unwrap();
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn a_peer_that_reads_nothing_delays_nobody() {
+    const STRANGER: &str = "QUAD_TEST_STRANGER";
+    if let Ok(endpoint) = std::env::var(STRANGER) {
+        return reads_nothing(endpoint).await;
+    }
+    let mut bench = Bench::start().await;
+    let client = bench.client().await;
+    bench.snapshot(10).await;
+    let mut command = std::process::Command::new(std::env::current_exe().unwrap());
+    command.args(["--exact", "a_peer_that_reads_nothing_delays_nobody"]).env(STRANGER, &bench.endpoint);
+    let mut stranger = command.stdout(std::process::Stdio::null()).spawn().unwrap();
+    let state = || std::fs::read_to_string(format!("/proc/{}/stat", stranger.id())).unwrap();
+    let start = Instant::now();
+    while !state().contains(") T ") {
+        assert!(start.elapsed() < PATIENCE, "{}", state());
+        tokio::time::sleep(Duration::from_millis(5)).await;
+    }
+
+    let request = encode(&WeightsRequest { evaluator: name("a") }).unwrap();
+    // For as long as Zenoh waits before it closes the connection.
+    let (start, mut slowest, mut step) = (Instant::now(), Duration::ZERO, 10);
+    while start.elapsed() < Duration::from_secs(6) {
+        let asked = Instant::now();
+        claim(&client, &bench.run, "a").await.expect("always the same job");
+        step += 10;
+        bench.snapshot(step).await;
+        let snapshot: Snapshot =
+            ask(&client, keys::weights_at(&bench.run, step), Some(request.clone())).await.unwrap().unwrap();
+        assert_eq!(snapshot.step, step);
+        slowest = slowest.max(asked.elapsed());
+        tokio::time::sleep(Duration::from_millis(100)).await;
+    }
+    stranger.kill().unwrap();
+    stranger.wait().unwrap();
+    // A snapshot is published with some patience for each subscriber, and there are other tests beside this one.
+    assert!(slowest < Duration::from_secs(2), "{slowest:?}");
+    assert!(bench.rejected("busy") > 0, "more was asked than is kept waiting");
 }

@@ -3,8 +3,8 @@
 
 use std::time::{Duration, Instant};
 
-use quad_learner::scoreboard::{Recorded, Refusal, Rules, Scoreboard, Screened};
-use quad_protocol::{EpisodeScore, Hash, Job, JobReply, JobRequest, Name, Progress, ScoreReport};
+use quad_learner::scoreboard::{Claim, Lost, Recorded, Refusal, Rules, Scoreboard, Screened};
+use quad_protocol::{CannotAct, EpisodeScore, Hash, Job, JobReply, Lease, Name, Progress, ScoreReport};
 
 const LEASE: Duration = Duration::from_secs(10);
 const INCARNATION: u64 = 77;
@@ -46,6 +46,24 @@ fn full_report(job: &Job, evaluator: &str) -> ScoreReport {
     report(job, evaluator, job.seeds.iter().map(|&seed| score(seed, 500.0)).collect())
 }
 
+/// Of so many environment steps, with its proof.
+fn progress(job: &Job, evaluator: &str, steps_done: u64) -> Progress {
+    Progress {
+        evaluator: name(evaluator),
+        run: job.run.clone(),
+        incarnation: job.incarnation,
+        job: job.id,
+        step: job.step,
+        episodes_done: 0,
+        episodes_total: 5,
+        steps_done,
+        environment_steps: 10,
+        episodes: 1,
+        proof: Hash::of(b"none"),
+    }
+    .signed(&job.lease)
+}
+
 impl Bench {
     /// Evaluations of steps 1000 and 2000, seven episodes each: seeds 1..=7 and 11..=17.
     fn new() -> Self {
@@ -68,32 +86,28 @@ impl Bench {
         self.start + Duration::from_secs(seconds)
     }
 
-    fn claim(&mut self, evaluator: &str, seconds: u64) -> JobReply {
-        let request = JobRequest { evaluator: name(evaluator), environments: vec!["ant".into(), "hopper".into()] };
+    fn claim(&mut self, evaluator: &str, attempt: u64, seconds: u64) -> JobReply {
         let now = self.at(seconds);
-        self.board.claim(&request, now)
+        let environments = ["ant".to_owned(), "hopper".to_owned()];
+        self.board.claim(Claim { evaluator: &name(evaluator), attempt, environments: &environments }, now)
     }
 
     fn job(&mut self, evaluator: &str, seconds: u64) -> Job {
-        match self.claim(evaluator, seconds) {
+        // Another attempt at another time.
+        match self.claim(evaluator, seconds, seconds) {
             JobReply::Job(job) => job,
-            JobReply::Wait { .. } => panic!("no job at {seconds} s"),
+            other => panic!("{other:?} at {seconds} s"),
         }
     }
 
-    fn progress(&mut self, job: &Job, evaluator: &str, seconds: u64) -> Result<(), Refusal> {
-        let progress = Progress {
-            evaluator: name(evaluator),
-            run: job.run.clone(),
-            job: job.id,
-            step: job.step,
-            episodes_done: 1,
-            episodes_total: 5,
-            environment_steps: 10,
-            episodes: 1,
-        };
+    fn progress(&mut self, progress: &Progress, seconds: u64) -> Result<(), Refusal> {
         let now = self.at(seconds);
-        self.board.progress(&progress, now)
+        self.board.progress(progress, now)
+    }
+
+    fn expire(&mut self, seconds: u64) -> usize {
+        let now = self.at(seconds);
+        self.board.expire(now).jobs
     }
 
     /// As the hub does: screen, then record.
@@ -107,25 +121,37 @@ impl Bench {
 #[test]
 fn jobs_go_out_oldest_step_first_and_no_episode_twice() {
     let mut bench = Bench::new();
-    let jobs: Vec<_> = (0..4).map(|_| bench.job("a", 0)).collect();
+    let jobs = ["a", "b", "c", "d"].map(|evaluator| bench.job(evaluator, 0));
     let handed_out: Vec<_> = jobs.iter().map(|job| (job.step, job.seeds.clone())).collect();
     let expected =
         [(1000, vec![1, 2, 3, 4, 5]), (1000, vec![6, 7]), (2000, vec![11, 12, 13, 14, 15]), (2000, vec![16, 17])];
     assert_eq!(handed_out, expected);
     assert_eq!((jobs[0].weights, jobs[2].weights), (hash(1000), hash(2000)));
     assert_eq!((jobs[0].incarnation, jobs[0].candidates, jobs[0].lease_milliseconds), (INCARNATION, 10, 10_000));
-    assert!(matches!(bench.claim("b", 0), JobReply::Wait { milliseconds: 1.. }));
-    assert_eq!(bench.board.pending(), 14);
+    assert!(jobs[1..].iter().all(|job| job.lease != jobs[0].lease), "each lease is another");
+    assert!(matches!(bench.claim("e", 0, 0), JobReply::Wait { milliseconds: 1.., incarnation: INCARNATION }));
+    assert_eq!((bench.board.pending(), bench.board.handed_out()), (14, 4));
 }
 
 #[test]
 fn an_evaluator_without_the_environment_gets_nothing() {
     let mut bench = Bench::new();
     for environments in [vec![], vec!["ant".to_owned()]] {
-        let request = JobRequest { evaluator: name("a"), environments };
         let now = bench.at(0);
-        assert!(matches!(bench.board.claim(&request, now), JobReply::Wait { .. }));
+        let claim = Claim { evaluator: &name("a"), attempt: 1, environments: &environments };
+        assert!(matches!(bench.board.claim(claim, now), JobReply::Wait { .. }));
     }
+}
+
+#[test]
+fn a_claim_that_is_repeated_gets_the_same_job_and_another_one_waits() {
+    let mut bench = Bench::new();
+    let first = bench.job("a", 0);
+    assert_eq!(bench.claim("a", 0, 3), JobReply::Job(first.clone()), "the answer was lost");
+    assert!(matches!(bench.claim("a", 1, 3), JobReply::Wait { .. }), "one job at a time");
+    assert_eq!((bench.board.handed_out(), bench.job("b", 3).seeds), (1, vec![6, 7]));
+    assert_eq!(bench.expire(10), 1, "to ask again does not extend the lease");
+    assert_eq!(bench.job("a", 10).seeds, first.seeds);
 }
 
 #[test]
@@ -134,12 +160,13 @@ fn scores_complete_a_job_and_an_evaluation_once() {
     let (first, second) = (bench.job("a", 0), bench.job("b", 0));
     let (screened, recorded) = bench.deliver(&full_report(&first, "a")).unwrap();
     assert_eq!((screened.new.len(), screened.duplicates), (5, 0));
-    assert_eq!(recorded, Recorded { job_completed: true, evaluation_completed: None });
+    assert_eq!(recorded, Recorded { jobs_completed: 1, evaluation_completed: None });
     assert_eq!(bench.board.pending(), 9);
 
     let (_, recorded) = bench.deliver(&full_report(&second, "b")).unwrap();
     let seeds: Vec<_> = recorded.evaluation_completed.unwrap().iter().map(|score| score.seed).collect();
     assert_eq!(seeds, Vec::from_iter(1..=7), "in the order of the evaluation's seeds");
+    assert_eq!(bench.job("a", 1).step, 2000, "an evaluator that has delivered gets the next");
 }
 
 #[test]
@@ -156,11 +183,11 @@ fn a_report_delivered_again_is_accepted_and_counted_once() {
 #[test]
 fn the_first_score_of_an_episode_stays() {
     let mut bench = Bench::new();
-    let (job, rest) = (bench.job("a", 0), bench.job("a", 0));
+    let (job, rest) = (bench.job("a", 0), bench.job("b", 0));
     bench.deliver(&full_report(&job, "a")).unwrap();
     let changed = report(&job, "a", vec![score(1, 3000.0)]);
     assert_eq!(bench.deliver(&changed).unwrap().0.duplicates, 1);
-    let (_, recorded) = bench.deliver(&full_report(&rest, "a")).unwrap();
+    let (_, recorded) = bench.deliver(&full_report(&rest, "b")).unwrap();
     let scores = recorded.evaluation_completed.unwrap();
     assert!(scores.iter().all(|score| score.episode_return == 500.0));
 }
@@ -170,10 +197,25 @@ fn a_job_may_be_delivered_in_parts() {
     let mut bench = Bench::new();
     let job = bench.job("a", 0);
     let (_, recorded) = bench.deliver(&report(&job, "a", vec![score(1, 0.0), score(3, 0.0)])).unwrap();
-    assert!(!recorded.job_completed);
+    assert_eq!(recorded.jobs_completed, 0);
     assert_eq!(bench.board.pending(), 12);
     let (screened, recorded) = bench.deliver(&full_report(&job, "a")).unwrap();
-    assert_eq!((screened.new.len(), screened.duplicates, recorded.job_completed), (3, 2, true));
+    assert_eq!((screened.new.len(), screened.duplicates, recorded.jobs_completed), (3, 2, 1));
+}
+
+/// An older life of the learner handed the job out, or to somebody else, or nobody knows it any more.
+#[test]
+fn any_lifes_report_is_welcome_if_step_weights_and_seeds_fit() {
+    let mut bench = Bench::new();
+    let job = bench.job("a", 0);
+    let earlier = ScoreReport { incarnation: INCARNATION - 1, job: 99, ..report(&job, "b", vec![score(6, 0.0)]) };
+    assert_eq!(bench.deliver(&earlier).unwrap().0.new.len(), 1, "an episode that waits");
+    let other = ScoreReport { job: 77, ..full_report(&job, "c") };
+    let (screened, recorded) = bench.deliver(&other).unwrap();
+    assert_eq!((screened.new.len(), recorded.jobs_completed), (5, 1), "episodes that a has");
+    let (screened, _) = bench.deliver(&full_report(&job, "a")).unwrap();
+    assert_eq!((screened.new.len(), screened.duplicates), (0, 5));
+    assert_eq!(bench.job("a", 1).seeds, [7]);
 }
 
 #[test]
@@ -181,11 +223,7 @@ fn a_lease_that_runs_out_gives_the_unscored_episodes_to_the_next() {
     let mut bench = Bench::new();
     let lost = bench.job("a", 0);
     bench.deliver(&report(&lost, "a", vec![score(2, 0.0)])).unwrap();
-    let at_9 = bench.at(9);
-    assert_eq!(bench.board.expire(at_9), 0);
-    let at_10 = bench.at(10);
-    assert_eq!(bench.board.expire(at_10), 1);
-    assert_eq!(bench.board.expire(at_10), 0, "only once");
+    assert_eq!([bench.expire(9), bench.expire(10), bench.expire(10)], [0, 1, 0], "in time, and only once");
     let next = bench.job("b", 10);
     assert_eq!((next.step, next.seeds), (1000, vec![1, 3, 4, 5, 6]));
     assert_ne!(next.id, lost.id);
@@ -196,81 +234,159 @@ fn progress_extends_the_lease_of_its_job_only() {
     let mut bench = Bench::new();
     let (alive, lost) = (bench.job("a", 0), bench.job("b", 0));
     for seconds in [5, 14, 23] {
-        bench.progress(&alive, "a", seconds).unwrap();
+        bench.progress(&progress(&alive, "a", seconds), seconds).unwrap();
     }
-    let now = bench.at(24);
-    assert_eq!(bench.board.expire(now), 1);
+    assert_eq!(bench.expire(24), 1);
     let next = bench.job("c", 24);
     assert_eq!(next.seeds, lost.seeds);
-    let end = bench.at(33);
-    assert_eq!(bench.board.expire(end), 1, "10 s after the last progress");
+    assert_eq!(bench.expire(33), 1, "10 s after the last progress");
+}
+
+#[test]
+fn progress_that_does_not_advance_extends_nothing() {
+    let mut bench = Bench::new();
+    let job = bench.job("a", 0);
+    let first = progress(&job, "a", 100);
+    bench.progress(&first, 5).unwrap();
+    assert_eq!(bench.progress(&first, 9), Err(Refusal::NotAdvanced), "played again");
+    assert_eq!(bench.progress(&progress(&job, "a", 99), 9), Err(Refusal::NotAdvanced));
+    assert_eq!(bench.progress(&progress(&job, "a", 0), 9), Err(Refusal::NotAdvanced), "it has begun");
+    let ended = Progress { episodes_done: 1, ..progress(&job, "a", 100) }.signed(&job.lease);
+    bench.progress(&ended, 14).unwrap();
+    assert_eq!((bench.expire(23), bench.expire(24)), (0, 1));
+}
+
+/// While it fetches the weights an evaluator has nothing to show. It has a minute for that, then it must begin.
+#[test]
+fn an_evaluator_may_prepare_for_a_while() {
+    let mut bench = Bench::new();
+    let (job, other) = (bench.job("a", 0), bench.job("b", 0));
+    for seconds in (5..60).step_by(5) {
+        bench.progress(&progress(&job, "a", 0), seconds).unwrap();
+        bench.progress(&progress(&other, "b", 0), seconds).unwrap();
+    }
+    bench.progress(&progress(&other, "b", 1), 59).unwrap();
+    bench.progress(&progress(&job, "a", 0), 59).unwrap();
+    assert_eq!((bench.expire(59), bench.expire(60)), (0, 1), "a's, which has not begun");
+    assert_eq!((bench.expire(68), bench.expire(69)), (0, 1));
+}
+
+#[test]
+fn a_job_has_a_longest_life() {
+    let mut bench = Bench::new();
+    let job = bench.job("a", 0);
+    let longest = Job::LONGEST.as_secs();
+    for seconds in (5..longest).step_by(5) {
+        bench.progress(&progress(&job, "a", seconds), seconds).unwrap();
+    }
+    assert_eq!((bench.expire(longest - 1), bench.expire(longest)), (0, 1));
 }
 
 #[test]
 fn progress_of_others_is_refused_and_extends_nothing() {
     let mut bench = Bench::new();
-    let job = bench.job("a", 0);
-    assert_eq!(bench.progress(&job, "b", 9), Err(Refusal::Evaluator));
-    assert_eq!(bench.progress(&Job { id: 99, ..job.clone() }, "a", 9), Err(Refusal::Job));
-    assert_eq!(bench.progress(&Job { run: name("other"), ..job }, "a", 9), Err(Refusal::Run));
-    let now = bench.at(10);
-    assert_eq!(bench.board.expire(now), 1);
+    let (job, other) = (bench.job("a", 0), bench.job("b", 0));
+    let good = progress(&job, "a", 10);
+    let forged = Progress { proof: Hash::of(b"guessed"), ..good.clone() };
+    let changed = Progress { steps_done: 1 << 40, ..good.clone() };
+    let by_another_lease = progress(&Job { lease: other.lease.clone(), ..job.clone() }, "a", 10);
+    let cases = [
+        (forged, Refusal::Proof),
+        (changed, Refusal::Proof),
+        (by_another_lease, Refusal::Proof),
+        (progress(&job, "b", 10), Refusal::Evaluator),
+        (progress(&Job { id: 99, ..job.clone() }, "a", 10), Refusal::Job),
+        (progress(&Job { run: name("other"), ..job.clone() }, "a", 10), Refusal::Run),
+        (progress(&Job { incarnation: 1, ..job.clone() }, "a", 10), Refusal::Incarnation),
+    ];
+    for (message, refusal) in cases {
+        assert_eq!(bench.progress(&message, 9), Err(refusal));
+    }
+    assert_eq!(bench.expire(10), 2);
 }
 
 #[test]
 fn progress_does_not_bring_back_a_job_that_was_taken_away() {
     let mut bench = Bench::new();
     let job = bench.job("a", 0);
-    let now = bench.at(10);
-    bench.board.expire(now);
-    bench.progress(&job, "a", 11).unwrap();
+    bench.expire(10);
+    assert_eq!(bench.progress(&progress(&job, "a", 1), 11), Err(Refusal::Job));
     assert_eq!(bench.job("b", 11).seeds, job.seeds);
-    let end = bench.at(21);
-    assert_eq!(bench.board.expire(end), 1, "b's alone");
+    assert_eq!(bench.expire(21), 1, "b's alone");
 }
 
 #[test]
-fn an_evaluator_that_goes_loses_all_its_jobs_and_nobody_elses() {
+fn an_evaluator_that_goes_loses_its_job_and_nobody_elses() {
     let mut bench = Bench::new();
-    let (first, other, third) = (bench.job("a", 0), bench.job("b", 0), bench.job("a", 0));
-    assert_eq!(bench.board.evaluator_gone(&name("a")), 2);
-    assert_eq!(bench.board.evaluator_gone(&name("a")), 0);
-    let again = [bench.job("c", 0), bench.job("c", 0)];
-    assert_eq!([&again[0].seeds, &again[1].seeds], [&first.seeds, &third.seeds]);
-    assert!(bench.deliver(&full_report(&other, "b")).unwrap().1.job_completed);
+    let (first, other) = (bench.job("a", 0), bench.job("b", 0));
+    assert_eq!(bench.board.evaluator_gone(&name("a")), Lost { jobs: 1, given_up: vec![] });
+    assert_eq!(bench.board.evaluator_gone(&name("a")), Lost::default());
+    assert_eq!(bench.job("c", 0).seeds, first.seeds);
+    assert_eq!(bench.deliver(&full_report(&other, "b")).unwrap().1.jobs_completed, 1);
+}
+
+#[test]
+fn only_whoever_has_the_lease_hands_a_job_back() {
+    let mut bench = Bench::new();
+    let job = bench.job("a", 0);
+    assert!(!bench.board.hand_back(&name("a"), job.id, &Lease::random()), "guessed");
+    assert!(!bench.board.hand_back(&name("b"), job.id, &job.lease));
+    assert!(!bench.board.hand_back(&name("a"), job.id + 1, &job.lease));
+    assert_eq!(bench.job("b", 0).seeds, [6, 7]);
+    assert!(bench.board.hand_back(&name("a"), job.id, &job.lease));
+    assert!(!bench.board.hand_back(&name("a"), job.id, &job.lease), "only once");
+    assert_eq!(bench.job("c", 0).seeds, job.seeds);
+}
+
+#[test]
+fn episodes_that_take_every_evaluator_with_them_are_given_up() {
+    let mut bench = Bench::new();
+    for _ in 0..100 {
+        let job = bench.job("a", 0);
+        assert!(bench.board.hand_back(&name("a"), job.id, &job.lease), "this does not count");
+    }
+    let mut given_up = Vec::new();
+    for attempt in 1..=20 {
+        assert_eq!((bench.job("a", 0).seeds, given_up.len()), (Vec::from_iter(1..=5), 0), "attempt {attempt}");
+        given_up = bench.board.evaluator_gone(&name("a")).given_up;
+    }
+    let expected = Vec::from_iter((1..=5).map(|seed| (1000, seed)));
+    assert_eq!((&given_up, &bench.board.missing()), (&expected, &expected));
+    assert_eq!(bench.board.pending(), 9, "the run does not wait for them");
+    let next = bench.job("a", 0);
+    assert_eq!(next.seeds, [6, 7]);
+    let late = report(&next, "b", vec![score(1, 0.0)]);
+    assert_eq!(bench.deliver(&late).unwrap().0.new.len(), 1, "but is glad of them");
+    assert_eq!(bench.board.missing(), expected[1..]);
 }
 
 #[test]
 fn whoever_delivers_first_counts_when_a_lost_evaluator_comes_back() {
     let mut bench = Bench::new();
     let lost = bench.job("a", 0);
-    let now = bench.at(10);
-    bench.board.expire(now);
+    bench.expire(10);
     let again = bench.job("b", 10);
     let (screened, recorded) = bench.deliver(&full_report(&lost, "a")).unwrap();
-    assert_eq!((screened.new.len(), recorded.job_completed), (5, false), "late, but nobody had been faster");
+    assert_eq!((screened.new.len(), recorded.jobs_completed), (5, 1), "late, but nobody had been faster; b's is over");
     assert!(matches!(bench.job("c", 11).seeds[..], [6, 7]), "nothing of it is handed out again");
     let (screened, recorded) = bench.deliver(&full_report(&again, "b")).unwrap();
-    assert_eq!((screened.duplicates, recorded.job_completed), (5, true));
+    assert_eq!((screened.duplicates, recorded.jobs_completed), (5, 0));
     assert_eq!(bench.board.pending(), 9);
 }
 
 #[test]
-fn a_report_that_is_not_of_this_job_is_refused() {
+fn a_report_that_fits_no_evaluation_is_refused() {
     let mut bench = Bench::new();
-    let (job, other) = (bench.job("a", 0), bench.job("b", 0));
+    let job = bench.job("a", 0);
     let good = full_report(&job, "a");
     let with_episode = |episode: EpisodeScore| ScoreReport { episodes: vec![episode], ..good.clone() };
     let twice = ScoreReport { episodes: vec![score(1, 0.0), score(1, 0.0)], ..good.clone() };
     let cases = [
         (ScoreReport { run: name("other"), ..good.clone() }, Refusal::Run),
-        (ScoreReport { incarnation: INCARNATION - 1, ..good.clone() }, Refusal::Incarnation),
-        (ScoreReport { job: 99, ..good.clone() }, Refusal::Job),
-        (ScoreReport { job: other.id, ..good.clone() }, Refusal::Evaluator),
-        (ScoreReport { evaluator: name("b"), ..good.clone() }, Refusal::Evaluator),
-        (ScoreReport { step: 2000, ..good.clone() }, Refusal::Step),
+        (ScoreReport { step: 3000, ..good.clone() }, Refusal::Step),
+        (ScoreReport { step: 2000, ..good.clone() }, Refusal::Weights),
         (ScoreReport { weights: hash(2000), ..good.clone() }, Refusal::Weights),
-        (with_episode(score(6, 0.0)), Refusal::Seed(6)),
+        (with_episode(score(11, 0.0)), Refusal::Seed(11)),
         (twice, Refusal::Seed(1)),
         (with_episode(EpisodeScore { length: 0, ..score(1, 0.0) }), Refusal::Episode(1)),
         (with_episode(EpisodeScore { length: 1001, ..score(1, 0.0) }), Refusal::Episode(1)),
@@ -283,6 +399,28 @@ fn a_report_that_is_not_of_this_job_is_refused() {
     }
     assert_eq!(bench.board.pending(), 14);
     assert_eq!(bench.deliver(&good).unwrap().0.new.len(), 5);
+}
+
+/// Because that ends the run.
+#[test]
+fn only_whoever_has_the_job_may_say_that_a_policy_cannot_act() {
+    let mut bench = Bench::new();
+    let (job, other) = (bench.job("a", 0), bench.job("b", 0));
+    let signed = |lease: &Lease, weights| CannotAct::signed("NaN".to_owned(), weights, lease);
+    let good = ScoreReport { cannot_act: Some(signed(&job.lease, job.weights)), ..report(&job, "a", vec![]) };
+    let with = |complaint| ScoreReport { cannot_act: Some(complaint), ..good.clone() };
+    let cases = [
+        (with(signed(&other.lease, job.weights)), Refusal::Proof),
+        (with(signed(&job.lease, hash(2000))), Refusal::Proof),
+        (ScoreReport { evaluator: name("b"), ..good.clone() }, Refusal::Evaluator),
+        (ScoreReport { job: 99, ..good.clone() }, Refusal::Job),
+        (ScoreReport { incarnation: 1, ..good.clone() }, Refusal::Incarnation),
+        (ScoreReport { weights: hash(2000), ..good.clone() }, Refusal::Weights),
+    ];
+    for (report, refusal) in cases {
+        assert_eq!(bench.board.screen_complaint(&report), Err(refusal));
+    }
+    assert_eq!(bench.board.screen_complaint(&good), Ok(()));
 }
 
 #[test]

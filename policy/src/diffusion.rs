@@ -1,6 +1,7 @@
 //! The diffusion policy: the best of N_a candidates (Eq. 25), drawn from the target actor and valued by the target critics.
 
-use crate::kind::check_range;
+use crate::ensemble::tile_numbers;
+use crate::kind::{Cost, check_range};
 use crate::slices::read;
 use crate::weights::{Tensors, Weights};
 use crate::{Ensemble, EnsembleShape, NoisePredictor, NoiseShape, Policy, PolicyError, Precision};
@@ -158,6 +159,22 @@ impl Policy for DiffusionPolicy {
 
     fn samples_candidates(&self) -> bool {
         true
+    }
+
+    fn cost(&self, states: usize, candidates: usize) -> Cost {
+        let DiffusionShape { observation_dim, action_dim, hidden, diffusion_steps, .. } = self.shape;
+        let (states, candidates, steps) = (states as u64, candidates as u64, diffusion_steps as u64);
+        let rows = states.saturating_mul(candidates);
+        // The noise of all steps, the candidates and their copies, and their values.
+        let drawn = rows.saturating_mul(action_dim as u64).saturating_mul(steps + 3).saturating_add(rows);
+        let observed = states.saturating_mul(observation_dim as u64);
+        let sampling = drawn.saturating_add(observed).saturating_add(tile_numbers(candidates, hidden));
+        let critics = self.shape.critics().cost(states, candidates);
+        let actor = rows.saturating_mul(steps).saturating_mul(self.shape.actor().layout().count() as u64);
+        Cost {
+            bytes: sampling.saturating_mul(4).saturating_add(critics.bytes),
+            products: actor.saturating_add(critics.products),
+        }
     }
 
     fn act(

@@ -4,7 +4,9 @@
 
 use crate::Precision;
 use crate::ensemble_ops::{ActionGradients, Networks, Outputs, SquaredError};
+use crate::kind::Cost;
 use crate::layers::Layers;
+use crate::network::TILE;
 use crate::operation::OnCpu;
 use crate::plain;
 use crate::record::{Pool, Record};
@@ -37,10 +39,25 @@ impl EnsembleShape {
         Layers::new(self.members, &[observation_dim + action_dim, hidden, hidden, hidden, self.outputs], 0)
     }
 
+    /// What it takes to run all networks forward on so many states, `repeat` rows for each.
+    pub(crate) fn cost(&self, states: u64, repeat: u64) -> Cost {
+        let (rows, members) = (states.saturating_mul(repeat), self.members as u64);
+        let outputs = rows.saturating_mul(members).saturating_mul(self.outputs as u64);
+        let bytes = 4 * outputs.saturating_add(tile_numbers(repeat, self.hidden));
+        Cost { bytes, products: rows.saturating_mul(self.layout().count() as u64) }
+    }
+
     /// Tensors `{0..3}.kernel` `[K, in, out]` and `{0..3}.bias` `[K, out]`.
     pub fn layout(&self) -> Layout {
         Layout::new(self.layers().named("", true))
     }
+}
+
+/// Numbers that the threads keep of the tiles of rows that they are at: rows of one state are not parted, and of each row
+/// there are some hidden layers.
+pub(crate) fn tile_numbers(repeat: u64, hidden: usize) -> u64 {
+    const LAYERS: u64 = 6;
+    (rayon::current_num_threads() as u64 * LAYERS).saturating_mul(repeat.max(TILE as u64)).saturating_mul(hidden as u64)
 }
 
 /// An ensemble and its weights.

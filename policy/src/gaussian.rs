@@ -1,6 +1,6 @@
 //! The Gaussian policy: its mean, tanh of a network of the state, is the action. Nothing is sampled.
 
-use crate::kind::check_range;
+use crate::kind::{Cost, check_range};
 use crate::slices::read;
 use crate::weights::{Tensors, Weights};
 use crate::{ActionNoise, Ensemble, EnsembleShape, Policy, PolicyError, Precision};
@@ -74,6 +74,12 @@ impl Policy for GaussianPolicy {
 
     fn samples_candidates(&self) -> bool {
         false
+    }
+
+    fn cost(&self, states: usize, _candidates: usize) -> Cost {
+        let GaussianShape { observation_dim, action_dim, .. } = self.shape;
+        let Cost { bytes, products } = self.shape.actor().cost(states as u64, 1);
+        Cost { bytes: bytes + 4 * states as u64 * (observation_dim + 2 * action_dim) as u64, products }
     }
 
     fn act(

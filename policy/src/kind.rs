@@ -15,6 +15,15 @@ const DESCRIPTION: &str = "policy";
 /// Widest hidden layer, most critics and most denoising steps that are believed.
 pub(crate) const MOST: usize = u16::MAX as usize;
 
+/// What one call of [`Policy::act`] takes, at most.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Cost {
+    /// Memory beside the weights, bytes.
+    pub bytes: u64,
+    /// Multiplications.
+    pub products: u64,
+}
+
 /// A trained policy, ready to act.
 pub trait Policy: Send + Sync {
     /// What kind it is, e.g. `diffusion`.
@@ -28,6 +37,9 @@ pub trait Policy: Send + Sync {
 
     /// Whether it samples candidate actions, of which it takes the best.
     fn samples_candidates(&self) -> bool;
+
+    /// What it takes to choose an action for each of so many states, which can be asked before it is too much.
+    fn cost(&self, states: usize, candidates: usize) -> Cost;
 
     /// Chooses an action for each of n states.
     ///

@@ -49,7 +49,7 @@ pub use diffusion::{ActionNoise, DiffusionPolicy, DiffusionShape};
 pub use ensemble::{Ensemble, EnsembleShape};
 pub use error::PolicyError;
 pub use gaussian::{GaussianPolicy, GaussianShape, gaussian_mean};
-pub use kind::{Description, Policy, load_policy, read_tensors};
+pub use kind::{Cost, Description, Policy, load_policy, read_tensors};
 pub use noise_predictor::{NoisePredictor, NoiseShape};
 pub use precision::Precision;
 pub use schedule::Schedule;

@@ -17,10 +17,13 @@ use bincode::error::{DecodeError, EncodeError};
 
 pub(crate) use bincode::{Decode, Encode};
 
-use crate::{Hash, JobReply, JobRequest, Name, Progress, RecordedScores, Schema, ScoreReply, ScoreReport, Snapshot};
+use crate::{
+    Hash, JobReply, JobRequest, Name, Progress, RecordedScores, Schema, ScoreReply, ScoreReport, Snapshot,
+    WeightsRequest,
+};
 
 /// Version of keys, messages and encoding. Frames of another version are refused.
-pub const PROTOCOL_VERSION: u16 = 3;
+pub const PROTOCOL_VERSION: u16 = 4;
 
 const MAGIC: &[u8; 4] = b"QUAD";
 const HEADER_LENGTH: usize = MAGIC.len() + size_of::<u16>() + size_of::<u8>();
@@ -87,6 +90,10 @@ impl Message for RecordedScores {
 
 impl Message for Progress {
     const KIND: u8 = 7;
+}
+
+impl Message for WeightsRequest {
+    const KIND: u8 = 8;
 }
 
 /// Why bytes are not the expected message, or a message cannot be sent.
@@ -218,6 +225,12 @@ pub fn decode_from<M: Message>(length: usize, mut frame: impl Read) -> Result<M,
     }
     message.verify()?;
     Ok(message)
+}
+
+/// The encoding of what is not a message of its own, without a header.
+pub(crate) fn fields<T: Encode>(value: &T) -> Vec<u8> {
+    // Writing to memory cannot fail, and none of our types refuses to be encoded.
+    bincode::encode_to_vec(value, FIXED).unwrap_or_default()
 }
 
 fn body_error(error: DecodeError) -> CodecError {

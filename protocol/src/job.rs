@@ -1,15 +1,34 @@
-//! An evaluator asks for work and gets some.
+//! An evaluator asks for work and gets some, or gives it back.
+
+use std::time::Duration;
 
 use crate::codec::{Decode, Encode};
-use crate::{Hash, Name};
+use crate::{Hash, Lease, Name};
 
-/// An evaluator claims a job.
+/// What an evaluator asks a learner about jobs.
 #[derive(Clone, Debug, PartialEq, Eq, Encode, Decode)]
-pub struct JobRequest {
-    /// Who asks.
-    pub evaluator: Name,
-    /// The environments it has.
-    pub environments: Vec<String>,
+pub enum JobRequest {
+    /// It wants one.
+    Claim {
+        /// Who asks.
+        evaluator: Name,
+        /// A random number, the same when the claim is sent again because no answer came: it is answered with the same job
+        /// again.
+        attempt: u64,
+        /// The environments it has.
+        environments: Vec<String>,
+        /// The arithmetic that it computes policies in, e.g. `f32` or `bf16`.
+        precision: Name,
+    },
+    /// It will not do the one that it has: it is leaving, or could not do it.
+    HandBack {
+        /// Who hands it back.
+        evaluator: Name,
+        /// [`Job::id`].
+        job: u64,
+        /// [`Job::lease`].
+        lease: Lease,
+    },
 }
 
 /// The learner's answer to a [`JobRequest`].
@@ -19,9 +38,28 @@ pub enum JobReply {
     Job(Job),
     /// None now; ask again after so many milliseconds.
     Wait {
+        /// The learner's incarnation.
+        incarnation: u64,
         /// How long to wait.
         milliseconds: u64,
     },
+    /// The answer to [`JobRequest::HandBack`].
+    HandedBack {
+        /// The learner's incarnation.
+        incarnation: u64,
+        /// Whether the evaluator still had the job; if not, there was nothing to hand back.
+        accepted: bool,
+    },
+}
+
+impl JobReply {
+    /// The incarnation of the learner that answers.
+    pub fn incarnation(&self) -> u64 {
+        match self {
+            Self::Job(job) => job.incarnation,
+            Self::Wait { incarnation, .. } | Self::HandedBack { incarnation, .. } => *incarnation,
+        }
+    }
 }
 
 /// Episodes to run with one snapshot, all of them with the same weights.
@@ -29,9 +67,11 @@ pub enum JobReply {
 pub struct Job {
     /// Number of the job, counted within the learner's incarnation.
     pub id: u64,
+    /// The secret that shows whose job it is.
+    pub lease: Lease,
     /// The run.
     pub run: Name,
-    /// The learner's incarnation when it handed the job out.
+    /// The learner's incarnation.
     pub incarnation: u64,
     /// Gradient step of the snapshot.
     pub step: u64,
@@ -45,6 +85,11 @@ pub struct Job {
     pub seeds: Vec<u64>,
     /// Actions that the policy draws in each state before it takes the best (the paper's N_a).
     pub candidates: u32,
-    /// After so many milliseconds without a progress message the job goes to another evaluator.
+    /// After so many milliseconds without progress the job goes to another evaluator.
     pub lease_milliseconds: u64,
+}
+
+impl Job {
+    /// Longest time that an evaluator may have a job, whatever its progress.
+    pub const LONGEST: Duration = Duration::from_secs(3600);
 }

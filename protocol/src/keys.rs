@@ -3,18 +3,22 @@
 //! | key | verb | message |
 //! |---|---|---|
 //! | `quad/<run>/weights` | learner publishes | [`Snapshot`](crate::Snapshot) |
-//! | `quad/<run>/weights/<step>` | learner answers | nothing → [`Snapshot`](crate::Snapshot) |
+//! | `quad/<run>/weights/<step>` | learner answers | [`WeightsRequest`](crate::WeightsRequest) or nothing → [`Snapshot`](crate::Snapshot) |
 //! | `quad/<run>/jobs` | learner answers | [`JobRequest`](crate::JobRequest) → [`JobReply`](crate::JobReply) |
 //! | `quad/<run>/scores` | learner answers | [`ScoreReport`](crate::ScoreReport) → [`ScoreReply`](crate::ScoreReply) |
 //! | `quad/<run>/scores/<step>` | learner publishes | [`RecordedScores`](crate::RecordedScores) |
 //! | `quad/<run>/progress/<evaluator>` | evaluator publishes | [`Progress`](crate::Progress) |
-//! | `quad/<run>/live/learner` | learner's liveliness token | |
+//! | `quad/<run>/live/learner/<incarnation>` | learner's liveliness token | |
 //! | `quad/<run>/live/evaluator/<evaluator>` | evaluator's liveliness token | |
+//!
+//! Anybody who reaches the network may answer on these keys, too. So a learner's answers, jobs and snapshots name its
+//! incarnation, and an evaluator believes those of the incarnation that it follows by its token; of several answers it takes
+//! the first that fits. Only access control keeps out whoever forges tokens and answers alike.
 
 use crate::Name;
 
 /// Key expression of the liveliness tokens of all runs' learners.
-pub const ALL_LEARNERS: &str = "quad/*/live/learner";
+pub const ALL_LEARNERS: &str = "quad/*/live/learner/*";
 
 /// The newest weights, as they are published.
 pub fn weights(run: &Name) -> String {
@@ -56,9 +60,14 @@ pub fn all_progress(run: &Name) -> String {
     format!("quad/{run}/progress/*")
 }
 
-/// The learner's liveliness token.
-pub fn live_learner(run: &Name) -> String {
-    format!("quad/{run}/live/learner")
+/// The liveliness token of one life of the learner.
+pub fn live_learner(run: &Name, incarnation: u64) -> String {
+    format!("quad/{run}/live/learner/{incarnation}")
+}
+
+/// Key expression of the tokens of all lives of a run's learner, and of all learners that took the same name.
+pub fn all_lives(run: &Name) -> String {
+    format!("quad/{run}/live/learner/*")
 }
 
 /// An evaluator's liveliness token.
@@ -85,6 +94,14 @@ pub fn evaluator_of(key: &str) -> Option<Name> {
     Name::new(evaluator).ok()
 }
 
+/// The incarnation that a key of [`live_learner`] names.
+pub fn incarnation_of(key: &str) -> Option<u64> {
+    let run = run_of(key)?;
+    let incarnation = key.strip_prefix("quad/")?.strip_prefix(run.as_str())?.strip_prefix("/live/learner/")?;
+    // Only as it is written: `+1` and `01` would be 1, too.
+    incarnation.parse().ok().filter(|number: &u64| number.to_string() == incarnation)
+}
+
 /// The step that a key of [`weights_at`] or [`scores_at`] names.
 pub fn step_of(key: &str) -> Option<u64> {
     let run = run_of(key)?;
@@ -100,7 +117,9 @@ mod tests {
     #[test]
     fn keys_give_back_what_they_were_made_of() {
         let (run, evaluator) = (Name::new("run-1").unwrap(), Name::new("box.7").unwrap());
-        for key in [weights(&run), jobs(&run), scores(&run), live_learner(&run)] {
+        let learner = live_learner(&run, 77);
+        assert_eq!(incarnation_of(&learner), Some(77));
+        for key in [weights(&run), jobs(&run), scores(&run), learner] {
             assert_eq!(run_of(&key), Some(run.clone()), "{key}");
             assert_eq!((evaluator_of(&key), step_of(&key)), (None, None), "{key}");
         }
@@ -114,12 +133,18 @@ mod tests {
 
     #[test]
     fn strangers_keys_give_nothing() {
-        for key in ["", "quad", "quad/", "quad//live", "quad/a b/live/learner", "quad/*/live/learner", "other/run/jobs"]
+        for key in
+            ["", "quad", "quad/", "quad//live", "quad/a b/live/learner/1", "quad/*/live/learner/1", "other/run/jobs"]
         {
             assert_eq!(run_of(key), None, "{key}");
         }
         for key in ["quad/run/live/evaluator/", "quad/run/live/evaluator/a/b", "quad/run/progress/*", "quad/run/x/e"] {
             assert_eq!(evaluator_of(key), None, "{key}");
+        }
+        for key in
+            ["quad/run/live/learner", "quad/run/live/learner/x", "quad/run/live/learner/01", "quad/run/live/learner/+1"]
+        {
+            assert_eq!(incarnation_of(key), None, "{key}");
         }
         for key in ["quad/run/weights/", "quad/run/weights/x", "quad/run/weights/-1", "quad/run/jobs/1"] {
             assert_eq!(step_of(key), None, "{key}");

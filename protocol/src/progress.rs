@@ -1,15 +1,19 @@
 //! Progress of an evaluator.
 
-use crate::Name;
 use crate::codec::{Decode, Encode};
+use crate::{Hash, Lease, Name};
 
-/// How far a job is, and what the evaluator has done so far. Extends the job's lease.
+/// How far a job is, and what the evaluator has done so far. Extends the job's lease, if it is further than before.
+///
+/// Everybody may read it, so it does not hold the job's lease but a proof that its sender has it.
 #[derive(Clone, Debug, PartialEq, Eq, Encode, Decode)]
 pub struct Progress {
     /// The evaluator.
     pub evaluator: Name,
     /// The run.
     pub run: Name,
+    /// The learner's incarnation when it handed the job out.
+    pub incarnation: u64,
     /// The job.
     pub job: u64,
     /// Gradient step of its snapshot.
@@ -18,8 +22,29 @@ pub struct Progress {
     pub episodes_done: u32,
     /// Episodes of the job.
     pub episodes_total: u32,
+    /// Environment steps of the job. None while its weights are being fetched.
+    pub steps_done: u64,
     /// Environment steps of this evaluator since it started, over all of its jobs and runs.
     pub environment_steps: u64,
     /// Episodes of this evaluator since it started, over all of its jobs and runs.
     pub episodes: u64,
+    /// Of everything above, under the job's lease. [`signed`](Self::signed) makes it.
+    pub proof: Hash,
+}
+
+impl Progress {
+    /// The same with its proof.
+    pub fn signed(self, lease: &Lease) -> Self {
+        let proof = self.proof_under(lease);
+        Self { proof, ..self }
+    }
+
+    /// Whether the sender has the lease.
+    pub fn is_signed(&self, lease: &Lease) -> bool {
+        self.proof.is(&self.proof_under(lease))
+    }
+
+    fn proof_under(&self, lease: &Lease) -> Hash {
+        lease.proof(&("progress", Self { proof: Hash::of(&[]), ..self.clone() }))
+    }
 }

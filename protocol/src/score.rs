@@ -1,7 +1,7 @@
 //! Scores: an evaluator delivers them, the learner acknowledges them and publishes what it has recorded.
 
 use crate::codec::{Decode, Encode};
-use crate::{Hash, Name};
+use crate::{Hash, Lease, Name};
 
 /// The result of one episode.
 #[derive(Clone, Copy, Debug, PartialEq, Encode, Decode)]
@@ -16,7 +16,8 @@ pub struct EpisodeScore {
     pub score: f64,
 }
 
-/// An evaluator delivers the episodes of a job.
+/// An evaluator delivers the episodes of a job. They are welcome whoever had the job and whichever life of the learner handed
+/// it out: what counts is that run, step, weights and seeds are those of an evaluation.
 #[derive(Clone, Debug, PartialEq, Encode, Decode)]
 pub struct ScoreReport {
     /// Who delivers.
@@ -35,9 +36,31 @@ pub struct ScoreReport {
     pub precision: Name,
     /// The episodes.
     pub episodes: Vec<EpisodeScore>,
-    /// Why there are none: the policy cannot act, because something on the way to an action is not a number. No other
-    /// evaluator would fare better.
-    pub cannot_act: Option<String>,
+    /// Why there are none.
+    pub cannot_act: Option<CannotAct>,
+}
+
+/// The policy cannot act, because something on the way to an action is not a number. No other evaluator would fare better,
+/// so this ends the run; therefore it has to be proved that it comes from whoever had the job.
+#[derive(Clone, Debug, PartialEq, Eq, Encode, Decode)]
+pub struct CannotAct {
+    /// What is not a number.
+    pub reason: String,
+    /// Of the reason and the weights, under the job's lease.
+    pub proof: Hash,
+}
+
+impl CannotAct {
+    /// Makes the proof.
+    pub fn signed(reason: String, weights: Hash, lease: &Lease) -> Self {
+        let proof = lease.proof(&("cannot act", &reason, weights));
+        Self { reason, proof }
+    }
+
+    /// Whether the sender has the lease.
+    pub fn is_signed(&self, weights: Hash, lease: &Lease) -> bool {
+        self.proof.is(&lease.proof(&("cannot act", &self.reason, weights)))
+    }
 }
 
 /// The learner's answer to a [`ScoreReport`].
@@ -45,6 +68,8 @@ pub struct ScoreReport {
 pub enum ScoreReply {
     /// They are on the learner's disk.
     Recorded {
+        /// The learner's incarnation.
+        incarnation: u64,
         /// Episodes that were not known before.
         new: u32,
         /// Episodes that were delivered before; they count once.
@@ -52,9 +77,20 @@ pub enum ScoreReply {
     },
     /// They were not accepted and never will be; do not send them again.
     Refused {
+        /// The learner's incarnation.
+        incarnation: u64,
         /// Why, for people.
         reason: String,
     },
+}
+
+impl ScoreReply {
+    /// The incarnation of the learner that answers.
+    pub fn incarnation(&self) -> u64 {
+        match self {
+            Self::Recorded { incarnation, .. } | Self::Refused { incarnation, .. } => *incarnation,
+        }
+    }
 }
 
 /// Scores that the learner has recorded, published for observers.

@@ -68,6 +68,7 @@ fn claimed_lengths_are_not_believed() {
     let episodes = vec![EpisodeScore { seed: 1, episode_return: 2.0, length: 3, score: 4.0 }; 3];
     let job = Job {
         id: 1,
+        lease: Lease::random(),
         run: name(),
         incarnation: 2,
         step: 3,
@@ -79,7 +80,9 @@ fn claimed_lengths_are_not_believed() {
         lease_milliseconds: 1000,
     };
     claim_too_much(&Snapshot { run: name(), incarnation: 1, step: 2, schema, hash, tensors });
-    claim_too_much(&JobRequest { evaluator: name(), environments: vec![environment(); 3] });
+    let environments = vec![environment(); 3];
+    claim_too_much(&JobRequest::Claim { evaluator: name(), attempt: 1, environments, precision: name() });
+    claim_too_much(&WeightsRequest { evaluator: name() });
     claim_too_much(&JobReply::Job(job));
     claim_too_much(&ScoreReport {
         evaluator: name(),
@@ -90,8 +93,8 @@ fn claimed_lengths_are_not_believed() {
         weights: hash,
         precision: name(),
         episodes: episodes.clone(),
-        cannot_act: Some(environment()),
+        cannot_act: Some(CannotAct { reason: environment(), proof: hash }),
     });
-    claim_too_much(&ScoreReply::Refused { reason: environment() });
+    claim_too_much(&ScoreReply::Refused { incarnation: 1, reason: environment() });
     claim_too_much(&RecordedScores { run: name(), step: 1, weights: hash, evaluator: name(), episodes });
 }

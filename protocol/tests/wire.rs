@@ -63,15 +63,38 @@ fn snapshot() -> impl Strategy<Value = Snapshot> {
     )
 }
 
+fn lease() -> impl Strategy<Value = Lease> {
+    // A lease comes out of its own generator only; what it is does not matter here.
+    Just(()).prop_map(|()| Lease::random())
+}
+
 fn job_request() -> impl Strategy<Value = JobRequest> {
-    (name(), vec(text(), 0..5)).prop_map(|(evaluator, environments)| JobRequest { evaluator, environments })
+    let claim =
+        (name(), any::<u64>(), vec(text(), 0..5), name()).prop_map(|(evaluator, attempt, environments, precision)| {
+            JobRequest::Claim { evaluator, attempt, environments, precision }
+        });
+    let hand_back = (name(), any::<u64>(), lease()).prop_map(|(evaluator, job, lease)| JobRequest::HandBack {
+        evaluator,
+        job,
+        lease,
+    });
+    prop_oneof![claim, hand_back]
 }
 
 fn job_reply() -> impl Strategy<Value = JobReply> {
-    let job = (any::<[u64; 5]>(), name(), hash(), text(), vec(any::<u64>(), 0..100), any::<u32>()).prop_map(
-        |([id, incarnation, step, instance, lease_milliseconds], run, weights, environment, seeds, candidates)| {
+    let job = (any::<[u64; 5]>(), lease(), name(), hash(), text(), vec(any::<u64>(), 0..100), any::<u32>()).prop_map(
+        |(
+            [id, incarnation, step, instance, lease_milliseconds],
+            lease,
+            run,
+            weights,
+            environment,
+            seeds,
+            candidates,
+        )| {
             JobReply::Job(Job {
                 id,
+                lease,
                 run,
                 incarnation,
                 step,
@@ -84,11 +107,18 @@ fn job_reply() -> impl Strategy<Value = JobReply> {
             })
         },
     );
-    prop_oneof![job, any::<u64>().prop_map(|milliseconds| JobReply::Wait { milliseconds })]
+    let wait = any::<[u64; 2]>().prop_map(|[incarnation, milliseconds]| JobReply::Wait { incarnation, milliseconds });
+    let handed_back = (any::<u64>(), any::<bool>())
+        .prop_map(|(incarnation, accepted)| JobReply::HandedBack { incarnation, accepted });
+    prop_oneof![job, wait, handed_back]
+}
+
+fn cannot_act() -> impl Strategy<Value = CannotAct> {
+    (text(), hash()).prop_map(|(reason, proof)| CannotAct { reason, proof })
 }
 
 fn score_report() -> impl Strategy<Value = ScoreReport> {
-    (name(), name(), any::<[u64; 3]>(), hash(), name(), episodes(), prop::option::of(text())).prop_map(
+    (name(), name(), any::<[u64; 3]>(), hash(), name(), episodes(), prop::option::of(cannot_act())).prop_map(
         |(evaluator, run, [incarnation, job, step], weights, precision, episodes, cannot_act)| ScoreReport {
             evaluator,
             run,
@@ -104,10 +134,10 @@ fn score_report() -> impl Strategy<Value = ScoreReport> {
 }
 
 fn score_reply() -> impl Strategy<Value = ScoreReply> {
-    prop_oneof![
-        any::<[u32; 2]>().prop_map(|[new, duplicates]| ScoreReply::Recorded { new, duplicates }),
-        text().prop_map(|reason| ScoreReply::Refused { reason }),
-    ]
+    let recorded = (any::<u64>(), any::<[u32; 2]>())
+        .prop_map(|(incarnation, [new, duplicates])| ScoreReply::Recorded { incarnation, new, duplicates });
+    let refused = (any::<u64>(), text()).prop_map(|(incarnation, reason)| ScoreReply::Refused { incarnation, reason });
+    prop_oneof![recorded, refused]
 }
 
 fn recorded_scores() -> impl Strategy<Value = RecordedScores> {
@@ -117,16 +147,22 @@ fn recorded_scores() -> impl Strategy<Value = RecordedScores> {
 }
 
 fn progress() -> impl Strategy<Value = Progress> {
-    (name(), name(), any::<[u64; 4]>(), any::<[u32; 2]>()).prop_map(
-        |(evaluator, run, [job, step, environment_steps, episodes], [episodes_done, episodes_total])| Progress {
-            evaluator,
-            run,
-            job,
-            step,
-            episodes_done,
-            episodes_total,
-            environment_steps,
-            episodes,
+    (name(), name(), any::<[u64; 6]>(), any::<[u32; 2]>(), hash()).prop_map(
+        |(evaluator, run, numbers, [episodes_done, episodes_total], proof)| {
+            let [incarnation, job, step, steps_done, environment_steps, episodes] = numbers;
+            Progress {
+                evaluator,
+                run,
+                incarnation,
+                job,
+                step,
+                episodes_done,
+                episodes_total,
+                steps_done,
+                environment_steps,
+                episodes,
+                proof,
+            }
         },
     )
 }
@@ -175,6 +211,9 @@ proptest! {
     fn job_requests(message in job_request()) { withstands_the_wire(&message)?; }
 
     #[test]
+    fn weights_requests(evaluator in name()) { withstands_the_wire(&WeightsRequest { evaluator })?; }
+
+    #[test]
     fn job_replies(message in job_reply()) { withstands_the_wire(&message)?; }
 
     #[test]
@@ -188,6 +227,26 @@ proptest! {
 
     #[test]
     fn progress_messages(message in progress()) { withstands_the_wire(&message)?; }
+
+    #[test]
+    fn what_is_signed_is_signed_as_a_whole(message in progress(), reason in text(), other in progress()) {
+        let (mine, another) = (Lease::random(), Lease::random());
+        let signed = message.clone().signed(&mine);
+        prop_assert!(signed.is_signed(&mine) && !signed.is_signed(&another) && !message.is_signed(&mine));
+        for changed in [
+            Progress { evaluator: other.evaluator, ..signed.clone() },
+            Progress { job: signed.job ^ 1, ..signed.clone() },
+            Progress { steps_done: signed.steps_done ^ 1, ..signed.clone() },
+            Progress { episodes_done: signed.episodes_done ^ 1, ..signed.clone() },
+            Progress { incarnation: signed.incarnation ^ 1, ..signed.clone() },
+        ] {
+            prop_assert!(changed == signed || !changed.is_signed(&mine), "{:?}", changed);
+        }
+        let weights = Hash::of(b"weights");
+        let complaint = CannotAct::signed(reason, weights, &mine);
+        prop_assert!(complaint.is_signed(weights, &mine) && !complaint.is_signed(weights, &another));
+        prop_assert!(!complaint.is_signed(Hash::of(b"others"), &mine));
+    }
 
     #[test]
     fn random_bytes_are_no_message(bytes in vec(any::<u8>(), 0..300)) {
@@ -209,6 +268,7 @@ proptest! {
         check::<ScoreReply>(&body);
         check::<RecordedScores>(&body);
         check::<Progress>(&body);
+        check::<WeightsRequest>(&body);
     }
 }
 
@@ -237,7 +297,9 @@ proptest! {
 
 #[test]
 fn a_name_that_is_not_allowed_is_malformed() {
-    let message = JobRequest { evaluator: Name::new("a-b").unwrap(), environments: vec![] };
+    let precision = Name::new("f32").unwrap();
+    let evaluator = Name::new("a-b").unwrap();
+    let message = JobRequest::Claim { evaluator, attempt: 0, environments: vec![], precision };
     let mut frame = encode(&message).unwrap();
     let dash = frame.iter().position(|&byte| byte == b'-').unwrap();
     frame[dash] = b'/';

@@ -59,6 +59,14 @@ impl Process {
         assert!(status.success(), "{command}: {status}");
     }
 
+    /// The most memory that it has had, bytes.
+    pub fn peak_memory(&self) -> u64 {
+        let status = fs::read_to_string(format!("/proc/{}/status", self.child.id())).expect("it runs");
+        let line = status.lines().find_map(|line| line.strip_prefix("VmHWM:")).expect("Linux says so");
+        let kilobytes = line.trim().trim_end_matches(" kB").parse::<u64>().expect("a number of kilobytes");
+        kilobytes << 10
+    }
+
     /// Kills it at once, as a power cut would.
     pub fn kill(&mut self) {
         self.child.kill().expect("a child can be killed");

@@ -71,8 +71,7 @@ fn an_evaluator_leaves_in_the_middle_of_a_job() {
     let (duration, status) = evaluator.process.terminate(PATIENCE);
     assert_eq!(status.code(), Some(0), "the evaluator ended with {status}");
     assert!(duration < Duration::from_secs(3), "it took {duration:?} to leave");
-    eventually("the job was taken back", PATIENCE, || {
-        let page = http::metrics(&learner.metrics())?;
-        (http::sum(&page, "quad_learner_jobs_total", "outcome=\"expired\"") == 1.0).then_some(())
-    });
+    let page = http::metrics(&learner.metrics()).unwrap();
+    let jobs = |outcome: &str| http::sum(&page, "quad_learner_jobs_total", &format!("outcome=\"{outcome}\""));
+    assert_eq!((jobs("handed_back"), jobs("expired")), (1.0, 0.0), "{page}");
 }

@@ -1,10 +1,14 @@
-//! Bytes from the wire are not trusted: whatever strangers send is counted, and the work goes on.
+//! Bytes from the wire are not trusted: whatever strangers send, and however much, is counted, and the work goes on.
 #![allow(clippy::unwrap_used, clippy::expect_used)]
 
-use std::sync::atomic::{AtomicUsize, Ordering};
-use std::time::Duration;
+use std::sync::Mutex;
+use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering};
+use std::time::{Duration, Instant};
 
-use quad_protocol::{Hash, Job, JobReply, JobRequest, Name, Schema, Snapshot, decode, encode, keys};
+use quad_protocol::{
+    EpisodeScore, Hash, Job, JobReply, JobRequest, Lease, Name, Progress, Schema, ScoreReply, ScoreReport, Snapshot,
+    decode, encode, keys,
+};
 use quad_tests::router::router;
 use quad_tests::system::{Scratch, Setting, free_port};
 use quad_tests::{PATIENCE, eventually, http};
@@ -28,6 +32,11 @@ fn garbage(real: &[u8]) -> Vec<Vec<u8>> {
     ]
 }
 
+fn claim(evaluator: &str, attempt: u64) -> JobRequest {
+    let (evaluator, precision) = (Name::new(evaluator).unwrap(), Name::new("f32").unwrap());
+    JobRequest::Claim { evaluator, attempt, environments: vec!["hopper".to_owned()], precision }
+}
+
 /// A run whose learner answers claims with nonsense of every kind, one after another.
 async fn haunt(session: &Session) -> impl Sized {
     let ghost = Name::new("ghost").unwrap();
@@ -36,6 +45,7 @@ async fn haunt(session: &Session) -> impl Sized {
         let (run, environment) = (run.clone(), environment.to_owned());
         encode(&JobReply::Job(Job {
             id: 1,
+            lease: Lease::random(),
             run,
             incarnation: 1,
             step: 1,
@@ -63,6 +73,10 @@ async fn haunt(session: &Session) -> impl Sized {
     let asked = AtomicUsize::new(0);
     let jobs = keys::jobs(&ghost);
     let queryable = session.declare_queryable("quad/ghost/**").callback(move |query| {
+        let message = query.payload().map(|payload| payload.to_bytes().into_owned()).unwrap_or_default();
+        if matches!(decode(&message), Ok(JobRequest::HandBack { .. })) {
+            return;
+        }
         let answer = match query.key_expr().as_str() == jobs {
             true => answers[asked.fetch_add(1, Ordering::Relaxed) % answers.len()].clone(),
             false => snapshot.clone(),
@@ -71,8 +85,8 @@ async fn haunt(session: &Session) -> impl Sized {
         zenoh::Wait::wait(query.reply(key, answer)).unwrap();
     });
     let queryable = queryable.await.unwrap();
-    let token = session.liveliness().declare_token(keys::live_learner(&ghost)).await.unwrap();
-    let nameless = session.liveliness().declare_token("quad/not a name/live/learner").await.unwrap();
+    let token = session.liveliness().declare_token(keys::live_learner(&ghost, 1)).await.unwrap();
+    let nameless = session.liveliness().declare_token("quad/not a name/live/learner/1").await.unwrap();
     (queryable, token, nameless)
 }
 
@@ -90,7 +104,7 @@ async fn nonsense_on_every_key_is_counted_and_survived() {
     let replies = session.get(keys::weights_at(&run, first)).await.unwrap();
     let snapshot = replies.recv_async().await.unwrap().into_result().unwrap().payload().to_bytes().into_owned();
     decode::<Snapshot>(&snapshot).unwrap();
-    let request = JobRequest { evaluator: Name::new("stranger").unwrap(), environments: vec!["hopper".to_owned()] };
+    let request = claim("stranger", 1);
     let payloads = garbage(&snapshot).into_iter().chain(garbage(&encode(&request).unwrap()));
     let _ghost = haunt(&session).await;
     for payload in payloads {
@@ -124,4 +138,187 @@ async fn nonsense_on_every_key_is_counted_and_survived() {
     for (name, log) in [("learner", learner.process.log()), ("evaluator", evaluator.process.log())] {
         assert!(!log.contains("panicked"), "a thread of the {name} panicked:\n{log}");
     }
+}
+
+/// Somebody who answers in the learner's place: with messages that are all right but for the incarnation, or never.
+async fn impostor(session: &Session, run: &Name) -> impl Sized {
+    let tensors = b"other tensors".to_vec();
+    let schema =
+        Schema { environment: "hopper".to_owned(), observation_dim: 11, action_dim: 3, policy: "diffusion".to_owned() };
+    let hash = Hash::of(&tensors);
+    let weights = encode(&Snapshot { run: run.clone(), incarnation: 1, step: 20, schema, hash, tensors }).unwrap();
+    let wait = encode(&JobReply::Wait { incarnation: 1, milliseconds: 5000 }).unwrap();
+    let refused = encode(&ScoreReply::Refused { incarnation: 1, reason: "no".to_owned() }).unwrap();
+    let (jobs, scores) = (keys::jobs(run), keys::scores(run));
+    let (count, unanswered) = (AtomicUsize::new(0), Mutex::new(Vec::new()));
+    let answer = move |query: zenoh::query::Query| {
+        if count.fetch_add(1, Ordering::Relaxed) % 2 == 1 {
+            // As long as it is held, nobody knows that there will be no answer.
+            unanswered.lock().unwrap().push(query);
+            return;
+        }
+        let key = query.key_expr().clone();
+        let message = match key.as_str() {
+            key if key == jobs => wait.clone(),
+            key if key == scores => refused.clone(),
+            _ => weights.clone(),
+        };
+        zenoh::Wait::wait(query.reply(key, message)).unwrap();
+    };
+    session.declare_queryable("quad/**").complete(true).callback(answer).await.unwrap()
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn whoever_answers_in_the_learners_place_or_never_costs_nothing() {
+    let scratch = Scratch::new();
+    let endpoint = format!("tcp/127.0.0.1:{}", free_port());
+    let session = router(&endpoint).await;
+    let run = Name::new("run").unwrap();
+    let _impostor = impostor(&session, &run).await;
+    let setting = Setting { steps: 200, ..Setting::default() };
+    let evaluator = scratch.evaluator("loyal", &endpoint);
+    let page = evaluator.metrics();
+    let start = Instant::now();
+    let mut learner = scratch.learner_with("run", setting, &["--connect", &endpoint]);
+    let status = learner.process.wait(PATIENCE);
+    let took = start.elapsed();
+    assert!(status.success(), "the learner ended with {status}");
+    learner.assert_complete(&setting);
+    // Twenty jobs, each claimed and delivered: with five seconds for each question that somebody does not answer, minutes.
+    assert!(took < Duration::from_secs(40), "{took:?}");
+    let page = http::metrics(&page).unwrap();
+    assert!(http::sum(&page, "quad_evaluator_rejected_messages_total", "reason=\"other_incarnation\"") > 3.0, "{page}");
+    assert_eq!(http::sum(&page, "quad_evaluator_jobs_total", "outcome=\"abandoned\""), 0.0, "no score was dropped");
+}
+
+/// Messages that a learner can read, as fast as they can be sent, and evaluators that come and go.
+async fn flood(session: &Session, run: &Name, stop: &AtomicBool) {
+    let progress = |number: u64| Progress {
+        evaluator: Name::new(format!("flood-{number}")).unwrap(),
+        run: run.clone(),
+        incarnation: 1,
+        job: 1,
+        step: 10,
+        episodes_done: 0,
+        episodes_total: 5,
+        steps_done: number,
+        environment_steps: number,
+        episodes: 0,
+        proof: Hash::of(b"guessed"),
+    };
+    let lie = |number: u64| ScoreReport {
+        evaluator: Name::new("liar").unwrap(),
+        run: run.clone(),
+        incarnation: 1,
+        job: 1,
+        step: 10 + number % 2,
+        weights: Hash::of(b"guessed"),
+        precision: Name::new("f32").unwrap(),
+        episodes: vec![EpisodeScore { seed: number, episode_return: f64::NAN, length: 0, score: f64::NAN }],
+        cannot_act: None,
+    };
+    let mut number = 0;
+    let mut tokens = Vec::new();
+    while !stop.load(Ordering::Relaxed) {
+        number += 1;
+        session.put(format!("quad/{run}/progress/flood"), encode(&progress(number)).unwrap()).await.unwrap();
+        let mut elsewhere = claim(&format!("flood-{number}"), number);
+        if let JobRequest::Claim { environments, .. } = &mut elsewhere {
+            *environments = vec!["moon".to_owned()];
+        }
+        for (key, message) in
+            [(keys::jobs(run), encode(&elsewhere).unwrap()), (keys::scores(run), encode(&lie(number)).unwrap())]
+        {
+            session.get(key).payload(message).timeout(Duration::from_secs(1)).callback(drop).await.unwrap();
+        }
+        let name = Name::new(format!("flood-{number}")).unwrap();
+        tokens.push(session.liveliness().declare_token(keys::live_evaluator(run, &name)).await.unwrap());
+        if tokens.len() >= 3000 {
+            tokens.clear();
+        }
+    }
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn a_flood_takes_bounded_memory_and_the_run_completes() {
+    let scratch = Scratch::new();
+    let endpoint = format!("tcp/127.0.0.1:{}", free_port());
+    let session = router(&endpoint).await;
+    let run = Name::new("run").unwrap();
+    let setting = Setting { steps: 40, eval_interval: 10, ..Setting::default() };
+    let mut learner = scratch.learner_with("run", setting, &["--connect", &endpoint]);
+    learner.process.wait_for_log("training is done", PATIENCE);
+    let quiet = learner.process.peak_memory();
+
+    let stop = AtomicBool::new(false);
+    let page = learner.metrics();
+    let work = async {
+        tokio::task::block_in_place(|| {
+            for reason in ["unknown_incarnation", "unknown_weights", "unknown_step", "too_many_evaluators"] {
+                eventually(&format!("the learner counts {reason}"), PATIENCE, || {
+                    let label = format!("reason=\"{reason}\"");
+                    let page = http::metrics(&page)?;
+                    (http::sum(&page, "quad_learner_rejected_messages_total", &label) > 100.0).then_some(())
+                });
+            }
+            let evaluator = scratch.evaluator("steady", &endpoint);
+            eventually("the first scores", PATIENCE, || (!learner.scores().is_empty()).then_some(()));
+            let flooded = learner.process.peak_memory();
+            let status = learner.process.wait(PATIENCE);
+            assert!(status.success(), "the learner ended with {status}");
+            drop(evaluator);
+            stop.store(true, Ordering::Relaxed);
+            flooded
+        })
+    };
+    let (flooded, ()) = tokio::join!(work, async {
+        let (session, run, stop) = (session.clone(), run.clone(), &stop);
+        flood(&session, &run, stop).await;
+    });
+    learner.assert_complete(&setting);
+    let growth = flooded.saturating_sub(quiet) >> 20;
+    assert!(growth < 200, "the flood took {growth} MiB");
+    let lines = learner.process.log().lines().count();
+    assert!(lines < 300, "{lines} lines in the log");
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn of_two_learners_under_one_name_the_second_says_so_and_stops() {
+    let [one, other] = [Scratch::new(), Scratch::new()];
+    let endpoint = format!("tcp/127.0.0.1:{}", free_port());
+    let _session = router(&endpoint).await;
+    let endless = Setting { steps: 100_000_000, eval_interval: 500, ..Setting::default() };
+    let mut first = one.learner_with("run", endless, &["--connect", &endpoint]);
+    first.process.wait_for_log("its metrics at", PATIENCE);
+    let mut second = other.learner_with("run", endless, &["--connect", &endpoint]);
+    let status = second.process.wait(PATIENCE);
+    let log = second.process.log();
+    assert!(!status.success() && log.contains("there is another learner of run run"), "{status}: {log}");
+    assert!(log.contains("hint: choose another name for the folder with --run-dir"), "{log}");
+    let _evaluator = one.evaluator("shared", &endpoint);
+    eventually("the first is evaluated", PATIENCE, || (!first.scores().is_empty()).then_some(()));
+    assert!(first.process.is_running());
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn of_two_learners_under_one_name_that_start_at_once_one_stops() {
+    let scratches = [Scratch::new(), Scratch::new()];
+    let endpoint = format!("tcp/127.0.0.1:{}", free_port());
+    let endless = Setting { steps: 100_000_000, eval_interval: 500, ..Setting::default() };
+    let mut learners =
+        scratches.each_ref().map(|scratch| scratch.learner_with("run", endless, &["--connect", &endpoint]));
+    // Both wait for the router, and so come together.
+    std::thread::sleep(Duration::from_secs(2));
+    let _session = router(&endpoint).await;
+    eventually("one of them stops", PATIENCE, || {
+        learners.iter_mut().any(|learner| !learner.process.is_running()).then_some(())
+    });
+    let _evaluator = scratches[0].evaluator("shared", &endpoint);
+    eventually("the other is evaluated", PATIENCE, || {
+        learners.iter().any(|learner| !learner.scores().is_empty()).then_some(())
+    });
+    let running = learners.iter_mut().filter_map(|learner| learner.process.is_running().then_some(())).count();
+    assert_eq!(running, 1);
+    let said = learners.iter().filter(|learner| learner.process.log().contains("there is another learner")).count();
+    assert_eq!(said, 1);
 }

@@ -1,6 +1,6 @@
 //! Finds the runs: every learner announces its run with a liveliness token.
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 use std::convert::Infallible;
 
 use anyhow::Context;
@@ -8,17 +8,33 @@ use quad_protocol::{Name, keys};
 use quad_service::{Endpoints, open_session};
 use tokio::sync::watch;
 use tokio::task::JoinSet;
-use tracing::{info, warn};
+use tracing::{debug, info, warn};
 use zenoh::Session;
-use zenoh::sample::SampleKind;
+use zenoh::sample::{Sample, SampleKind};
+
+use crate::metrics::Metrics;
+
+/// Most runs that are served at a time, and most learners of one run that are told apart: for floods of made-up ones.
+const MOST_RUNS: usize = 64;
+const MOST_LIVES: usize = 8;
 
 /// A run as one endpoint shows it: the endpoint's place on the command line, and the run's name.
 ///
 /// Seen through two endpoints, a run is served through both: either may fail on its own.
 pub type RunKey = (usize, Name);
 
-/// The runs whose learner is there, and the session that reaches it.
-pub type Runs = BTreeMap<RunKey, Session>;
+/// A run whose learner is there.
+#[derive(Clone)]
+pub struct Found {
+    /// The session that reaches it.
+    pub session: Session,
+    /// The incarnations that announce themselves, at least one: a learner that was cut off or killed may still seem to be
+    /// there when the next one starts.
+    pub lives: BTreeSet<u64>,
+}
+
+/// The runs that are there.
+pub type Runs = BTreeMap<RunKey, Found>;
 
 /// Watches every endpoint for as long as it lives.
 pub struct Discovery {
@@ -31,11 +47,11 @@ impl Discovery {
     ///
     /// Each endpoint gets a session of its own, because a Zenoh client keeps one connection: with one session,
     /// a second learner's endpoint would only be a spare for the first.
-    pub fn start(endpoints: Vec<String>) -> Discovery {
+    pub fn start(endpoints: Vec<String>, metrics: &Metrics) -> Discovery {
         let (found, runs) = watch::channel(Runs::new());
         let mut tasks = JoinSet::new();
         for (index, endpoint) in endpoints.into_iter().enumerate() {
-            tasks.spawn(watch_endpoint(index, endpoint, found.clone()));
+            tasks.spawn(watch_endpoint(index, endpoint, found.clone(), metrics.clone()));
         }
         Discovery { runs, tasks }
     }
@@ -56,7 +72,12 @@ impl Discovery {
     }
 }
 
-async fn watch_endpoint(index: usize, endpoint: String, found: watch::Sender<Runs>) -> anyhow::Result<Infallible> {
+async fn watch_endpoint(
+    index: usize,
+    endpoint: String,
+    found: watch::Sender<Runs>,
+    metrics: Metrics,
+) -> anyhow::Result<Infallible> {
     info!(endpoint, "waiting for a learner or a router");
     let session = open_session(&Endpoints { listen: Vec::new(), connect: vec![endpoint.clone()] }).await?;
     info!(endpoint, "connected");
@@ -67,22 +88,50 @@ async fn watch_endpoint(index: usize, endpoint: String, found: watch::Sender<Run
         .await
         .map_err(|error| anyhow::anyhow!(error))
         .with_context(|| format!("cannot look for learners at {endpoint}"))?;
+    let mut warned = false;
     loop {
         let token =
             tokens.recv_async().await.map_err(|error| anyhow::anyhow!(error)).context("the Zenoh session closed")?;
-        let Some(run) = keys::run_of(token.key_expr().as_str()) else {
-            warn!(key = %token.key_expr(), "a learner announced itself under a name that is not allowed");
-            continue;
-        };
-        found.send_modify(|runs| match token.kind() {
-            SampleKind::Put => {
-                info!(%run, endpoint, "found a run");
-                runs.insert((index, run), session.clone());
-            }
-            SampleKind::Delete => {
-                info!(%run, endpoint, "the run's learner is gone");
-                runs.remove(&(index, run));
+        let mut problem = None;
+        found.send_if_modified(|runs| match follow(runs, index, &session, &token) {
+            Ok(changed) => changed,
+            Err(label) => {
+                problem = Some(label);
+                false
             }
         });
+        let Some(label) = problem else { continue };
+        metrics.rejected(label);
+        match std::mem::replace(&mut warned, true) {
+            false => warn!(endpoint, key = %token.key_expr(), label, "a learner is not served; more are only counted"),
+            true => debug!(endpoint, key = %token.key_expr(), label, "a learner is not served"),
+        }
+    }
+}
+
+/// Takes in a token; says whether the runs have changed, or why it is not taken in.
+fn follow(runs: &mut Runs, index: usize, session: &Session, token: &Sample) -> Result<bool, &'static str> {
+    let key = token.key_expr().as_str();
+    let (run, incarnation) = keys::run_of(key).zip(keys::incarnation_of(key)).ok_or("invalid_name")?;
+    let place = (index, run.clone());
+    let count = runs.len();
+    match (token.kind(), runs.get_mut(&place)) {
+        (SampleKind::Put, None) if count >= MOST_RUNS => Err("too_many_runs"),
+        (SampleKind::Put, None) => {
+            info!(%run, incarnation, "found a run");
+            runs.insert(place, Found { session: session.clone(), lives: BTreeSet::from([incarnation]) });
+            Ok(true)
+        }
+        (SampleKind::Put, Some(found)) if found.lives.len() >= MOST_LIVES => Err("too_many_learners"),
+        (SampleKind::Put, Some(found)) => Ok(found.lives.insert(incarnation)),
+        (SampleKind::Delete, None) => Ok(false),
+        (SampleKind::Delete, Some(found)) => {
+            let changed = found.lives.remove(&incarnation);
+            if found.lives.is_empty() {
+                info!(%run, incarnation, "the run's learner is gone");
+                runs.remove(&place);
+            }
+            Ok(changed)
+        }
     }
 }

@@ -1,19 +1,25 @@
 //! One job: all of its episodes as one batch, on a thread of its own.
 
 use std::sync::Arc;
-use std::sync::atomic::{AtomicBool, AtomicU32, Ordering::Relaxed};
+use std::sync::atomic::{AtomicBool, AtomicU32, AtomicU64, Ordering::Relaxed};
 use std::time::{Duration, Instant};
 
 use anyhow::Context;
 use quad_dataset::environment::{self, EnvironmentSpec, UnknownEnvironment};
-use quad_policy::{ActionNoise, Policy};
+use quad_policy::{ActionNoise, Cost, Policy};
 use quad_protocol::{EpisodeScore, Job, Name};
 
 use crate::metrics::{JobOutcome, Metrics};
 use crate::rollout::{EpisodeOutcome, Rollout};
 
-/// Most rows (episodes × candidates) of one network call; they bound an evaluator's memory. The paper's job has 100.
+/// Most rows (episodes × candidates) of one network call. The paper's job has 100.
 const MAX_ROWS: usize = 65_536;
+/// Most episodes: each is a simulation of its own. A learner gives five.
+const MAX_EPISODES: usize = 256;
+/// Most memory that one network call may take, bytes.
+const MAX_BYTES: u64 = 1 << 30;
+/// Most multiplications of one network call, which cannot be broken off: a minute on a slow core. The paper's have 10⁹.
+const MAX_PRODUCTS: u64 = 1 << 40;
 
 /// Why a job is not run.
 #[derive(Debug, thiserror::Error)]
@@ -22,13 +28,29 @@ pub enum JobError {
     #[error("it is for run {0}")]
     Run(Name),
     /// It is empty, or larger than this evaluator runs.
-    #[error("it has {episodes} episodes with {candidates} candidates; 1 to {MAX_ROWS} in all are run")]
+    #[error(
+        "it has {episodes} episodes with {candidates} candidates; at most {MAX_EPISODES} episodes and {MAX_ROWS} \
+         candidates in all are run"
+    )]
     Size {
         /// Its episodes.
         episodes: usize,
         /// Candidates per state.
         candidates: u32,
     },
+    /// Its policy would take more memory or time for each step of the episodes than this evaluator gives.
+    #[error(
+        "each of its steps takes {bytes} bytes and {products} multiplications; {MAX_BYTES} and {MAX_PRODUCTS} are given"
+    )]
+    Cost {
+        /// Memory, bytes.
+        bytes: u64,
+        /// Multiplications.
+        products: u64,
+    },
+    /// It took too long.
+    #[error("its episodes did not end within {} s", Job::LONGEST.as_secs())]
+    TooLong,
     /// Its environment is not known.
     #[error(transparent)]
     Environment(#[from] UnknownEnvironment),
@@ -39,7 +61,8 @@ impl JobError {
     pub fn label(&self) -> &'static str {
         match self {
             JobError::Run(_) => "other_run",
-            JobError::Size { .. } => "job_size",
+            JobError::Size { .. } | JobError::Cost { .. } => "job_size",
+            JobError::TooLong => "too_long",
             JobError::Environment(_) => "schema",
         }
     }
@@ -51,10 +74,20 @@ pub fn check(job: &Job, run: &Name) -> Result<&'static EnvironmentSpec, JobError
         return Err(JobError::Run(job.run.clone()));
     }
     let (episodes, candidates) = (job.seeds.len(), job.candidates);
-    if !(1..=MAX_ROWS).contains(&episodes.saturating_mul(candidates as usize)) {
+    let rows = episodes.saturating_mul(candidates as usize);
+    if !(1..=MAX_ROWS).contains(&rows) || episodes > MAX_EPISODES {
         return Err(JobError::Size { episodes, candidates });
     }
     Ok(environment::find(&job.environment)?)
+}
+
+/// Checks what a job takes with its policy.
+pub fn check_cost(job: &Job, policy: &dyn Policy) -> Result<(), JobError> {
+    let Cost { bytes, products } = policy.cost(job.seeds.len(), job.candidates as usize);
+    if bytes > MAX_BYTES || products > MAX_PRODUCTS {
+        return Err(JobError::Cost { bytes, products });
+    }
+    Ok(())
 }
 
 /// What the thread that runs a job and the task that watches it share.
@@ -62,6 +95,7 @@ pub fn check(job: &Job, run: &Name) -> Result<&'static EnvironmentSpec, JobError
 struct Shared {
     cancelled: AtomicBool,
     episodes_done: AtomicU32,
+    steps_done: AtomicU64,
 }
 
 /// A job that is being run. Dropped before its end, it stops within one step of the batch and counts as abandoned.
@@ -87,6 +121,11 @@ impl Running {
     /// Episodes that have ended.
     pub fn episodes_done(&self) -> u32 {
         self.shared.episodes_done.load(Relaxed)
+    }
+
+    /// Environment steps so far.
+    pub fn steps_done(&self) -> u64 {
+        self.shared.steps_done.load(Relaxed)
     }
 
     /// Waits up to `patience` for the end; `None` if it is not there yet.
@@ -123,11 +162,16 @@ fn roll_out(
     shared: &Shared,
     metrics: &Metrics,
 ) -> anyhow::Result<Option<Vec<EpisodeOutcome>>> {
+    let started = Instant::now();
     let mut rollout = Rollout::new(spec, job.instance, &job.seeds, ActionNoise::new)?;
     let candidates = job.candidates as usize;
     while !rollout.is_done() {
         if shared.cancelled.load(Relaxed) {
             return Ok(None);
+        }
+        if started.elapsed() > Job::LONGEST {
+            metrics.rejected(JobError::TooLong.label());
+            return Err(JobError::TooLong.into());
         }
         let steps = rollout.environment_steps();
         let times = [rollout.select_time(), rollout.physics_time()];
@@ -141,6 +185,7 @@ fn roll_out(
         let ended = rollout.episodes_done() - done;
         metrics.episodes.inc_by(ended as u64);
         shared.episodes_done.fetch_add(ended as u32, Relaxed);
+        shared.steps_done.store(rollout.environment_steps(), Relaxed);
     }
     Ok(Some(rollout.into_outcomes()))
 }
@@ -148,4 +193,64 @@ fn roll_out(
 fn episode_score(outcome: &EpisodeOutcome) -> EpisodeScore {
     let EpisodeOutcome { seed, episode_return, length, score, .. } = *outcome;
     EpisodeScore { seed, episode_return, length, score }
+}
+
+#[cfg(test)]
+mod tests {
+    use quad_policy::{
+        DiffusionPolicy, DiffusionShape, Ensemble, Layout, NoisePredictor, Precision, Weights, load_policy,
+    };
+    use quad_protocol::{Hash, Lease};
+
+    use super::*;
+
+    fn job(episodes: usize, candidates: u32) -> Job {
+        Job {
+            id: 1,
+            lease: Lease::random(),
+            run: Name::new("run").unwrap(),
+            incarnation: 1,
+            step: 1,
+            weights: Hash::of(b""),
+            environment: "hopper".to_owned(),
+            instance: 1,
+            seeds: (0..episodes as u64).collect(),
+            candidates,
+            lease_milliseconds: 1000,
+        }
+    }
+
+    fn policy(hidden: usize, critics: usize, diffusion_steps: usize) -> Box<dyn Policy> {
+        let shape = DiffusionShape { observation_dim: 11, action_dim: 3, hidden, critics, diffusion_steps };
+        let zeros = |layout: Layout| {
+            let values = candle_core::Tensor::zeros(layout.count(), candle_core::DType::F32, &candle_core::Device::Cpu);
+            Weights::constant(layout, values.unwrap())
+        };
+        let actor = NoisePredictor::new(shape.actor(), zeros(shape.actor().layout()), Precision::F32);
+        let ensemble = Ensemble::new(shape.critics(), zeros(shape.critics().layout()), Precision::F32);
+        let tensors = DiffusionPolicy::tensors(&actor, &ensemble).unwrap();
+        load_policy(&quad_policy::Description::Diffusion(shape).to_safetensors(&tensors).unwrap(), Precision::F32)
+            .unwrap()
+    }
+
+    #[test]
+    fn a_job_has_a_size_that_somebody_can_mean() {
+        let run = Name::new("run").unwrap();
+        let label = |episodes, candidates| check(&job(episodes, candidates), &run).err().map(|error| error.label());
+        assert_eq!([label(1, 1), label(10, 50), label(256, 256)], [None; 3]);
+        for (episodes, candidates) in [(0, 1), (1, 0), (1, u32::MAX), (256, 257), (257, 1), (65_536, 1)] {
+            assert_eq!(label(episodes, candidates), Some("job_size"), "{episodes} × {candidates}");
+        }
+    }
+
+    /// A file of some megabytes asks for 17 GB: a value of each of 65,535 tiny critics for each of 65,536 candidates.
+    #[test]
+    fn memory_and_time_of_a_policy_are_known_before_they_are_spent() {
+        assert!(check_cost(&job(10, 50), policy(256, 10, 5).as_ref()).is_ok(), "the paper's");
+        assert!(check_cost(&job(1, 1), policy(1, 65_535, 1).as_ref()).is_ok());
+        let many_critics = check_cost(&job(256, 256), policy(1, 65_535, 1).as_ref());
+        assert!(matches!(many_critics, Err(JobError::Cost { bytes: 17_000_000_000.., .. })), "{many_critics:?}");
+        let slow = check_cost(&job(256, 256), policy(512, 1, 1000).as_ref());
+        assert!(matches!(slow, Err(JobError::Cost { products: 10_000_000_000_000.., .. })), "{slow:?}");
+    }
 }

@@ -7,19 +7,23 @@
 //! - `discovery`: finds the runs, by their learners' liveliness tokens.
 //! - `worker`: the main loop, which serves the runs in turn.
 //! - `run`: everything that is exchanged with the learner of one run; `query`: a query to a learner.
-//! - `receiver`: receives snapshots and makes policies of them.
+//! - `snapshots`: keeps the newest snapshot of a run, within a `budget`; `loading`: makes a policy of one.
 //! - `job`: all episodes of a job, as one batch.
 //!
-//! An evaluator has no state that must last. If it is killed, its job goes to another evaluator when the lease runs out.
+//! An evaluator has no state that must last. When it is told to leave, it hands its job back; if it is killed, the job goes to
+//! another evaluator when the lease runs out.
 
+mod budget;
 mod discovery;
 mod job;
+mod loading;
 mod query;
-mod receiver;
 mod run;
+mod snapshots;
 mod worker;
 
 use std::net::SocketAddr;
+use std::sync::PoisonError;
 use std::time::Duration;
 
 use anyhow::Context;
@@ -63,7 +67,9 @@ pub struct ServeArgs {
     precision: Option<Precision>,
 }
 
-/// When it is told to stop, the process waits this long for its threads and for the session to close.
+/// When it is told to stop, it hands its job back within this time.
+const HAND_BACK: Duration = Duration::from_secs(1);
+/// Then the process waits this long for its threads and for the session to close.
 const LEAVE: Duration = Duration::from_secs(1);
 
 /// Serves until SIGINT or SIGTERM.
@@ -100,15 +106,22 @@ async fn serve_until_stopped(args: ServeArgs) -> anyhow::Result<()> {
         }
         None => None,
     };
-    let mut discovery = Discovery::start(args.connect);
-    let worker = Worker::new(name, precision, metrics.clone(), discovery.runs());
+    let mut discovery = Discovery::start(args.connect, &metrics);
+    let worker = Worker::new(name, precision, metrics.clone(), discovery.runs())?;
+    let held = worker.held();
+    let mut work = std::pin::pin!(worker.run());
     let result = tokio::select! {
         biased;
         () = stop => Ok(()),
         // Before the worker, which fails as a consequence when this has failed.
         error = discovery.failed() => Err(error),
-        error = worker.run() => Err(error),
+        error = &mut work => Err(error),
     };
+    // While the worker still is there, and with it what announces this evaluator: without, the job would count as lost.
+    let job = held.lock().unwrap_or_else(PoisonError::into_inner).take();
+    if let Some(job) = job {
+        job.send(HAND_BACK).await;
+    }
     let (episodes, steps) = (metrics.episodes.get(), metrics.environment_steps.get());
     info!(episodes, steps, "leaving");
     result

@@ -1,10 +1,13 @@
 //! A query to a learner.
 
+use std::sync::{Arc, Mutex, PoisonError};
 use std::time::Duration;
 
-use quad_protocol::{CodecError, Message, decode_from};
-use tracing::warn;
+use quad_protocol::{Message, decode_from};
+use tokio::sync::oneshot;
+use tracing::{debug, warn};
 use zenoh::Session;
+use zenoh::query::{ConsolidationMode, QueryTarget, Reply};
 
 use crate::metrics::Metrics;
 
@@ -17,13 +20,13 @@ pub enum AskError {
         /// The key that was asked.
         key: String,
     },
-    /// The answer is not the message that the protocol prescribes.
-    #[error("unusable answer at {key}")]
+    /// What came was not the answer of the learner that was asked.
+    #[error("unusable answer at {key}: {reason}")]
     Unusable {
         /// The key that was asked.
         key: String,
         /// What is wrong with the answer.
-        source: CodecError,
+        reason: String,
     },
     /// Zenoh could not send the question.
     #[error("cannot ask {key}: {source}")]
@@ -35,41 +38,90 @@ pub enum AskError {
     },
 }
 
-/// Sends `question` to `key` and gives the first answer that can be decoded.
-pub async fn ask<A: Message>(
+/// What one question gathers.
+struct Gathered<A> {
+    /// Gone as soon as there is an answer.
+    tell: Option<oneshot::Sender<A>>,
+    unusable: Option<String>,
+}
+
+/// Sends `question` to everybody at `key` and gives the first answer that can be decoded and is `fitting`, which gives the
+/// metric's label of what is wrong with one that is not. Whoever else answers, or never does, is not waited for.
+pub async fn ask<A: Message + Send + 'static>(
     session: &Session,
     key: String,
     question: Vec<u8>,
     timeout: Duration,
     metrics: &Metrics,
+    fitting: impl Fn(&A) -> Result<(), &'static str> + Send + Sync + 'static,
 ) -> Result<A, AskError> {
-    let replies = match session.get(&key).payload(question).timeout(timeout).await {
-        Ok(replies) => replies,
-        Err(source) => return Err(AskError::Send { key, source }),
-    };
-    let mut unusable = None;
-    // The channel closes when everybody has answered, at once where nobody does.
-    while let Ok(reply) = replies.recv_async().await {
-        match reply.result() {
-            Ok(sample) => match decode_from(sample.payload().len(), sample.payload().reader()) {
-                Ok(answer) => return Ok(answer),
-                Err(error) => {
-                    metrics.rejected(error.label());
-                    unusable = Some(error);
+    let (tell, told) = oneshot::channel();
+    let gathered = Arc::new(Mutex::new(Gathered { tell: Some(tell), unusable: None }));
+    let callback = {
+        // Only the callback holds the sender, so that it goes when nobody can answer any more.
+        let (gathered, metrics, key) = (gathered.clone(), metrics.clone(), key.clone());
+        let end = EndOfAnswers(gathered.clone());
+        move |reply: Reply| {
+            let gathered = &mut *end.0.lock().unwrap_or_else(PoisonError::into_inner);
+            if gathered.tell.is_none() {
+                return;
+            }
+            match read(&reply, &key, &metrics, &fitting) {
+                Ok(answer) => {
+                    // The asker may have gone.
+                    gathered.tell.take().and_then(|tell| tell.send(answer).ok());
                 }
-            },
-            Err(error) => {
-                let text = error.payload().to_bytes();
-                warn!(
-                    key,
-                    "the learner answered with an error: {}",
-                    String::from_utf8_lossy(&text[..text.len().min(200)])
-                );
+                Err(reason) => gathered.unusable = Some(reason),
             }
         }
+    };
+    // All, not the best matching: that would be whoever claims to be complete. None, because consolidation would hold
+    // answers back until everybody has answered.
+    let get = session.get(&key).payload(question).timeout(timeout);
+    let sent = get.target(QueryTarget::All).consolidation(ConsolidationMode::None).callback(callback).await;
+    sent.map_err(|source| AskError::Send { key: key.clone(), source })?;
+    match told.await {
+        Ok(answer) => Ok(answer),
+        Err(_) => match gathered.lock().unwrap_or_else(PoisonError::into_inner).unusable.take() {
+            Some(reason) => Err(AskError::Unusable { key, reason }),
+            None => Err(AskError::Silent { key }),
+        },
     }
-    Err(match unusable {
-        Some(source) => AskError::Unusable { key, source },
-        None => AskError::Silent { key },
-    })
+}
+
+/// Dropped with the callback, after the last answer or the timeout: ends the asker's wait.
+struct EndOfAnswers<A>(Arc<Mutex<Gathered<A>>>);
+
+impl<A> Drop for EndOfAnswers<A> {
+    fn drop(&mut self) {
+        self.0.lock().unwrap_or_else(PoisonError::into_inner).tell = None;
+    }
+}
+
+fn read<A: Message>(
+    reply: &Reply,
+    key: &str,
+    metrics: &Metrics,
+    fitting: &impl Fn(&A) -> Result<(), &'static str>,
+) -> Result<A, String> {
+    match reply.result() {
+        Ok(sample) => {
+            let answer = decode_from(sample.payload().len(), sample.payload().reader()).map_err(|error| {
+                metrics.rejected(error.label());
+                error.to_string()
+            })?;
+            fitting(&answer).map_err(|label| {
+                metrics.rejected(label);
+                debug!(key, label, "an answer that is not for this question");
+                format!("it is not from the learner that was asked ({label})")
+            })?;
+            Ok(answer)
+        }
+        Err(error) => {
+            let text = error.payload().to_bytes();
+            let text = String::from_utf8_lossy(&text[..text.len().min(200)]).into_owned();
+            warn!(key, "the learner answered with an error: {text}");
+            Err(text)
+        }
+    }
 }

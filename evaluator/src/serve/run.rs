@@ -1,75 +1,130 @@
 //! Everything that is exchanged with the learner of one run: jobs, snapshots, progress, scores.
 
+use std::collections::BTreeSet;
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use anyhow::Context;
-use quad_protocol::{Job, JobReply, JobRequest, Name, Progress, ScoreReply, ScoreReport, Snapshot, encode, keys};
+use quad_protocol::{
+    Hash, Job, JobReply, JobRequest, Name, Progress, ScoreReply, ScoreReport, Snapshot, WeightsRequest, encode, keys,
+};
+use rand::Rng;
 use tokio::sync::Notify;
-use tracing::{info, warn};
+use tracing::{debug, info, warn};
 use zenoh::Session;
 use zenoh::liveliness::LivelinessToken;
 
-use super::query::{AskError, ask};
-use super::receiver::SnapshotReceiver;
+use super::budget::Budget;
+use super::discovery::Found;
+use super::query::ask;
+use super::snapshots::SnapshotReceiver;
 use crate::metrics::{JobOutcome, Metrics};
 
 /// A learner answers in milliseconds; one that takes this long hangs, and other runs wait behind it.
 const ANSWER_TIMEOUT: Duration = Duration::from_secs(5);
 /// The same for a snapshot, which has megabytes to carry over whatever network there is.
 const WEIGHTS_TIMEOUT: Duration = Duration::from_secs(30);
-/// First and longest pause after a learner did not answer though it is connected.
+/// First and longest pause after a learner did not answer though it is connected, or its job came to nothing.
 const BACK_OFF: [Duration; 2] = [Duration::from_millis(250), Duration::from_secs(5)];
 /// Bounds of the pause that a learner without work may ask for: one too short would be a flood of questions, one too
 /// long would lose the evaluator.
 const WAIT: [Duration; 2] = [Duration::from_millis(20), Duration::from_secs(5)];
 
+/// Who an evaluator is to every learner.
+#[derive(Clone)]
+pub struct Identity {
+    /// Its name.
+    pub evaluator: Name,
+    /// The arithmetic that it computes policies in.
+    pub precision: Name,
+}
+
 /// An evaluator's side of one run.
 pub struct RunClient {
     run: Name,
-    evaluator: Name,
+    identity: Identity,
     session: Session,
     metrics: Metrics,
     snapshots: SnapshotReceiver,
+    /// Whose answers are believed.
+    incarnation: u64,
+    /// Of the claim that has no answer yet.
+    attempt: Option<u64>,
     /// Scores that the learner has not acknowledged. While there are some, nothing new is asked for.
     undelivered: Option<ScoreReport>,
     ready_at: Instant,
     back_off: Duration,
+    /// Time that was spent on this run.
+    used: Duration,
+    /// What was last complained about, so that it is not said again and again.
+    complaint: String,
     _token: LivelinessToken,
 }
 
 impl RunClient {
-    /// Subscribes to the run's snapshots and announces `evaluator` in it; `snapshot_arrived` is told of each new one.
+    /// Subscribes to the run's snapshots and announces the evaluator in it; `snapshot_arrived` is told of each new one.
     pub async fn attach(
-        session: Session,
         run: Name,
-        evaluator: Name,
+        found: &Found,
+        identity: Identity,
         metrics: Metrics,
-        snapshot_arrived: Arc<Notify>,
+        (snapshot_arrived, budget): (Arc<Notify>, Budget),
     ) -> anyhow::Result<RunClient> {
+        let session = found.session.clone();
         let readable = |error: zenoh::Error| anyhow::anyhow!(error);
-        let snapshots = SnapshotReceiver::listen(&session, run.clone(), metrics.clone(), snapshot_arrived)
+        let snapshots = SnapshotReceiver::listen(&session, run.clone(), metrics.clone(), snapshot_arrived, budget)
             .await
             .map_err(readable)
             .with_context(|| format!("cannot listen to the snapshots of run {run}"))?;
         let token = session
             .liveliness()
-            .declare_token(keys::live_evaluator(&run, &evaluator))
+            .declare_token(keys::live_evaluator(&run, &identity.evaluator))
             .await
             .map_err(readable)
             .with_context(|| format!("cannot announce this evaluator in run {run}"))?;
-        let (ready_at, back_off) = (Instant::now(), BACK_OFF[0]);
-        Ok(RunClient {
+        let mut client = RunClient {
             run,
-            evaluator,
+            identity,
             session,
             metrics,
             snapshots,
+            incarnation: 0,
+            attempt: None,
             undelivered: None,
-            ready_at,
-            back_off,
+            ready_at: Instant::now(),
+            back_off: BACK_OFF[0],
+            used: Duration::ZERO,
+            complaint: String::new(),
             _token: token,
-        })
+        };
+        client.follow(&found.lives);
+        Ok(client)
+    }
+
+    /// Follows the learner that it follows already, if that is among these; else the one that was started first, because of two
+    /// learners of one name the later one stops.
+    pub fn follow(&mut self, lives: &BTreeSet<u64>) {
+        if let Some(&first) = lives.first()
+            && !lives.contains(&self.incarnation)
+        {
+            self.turn_to(first);
+        }
+    }
+
+    /// Follows the next of several, because this one does not answer.
+    pub fn follow_next(&mut self, lives: &BTreeSet<u64>) {
+        let next = lives.range(self.incarnation.saturating_add(1)..).next().or(lives.first());
+        if let Some(&next) = next.filter(|next| **next != self.incarnation) {
+            self.turn_to(next);
+        }
+    }
+
+    fn turn_to(&mut self, incarnation: u64) {
+        debug!(run = %self.run, incarnation, "following a learner");
+        self.incarnation = incarnation;
+        self.attempt = None;
+        self.snapshots.follow(incarnation);
+        self.wake();
     }
 
     /// When the learner may be asked again.
@@ -77,16 +132,45 @@ impl RunClient {
         self.ready_at
     }
 
-    /// Lets the learner be asked again at once, because something has changed.
+    /// Time that was spent on this run, compared with others.
+    pub fn used(&self) -> Duration {
+        self.used
+    }
+
+    /// Counts time that was spent on it.
+    pub fn spend(&mut self, time: Duration) {
+        self.used += time;
+    }
+
+    /// Lets the learner be asked again at once, because it is there again.
     pub fn wake(&mut self) {
         self.ready_at = Instant::now();
         self.back_off = BACK_OFF[0];
     }
 
-    /// Asks the learner nothing for a while, which is longer each time.
-    pub fn back_off(&mut self) {
+    /// Lets the learner be asked at once if it has published a snapshot, unless something went wrong with it before.
+    pub fn wake_for_snapshot(&mut self) {
+        if self.snapshots.take_news() && self.back_off == BACK_OFF[0] {
+            self.ready_at = Instant::now();
+        }
+    }
+
+    /// Asks the learner nothing for a while, which is longer each time. Says why, unless it is the same as the last time.
+    pub fn back_off(&mut self, error: &anyhow::Error) {
+        let complaint = format!("{error:#}");
+        match self.complaint == complaint {
+            false => warn!(run = %self.run, "{complaint}"),
+            true => debug!(run = %self.run, "{complaint}"),
+        }
+        self.complaint = complaint;
         self.ready_at = Instant::now() + self.back_off;
         self.back_off = (2 * self.back_off).min(BACK_OFF[1]);
+    }
+
+    /// Something worked again.
+    fn is_well(&mut self) {
+        self.back_off = BACK_OFF[0];
+        self.complaint.clear();
     }
 
     /// Whether scores wait for an acknowledgement.
@@ -94,36 +178,79 @@ impl RunClient {
         self.undelivered.is_some()
     }
 
-    /// Asks for a job; `None` when there is none now, or nobody to ask.
+    /// Asks for a job; `None` when there is none now.
     pub async fn claim(&mut self, environments: Vec<String>) -> anyhow::Result<Option<Job>> {
-        let request = encode(&JobRequest { evaluator: self.evaluator.clone(), environments })?;
-        let answer = ask(&self.session, keys::jobs(&self.run), request, ANSWER_TIMEOUT, &self.metrics).await?;
-        self.back_off = BACK_OFF[0];
+        let Identity { evaluator, precision } = self.identity.clone();
+        // The same number until there is an answer: if only that was lost, the job is not.
+        let attempt = *self.attempt.get_or_insert_with(|| rand::rng().random());
+        let request = encode(&JobRequest::Claim { evaluator, attempt, environments, precision })?;
+        let (run, incarnation) = (self.run.clone(), self.incarnation);
+        let fitting = move |reply: &JobReply| match reply {
+            reply if reply.incarnation() != incarnation => Err("other_incarnation"),
+            JobReply::Job(job) if job.run != run => Err("other_run"),
+            JobReply::HandedBack { .. } => Err("unexpected"),
+            _ => Ok(()),
+        };
+        let key = keys::jobs(&self.run);
+        let answer = ask(&self.session, key, request, ANSWER_TIMEOUT, &self.metrics, fitting).await?;
+        self.attempt = None;
         match answer {
             JobReply::Job(job) => Ok(Some(job)),
-            JobReply::Wait { milliseconds } => {
+            JobReply::Wait { milliseconds, .. } => {
+                self.is_well();
                 let wait = Duration::from_millis(milliseconds).clamp(WAIT[0], WAIT[1]);
                 self.ready_at = Instant::now() + wait;
                 Ok(None)
             }
+            JobReply::HandedBack { .. } => Ok(None),
+        }
+    }
+
+    /// What hands `job` back, also when this client is busy.
+    pub fn hand_back(&self, job: &Job) -> HandBack {
+        HandBack {
+            session: self.session.clone(),
+            metrics: self.metrics.clone(),
+            evaluator: self.identity.evaluator.clone(),
+            job: job.clone(),
         }
     }
 
     /// The snapshot that `job` names: as it was published, or asked for where that was missed.
-    pub async fn snapshot(&self, job: &Job) -> Result<Arc<Snapshot>, AskError> {
+    pub async fn snapshot(&self, job: &Job) -> anyhow::Result<Arc<Snapshot>> {
         if let Some(snapshot) = self.snapshots.get(job) {
             return Ok(snapshot);
         }
         let key = keys::weights_at(&self.run, job.step);
-        let snapshot = ask::<Snapshot>(&self.session, key, Vec::new(), WEIGHTS_TIMEOUT, &self.metrics).await?;
+        let request = encode(&WeightsRequest { evaluator: self.identity.evaluator.clone() })?;
+        let wanted = (job.run.clone(), job.incarnation, job.step, job.weights);
+        let fitting = move |found: &Snapshot| {
+            let (run, incarnation, step, weights) = &wanted;
+            let is_it = (&found.run, &found.incarnation, &found.step) == (run, incarnation, step);
+            if is_it && found.hash == *weights { Ok(()) } else { Err("other_snapshot") }
+        };
+        let snapshot: Snapshot = ask(&self.session, key, request, WEIGHTS_TIMEOUT, &self.metrics, fitting).await?;
         self.metrics.snapshots_received.inc();
         Ok(Arc::new(snapshot))
     }
 
     /// Reports progress to the learner. A lost message does not matter: the next one says the same and more.
-    pub async fn publish(&self, progress: &Progress) {
-        let key = keys::progress(&self.run, &self.evaluator);
-        let sent = match encode(progress) {
+    pub async fn publish(&self, job: &Job, (steps_done, episodes_done): (u64, u32)) {
+        let progress = Progress {
+            evaluator: self.identity.evaluator.clone(),
+            run: job.run.clone(),
+            incarnation: job.incarnation,
+            job: job.id,
+            step: job.step,
+            episodes_done,
+            episodes_total: job.seeds.len() as u32,
+            steps_done,
+            environment_steps: self.metrics.environment_steps.get(),
+            episodes: self.metrics.episodes.get(),
+            proof: Hash::of(&[]),
+        };
+        let key = keys::progress(&self.run, &self.identity.evaluator);
+        let sent = match encode(&progress.signed(&job.lease)) {
             Ok(message) => self.session.put(&key, message).await.map_err(|error| error.to_string()),
             Err(error) => Err(error.to_string()),
         };
@@ -137,28 +264,33 @@ impl RunClient {
         self.undelivered = Some(report);
     }
 
-    /// Delivers the scores that are kept. An error means that they are still kept.
+    /// Delivers the scores that are kept, to whichever life of the learner is there. An error means that they are still kept.
     pub async fn deliver(&mut self) -> anyhow::Result<()> {
         let Some(report) = &self.undelivered else { return Ok(()) };
-        let answer: ScoreReply =
-            ask(&self.session, keys::scores(&self.run), encode(report)?, ANSWER_TIMEOUT, &self.metrics).await?;
+        let incarnation = self.incarnation;
+        let fitting = move |reply: &ScoreReply| match reply.incarnation() == incarnation {
+            true => Ok(()),
+            false => Err("other_incarnation"),
+        };
+        let key = keys::scores(&self.run);
+        let answer = ask(&self.session, key, encode(report)?, ANSWER_TIMEOUT, &self.metrics, fitting).await?;
         let (run, step) = (&self.run, report.step);
         match answer {
             ScoreReply::Recorded { .. } if report.cannot_act.is_some() => {}
-            ScoreReply::Recorded { new, duplicates } => {
+            ScoreReply::Recorded { new, duplicates, .. } => {
                 let scores = report.episodes.iter().map(|episode| episode.score);
                 let mean = scores.clone().sum::<f64>() / report.episodes.len().max(1) as f64;
                 info!(%run, step, new, duplicates, "scores delivered, mean {mean:.2}");
                 scores.for_each(|score| self.metrics.episode_score.observe(score));
                 self.metrics.job(JobOutcome::Scored);
             }
-            ScoreReply::Refused { reason } => {
+            ScoreReply::Refused { reason, .. } => {
                 warn!(%run, step, "the learner refused the scores: {reason}");
                 self.metrics.job(JobOutcome::Abandoned);
             }
         }
         self.undelivered = None;
-        self.back_off = BACK_OFF[0];
+        self.is_well();
         Ok(())
     }
 
@@ -167,6 +299,32 @@ impl RunClient {
         if let Some(report) = self.undelivered {
             warn!(run = %self.run, step = report.step, "the learner did not come back for its scores");
             self.metrics.job(JobOutcome::Abandoned);
+        }
+    }
+}
+
+/// A job that is to be handed back, so that it need not wait for the end of its lease.
+pub struct HandBack {
+    session: Session,
+    metrics: Metrics,
+    evaluator: Name,
+    job: Job,
+}
+
+impl HandBack {
+    /// Hands it back, within `patience`. Best effort: without it, the lease runs out.
+    pub async fn send(self, patience: Duration) {
+        let Job { id, lease, run, incarnation, .. } = self.job;
+        let fitting = move |reply: &JobReply| match reply {
+            JobReply::HandedBack { incarnation: of, .. } if *of == incarnation => Ok(()),
+            JobReply::HandedBack { .. } => Err("other_incarnation"),
+            _ => Err("unexpected"),
+        };
+        let Ok(request) = encode(&JobRequest::HandBack { evaluator: self.evaluator, job: id, lease }) else { return };
+        match ask(&self.session, keys::jobs(&run), request, patience, &self.metrics, fitting).await {
+            Ok(JobReply::HandedBack { accepted: true, .. }) => info!(%run, "a job was handed back"),
+            Ok(_) => debug!(%run, "a job that was to be handed back had been taken away"),
+            Err(error) => debug!(%run, %error, "a job could not be handed back"),
         }
     }
 }

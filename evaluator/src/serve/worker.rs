@@ -1,20 +1,22 @@
 //! The evaluator's main loop: serves the runs in turn, one job at a time.
 
-use std::collections::{BTreeMap, VecDeque};
-use std::sync::Arc;
+use std::collections::BTreeMap;
+use std::sync::{Arc, Mutex, PoisonError};
 use std::time::{Duration, Instant};
 
 use anyhow::Context;
 use quad_dataset::environment::EnvironmentSpec;
 use quad_policy::{Policy, PolicyError, Precision};
-use quad_protocol::{EpisodeScore, Hash, Job, Name, Progress, ScoreReport};
+use quad_protocol::{CannotAct, EpisodeScore, Hash, Job, Name, ScoreReport};
 use tokio::sync::{Notify, watch};
+use tokio::time::{MissedTickBehavior, interval};
 use tracing::{info, warn};
 
+use super::budget::Budget;
 use super::discovery::{RunKey, Runs};
 use super::job::{self, Running};
-use super::receiver::policy_for;
-use super::run::RunClient;
+use super::loading::policy_for;
+use super::run::{HandBack, Identity, RunClient};
 use crate::environment;
 use crate::metrics::{JobOutcome, Metrics};
 
@@ -22,37 +24,60 @@ use crate::metrics::{JobOutcome, Metrics};
 const HEARTBEAT: Duration = Duration::from_secs(1);
 /// Scores are kept this long for a learner that is gone, which may be disconnected only for a while.
 const KEEP_SCORES: Duration = Duration::from_secs(600);
+/// Memory for the snapshots that were published, of all runs together, bytes; the largest that there may be fits.
+const SNAPSHOTS: usize = 256 << 20;
+/// How long it may take to hand back a job that could not be done; other runs wait meanwhile.
+const HAND_BACK: Duration = Duration::from_secs(1);
 
-/// Serves every run that is found, one job at a time, in turn.
+/// The job that is being done, for whoever has to hand it back when the worker is to end.
+pub type Held = Arc<Mutex<Option<HandBack>>>;
+
+/// Serves every run that is found, one job at a time; next is always the run that it has spent the least time on.
 pub struct Worker {
-    name: Name,
+    identity: Identity,
     precision: Precision,
     metrics: Metrics,
     found: watch::Receiver<Runs>,
     runs: BTreeMap<RunKey, RunClient>,
-    /// The run that was served longest ago comes first.
-    turns: VecDeque<RunKey>,
     /// Runs whose learner is gone but whose scores are kept, and since when.
     gone: BTreeMap<RunKey, Instant>,
     snapshot_arrived: Arc<Notify>,
+    budget: Budget,
+    held: Held,
     /// The policy of the last job: the next one is often about the same.
     policy: Option<(Hash, Arc<dyn Policy>)>,
 }
 
 impl Worker {
     /// A worker for the runs that `found` names.
-    pub fn new(name: Name, precision: Precision, metrics: Metrics, found: watch::Receiver<Runs>) -> Worker {
-        Worker {
-            name,
+    ///
+    /// # Errors
+    ///
+    /// The precision has no name that may cross the wire, which none of ours has not.
+    pub fn new(
+        evaluator: Name,
+        precision: Precision,
+        metrics: Metrics,
+        found: watch::Receiver<Runs>,
+    ) -> anyhow::Result<Worker> {
+        let identity = Identity { evaluator, precision: Name::new(precision.in_effect().name())? };
+        Ok(Worker {
+            identity,
             precision,
             metrics,
             found,
             runs: BTreeMap::new(),
-            turns: VecDeque::new(),
             gone: BTreeMap::new(),
             snapshot_arrived: Arc::new(Notify::new()),
+            budget: Budget::new(SNAPSHOTS),
+            held: Held::default(),
             policy: None,
-        }
+        })
+    }
+
+    /// Where the job is that it does.
+    pub fn held(&self) -> Held {
+        self.held.clone()
     }
 
     /// Serves until it is dropped. Dropped in the middle of a job, it abandons the job.
@@ -60,9 +85,8 @@ impl Worker {
         loop {
             self.follow_discovery().await;
             let now = Instant::now();
-            let due =
-                |key: &&RunKey| self.is_there(key) && self.runs.get(*key).is_some_and(|run| run.ready_at() <= now);
-            match self.turns.iter().find(due).cloned() {
+            let due = self.runs.iter().filter(|(key, run)| self.is_there(key) && run.ready_at() <= now);
+            match due.min_by_key(|(_, run)| run.used()).map(|(key, _)| key.clone()) {
                 Some(key) => self.turn(key).await,
                 None => {
                     if let Err(error) = self.wait().await {
@@ -80,20 +104,22 @@ impl Worker {
     /// Attaches to runs that appeared, detaches from runs that are gone.
     async fn follow_discovery(&mut self) {
         let found = self.found.borrow_and_update().clone();
-        for (key, session) in &found {
-            if self.gone.remove(key).is_some()
-                && let Some(run) = self.runs.get_mut(key)
-            {
-                run.wake();
-            }
-            if self.runs.contains_key(key) {
+        for (key, learner) in &found {
+            let was_gone = self.gone.remove(key).is_some();
+            if let Some(run) = self.runs.get_mut(key) {
+                run.follow(&learner.lives);
+                if was_gone {
+                    run.wake();
+                }
                 continue;
             }
-            let (metrics, arrived) = (self.metrics.clone(), self.snapshot_arrived.clone());
-            match RunClient::attach(session.clone(), key.1.clone(), self.name.clone(), metrics, arrived).await {
-                Ok(run) => {
+            let (identity, metrics) = (self.identity.clone(), self.metrics.clone());
+            let memory = (self.snapshot_arrived.clone(), self.budget.clone());
+            match RunClient::attach(key.1.clone(), learner, identity, metrics, memory).await {
+                Ok(mut run) => {
+                    // A new run has no claim to the time that others had before it came.
+                    run.spend(self.runs.values().map(RunClient::used).min().unwrap_or_default());
                     self.runs.insert(key.clone(), run);
-                    self.turns.push_front(key.clone());
                 }
                 Err(error) => warn!("{error:#}"),
             }
@@ -105,7 +131,6 @@ impl Worker {
             let kept = self.runs.get(&key).is_some_and(RunClient::has_undelivered) && now - since < KEEP_SCORES;
             if !kept {
                 self.gone.remove(&key);
-                self.turns.retain(|other| *other != key);
                 if let Some(run) = self.runs.remove(&key) {
                     run.give_up();
                 }
@@ -128,20 +153,22 @@ impl Worker {
         tokio::select! {
             () = timer => {}
             changed = self.found.changed() => changed.context("nobody looks for learners any more")?,
-            () = self.snapshot_arrived.notified() => self.runs.values_mut().for_each(RunClient::wake),
+            () = self.snapshot_arrived.notified() => self.runs.values_mut().for_each(RunClient::wake_for_snapshot),
         }
         Ok(())
     }
 
     /// One run's turn: delivers scores if there are any, else does one job.
     async fn turn(&mut self, key: RunKey) {
-        self.turns.retain(|other| *other != key);
-        self.turns.push_back(key.clone());
         let Some(mut run) = self.runs.remove(&key) else { return };
+        let started = Instant::now();
         if let Err(error) = self.serve(&key.1, &mut run).await {
-            warn!(run = %key.1, "{error:#}");
-            run.back_off();
+            run.back_off(&error);
+            if let Some(learner) = self.found.borrow().get(&key) {
+                run.follow_next(&learner.lives);
+            }
         }
+        run.spend(started.elapsed());
         self.runs.insert(key, run);
     }
 
@@ -151,22 +178,27 @@ impl Worker {
         }
         let environments = environment::simulated().map(|spec| spec.name.clone()).collect();
         let Some(job) = run.claim(environments).await? else { return Ok(()) };
-        let (episodes, cannot_act) = match self.measure(name, &job, run).await {
+        self.hold(Some(run.hand_back(&job)));
+        let measured = self.measure(name, &job, run).await;
+        self.hold(None);
+        let (episodes, cannot_act) = match measured {
             Ok(episodes) => (episodes, None),
             Err(error) => {
                 self.metrics.job(JobOutcome::Failed);
                 let broken = matches!(error.downcast_ref(), Some(PolicyError::NotANumber(_)));
-                let error = error.context(format!("job {} of step {} failed", job.id, job.step));
+                let error = error.context(format!("a job of step {} failed", job.step));
                 if !broken {
+                    run.hand_back(&job).send(HAND_BACK).await;
                     return Err(error);
                 }
                 // The learner must know, or it would hand the job out again and again.
                 warn!(run = %name, "{error:#}");
-                (Vec::new(), Some(format!("{:#}", error.root_cause())))
+                let reason = format!("{:#}", error.root_cause());
+                (Vec::new(), Some(CannotAct::signed(reason, job.weights, &job.lease)))
             }
         };
         let Job { id, run: of, incarnation, step, weights, .. } = job;
-        let (evaluator, precision) = (self.name.clone(), Name::new(self.precision.in_effect().name())?);
+        let Identity { evaluator, precision } = self.identity.clone();
         run.keep(ScoreReport {
             evaluator,
             run: of,
@@ -181,9 +213,26 @@ impl Worker {
         run.deliver().await
     }
 
+    fn hold(&self, job: Option<HandBack>) {
+        *self.held.lock().unwrap_or_else(PoisonError::into_inner) = job;
+    }
+
     async fn measure(&mut self, name: &Name, job: &Job, run: &RunClient) -> anyhow::Result<Vec<EpisodeScore>> {
         let spec = job::check(job, name).inspect_err(|error| self.metrics.rejected(error.label()))?;
-        let policy = self.policy(job, run).await?;
+        let metrics = self.metrics.clone();
+        let policy = {
+            // The learner grants some time for this, as long as it hears that somebody is at it.
+            let mut heartbeat = interval(heartbeat(job));
+            heartbeat.set_missed_tick_behavior(MissedTickBehavior::Delay);
+            let mut loading = std::pin::pin!(self.policy(job, run));
+            loop {
+                tokio::select! {
+                    policy = &mut loading => break policy?,
+                    _ = heartbeat.tick() => run.publish(job, (0, 0)).await,
+                }
+            }
+        };
+        job::check_cost(job, policy.as_ref()).inspect_err(|error| metrics.rejected(error.label()))?;
         info!(run = %name, step = job.step, episodes = job.seeds.len(), "evaluating");
         self.roll_out(job, spec, policy, run).await
     }
@@ -212,29 +261,23 @@ impl Worker {
         policy: Arc<dyn Policy>,
         run: &RunClient,
     ) -> anyhow::Result<Vec<EpisodeScore>> {
-        let heartbeat = HEARTBEAT.min(Duration::from_millis(job.lease_milliseconds / 3)).max(HEARTBEAT / 20);
         let mut running = Running::start(job, spec, policy, self.metrics.clone());
-        let mut told = self.metrics.environment_steps.get();
+        let mut told = 0;
         loop {
-            let finished = running.finished_within(heartbeat).await;
-            let steps = self.metrics.environment_steps.get();
-            if steps > told {
+            let finished = running.finished_within(heartbeat(job)).await;
+            let steps = running.steps_done();
+            // Nothing to tell yet is told, too: the first step of a large policy takes its time.
+            if steps > told || (steps == 0 && finished.is_none()) {
                 told = steps;
-                run.publish(&Progress {
-                    evaluator: self.name.clone(),
-                    run: job.run.clone(),
-                    job: job.id,
-                    step: job.step,
-                    episodes_done: running.episodes_done(),
-                    episodes_total: job.seeds.len() as u32,
-                    environment_steps: steps,
-                    episodes: self.metrics.episodes.get(),
-                })
-                .await;
+                run.publish(job, (steps, running.episodes_done())).await;
             }
             if let Some(episodes) = finished {
                 return episodes;
             }
         }
     }
+}
+
+fn heartbeat(job: &Job) -> Duration {
+    HEARTBEAT.min(Duration::from_millis(job.lease_milliseconds / 3)).max(HEARTBEAT / 20)
 }

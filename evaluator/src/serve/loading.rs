@@ -1,17 +1,8 @@
-//! Receives snapshots, and makes of one the policy that a job names.
-
-use std::sync::{Arc, Mutex, PoisonError};
+//! Makes of a snapshot the policy that a job names.
 
 use quad_dataset::environment;
 use quad_policy::{Policy, PolicyError, Precision, load_policy};
-use quad_protocol::{Job, Name, Schema, Snapshot, decode_from, keys};
-use tokio::sync::Notify;
-use tokio::task::JoinSet;
-use tracing::{debug, warn};
-use zenoh::Session;
-use zenoh::handlers::RingChannel;
-
-use crate::metrics::Metrics;
+use quad_protocol::{Job, Schema, Snapshot};
 
 /// Why a snapshot does not fit the job it came for.
 #[derive(Debug, thiserror::Error)]
@@ -115,65 +106,11 @@ fn is_as_claimed(schema: &Schema, policy: &dyn Policy) -> Result<(), SnapshotErr
     Ok(())
 }
 
-/// The newest good snapshot that one run's learner published while this evaluator listened.
-pub struct SnapshotReceiver {
-    newest: Arc<Mutex<Option<Arc<Snapshot>>>>,
-    // Aborted with the cache; owns the subscriber.
-    _listener: JoinSet<()>,
-}
-
-impl SnapshotReceiver {
-    /// Listens to `quad/<run>/weights`; `arrived` is told of each good snapshot.
-    pub async fn listen(
-        session: &Session,
-        run: Name,
-        metrics: Metrics,
-        arrived: Arc<Notify>,
-    ) -> zenoh::Result<SnapshotReceiver> {
-        // Newest wins: a queue would hold snapshots nobody wants, and a full one stops the whole session.
-        let subscriber = session.declare_subscriber(keys::weights(&run)).with(RingChannel::new(1)).await?;
-        let newest = Arc::new(Mutex::new(None));
-        let cache = newest.clone();
-        let mut listener = JoinSet::new();
-        listener.spawn(async move {
-            while let Ok(sample) = subscriber.recv_async().await {
-                // Hashing megabytes is work for a thread of its own, not for the runtime's.
-                let decoded = tokio::task::spawn_blocking(move || {
-                    let payload = sample.payload();
-                    decode_from::<Snapshot>(payload.len(), payload.reader())
-                });
-                match decoded.await {
-                    Ok(Ok(snapshot)) => {
-                        metrics.snapshots_received.inc();
-                        debug!(%run, step = snapshot.step, "weights arrived");
-                        *cache.lock().unwrap_or_else(PoisonError::into_inner) = Some(Arc::new(snapshot));
-                        arrived.notify_one();
-                    }
-                    Ok(Err(error)) => {
-                        metrics.rejected(error.label());
-                        warn!(%run, "ignored what was published as weights: {error}");
-                    }
-                    Err(error) => warn!(%run, "ignored what was published as weights: {error}"),
-                }
-            }
-        });
-        Ok(SnapshotReceiver { newest, _listener: listener })
-    }
-
-    /// The snapshot that `job` names, if it is the newest. The same step of another incarnation does not count.
-    pub fn get(&self, job: &Job) -> Option<Arc<Snapshot>> {
-        let named = |snapshot: &&Arc<Snapshot>| {
-            (snapshot.incarnation, snapshot.step, snapshot.hash) == (job.incarnation, job.step, job.weights)
-        };
-        self.newest.lock().unwrap_or_else(PoisonError::into_inner).as_ref().filter(named).cloned()
-    }
-}
-
 #[cfg(test)]
 mod tests {
     use candle_core::{DType, Device, Tensor};
     use quad_policy::{Description, DiffusionPolicy, DiffusionShape, Ensemble, Layout, NoisePredictor, Weights};
-    use quad_protocol::Hash;
+    use quad_protocol::{Hash, Lease, Name};
 
     use super::*;
 
@@ -202,6 +139,7 @@ mod tests {
         };
         let job = Job {
             id: 1,
+            lease: Lease::random(),
             run: run.clone(),
             incarnation: 3,
             step: 100,

@@ -1,0 +1,36 @@
+//! Why a message from the wire was not accepted.
+
+use quad_protocol::CodecError;
+
+use crate::run_dir::RunDirError;
+use crate::scoreboard::Refusal;
+
+/// Why a message from the wire was not accepted.
+#[derive(Debug, thiserror::Error)]
+pub(super) enum Rejection {
+    #[error("the message is empty")]
+    Empty,
+    #[error("the message cannot be read: {0}")]
+    Codec(#[from] CodecError),
+    #[error("refused: {0}")]
+    Refused(#[from] Refusal),
+    #[error("an evaluator announces itself under a name that is not allowed")]
+    Name,
+    #[error("there are too many evaluators")]
+    Crowd,
+    #[error("the scores could not be saved, try again: {0}")]
+    Disk(#[from] RunDirError),
+}
+
+impl Rejection {
+    pub fn label(&self) -> &'static str {
+        match self {
+            Self::Empty => "empty",
+            Self::Codec(error) => error.label(),
+            Self::Refused(refusal) => refusal.label(),
+            Self::Name => "invalid_name",
+            Self::Crowd => "too_many_evaluators",
+            Self::Disk(_) => "not_saved",
+        }
+    }
+}

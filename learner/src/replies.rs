@@ -1,0 +1,225 @@
+//! The threads that answer queries. To send an answer may take until the peer reads, or up to five seconds, after which Zenoh
+//! closes the connection; even to drop a query says "no more answers" to the peer. So neither happens on the threads that own
+//! the state, nor on Zenoh's own: they only put their answers into this bounded queue.
+//!
+//! It is shared fairly among those who ask, as far as they can be told apart: by the names that they give. Whoever gives none
+//! shares a place with all others who do not. (One who gives many names can take all places, for five seconds with each
+//! connection; against that only access control helps.)
+
+use std::collections::VecDeque;
+use std::mem;
+use std::sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError};
+use std::thread;
+use std::time::{Duration, Instant};
+
+use quad_protocol::Name;
+use tracing::debug;
+use zenoh::Wait;
+use zenoh::bytes::ZBytes;
+use zenoh::key_expr::KeyExpr;
+use zenoh::query::Query;
+
+use crate::metrics::Metrics;
+
+/// Threads that answer.
+const THREADS: usize = 12;
+/// Most answers that may wait, of all and of one of those who ask.
+const MOST_WAITING: usize = 512;
+const MOST_WAITING_OF_ONE: usize = 64;
+
+/// Who gets an answer.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub enum Asker {
+    /// An evaluator, by the name that it gives.
+    Evaluator(Name),
+    /// Whoever gives no name, or sent something that is refused.
+    Stranger,
+    /// Whoever gets no answer.
+    Nobody,
+}
+
+impl Asker {
+    /// How many threads may be busy with its answers at a time.
+    fn most_threads(&self) -> usize {
+        match self {
+            Self::Evaluator(_) => 2,
+            Self::Stranger => 2,
+            Self::Nobody => 1,
+        }
+    }
+}
+
+/// An answer: the key and the message, or an error for people.
+pub type Answer = Result<(String, ZBytes), String>;
+
+/// What makes an answer, on the thread that sends it.
+type Work = Box<dyn FnOnce(&Query) + Send>;
+
+struct Task {
+    asker: Asker,
+    query: Query,
+    work: Work,
+}
+
+#[derive(Default)]
+struct State {
+    waiting: VecDeque<Task>,
+    /// Of the answers that are being sent.
+    busy: Vec<Asker>,
+    closed: bool,
+}
+
+struct Shared {
+    state: Mutex<State>,
+    changed: Condvar,
+    metrics: Metrics,
+}
+
+/// Reaches the threads. They end when [`finish`](Self::finish) was called or the last clone is dropped.
+#[derive(Clone)]
+pub struct Replies {
+    shared: Arc<Shared>,
+    _last: Arc<CloseOnDrop>,
+}
+
+struct CloseOnDrop(Arc<Shared>);
+
+impl Drop for CloseOnDrop {
+    fn drop(&mut self) {
+        self.0.lock().closed = true;
+        self.0.changed.notify_all();
+    }
+}
+
+impl Replies {
+    /// Starts the threads.
+    pub fn start(metrics: &Metrics) -> std::io::Result<Self> {
+        let shared =
+            Arc::new(Shared { state: Mutex::new(State::default()), changed: Condvar::new(), metrics: metrics.clone() });
+        for _ in 0..THREADS {
+            let shared = shared.clone();
+            thread::Builder::new().name("reply".to_owned()).spawn(move || shared.work())?;
+        }
+        Ok(Self { _last: Arc::new(CloseOnDrop(shared.clone())), shared })
+    }
+
+    /// Waits until everything that was put in is sent, up to `patience`; a peer that does not read cannot make it longer.
+    pub fn finish(&self, patience: Duration) {
+        let deadline = Instant::now() + patience;
+        let mut state = self.shared.lock();
+        while !(state.waiting.is_empty() && state.busy.is_empty()) {
+            let Some(left) = deadline.checked_duration_since(Instant::now()) else { break };
+            let waited = self.shared.changed.wait_timeout(state, left);
+            state = waited.unwrap_or_else(PoisonError::into_inner).0;
+        }
+    }
+
+    /// A query that came in.
+    pub fn question(&self, query: Query) -> Question {
+        Question { query: Some(query), replies: self.clone() }
+    }
+
+    fn put(&self, task: Task) {
+        let mut state = self.shared.lock();
+        let of_one = state.waiting.iter().filter(|waiting| waiting.asker == task.asker).count();
+        if state.waiting.len() < MOST_WAITING && of_one < MOST_WAITING_OF_ONE {
+            state.waiting.push_back(task);
+            drop(state);
+            self.shared.changed.notify_all();
+            return;
+        }
+        drop(state);
+        let Task { asker, query, .. } = task;
+        self.shared.metrics.reject("busy");
+        match asker {
+            // The end of the road: whoever floods us with questions and does not read now waits here itself.
+            Asker::Nobody => drop(query),
+            _ => self.put(Task { asker: Asker::Nobody, query, work: Box::new(|_| ()) }),
+        }
+    }
+}
+
+impl Shared {
+    fn lock(&self) -> MutexGuard<'_, State> {
+        self.state.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+
+    fn work(&self) {
+        let mut state = self.lock();
+        loop {
+            let State { waiting, busy, .. } = &mut *state;
+            let may_start =
+                |task: &Task| busy.iter().filter(|asker| **asker == task.asker).count() < task.asker.most_threads();
+            let next = waiting.iter().position(may_start).and_then(|place| waiting.remove(place));
+            let Some(Task { asker, query, work }) = next else {
+                if state.closed {
+                    return;
+                }
+                state = self.changed.wait(state).unwrap_or_else(PoisonError::into_inner);
+                continue;
+            };
+            busy.push(asker.clone());
+            drop(state);
+            work(&query);
+            drop(query);
+            state = self.lock();
+            if let Some(place) = state.busy.iter().position(|other| *other == asker) {
+                state.busy.swap_remove(place);
+            }
+            self.changed.notify_all();
+        }
+    }
+}
+
+/// A query that came in. It is answered, and also dropped, on a thread of [`Replies`].
+pub struct Question {
+    query: Option<Query>,
+    replies: Replies,
+}
+
+impl Question {
+    /// What it asks for.
+    pub fn key(&self) -> Option<&KeyExpr<'static>> {
+        self.query.as_ref().map(Query::key_expr)
+    }
+
+    /// What came with it.
+    pub fn payload(&self) -> Option<&ZBytes> {
+        self.query.as_ref().and_then(Query::payload)
+    }
+
+    /// Answers it.
+    pub fn answer(self, asker: Asker, answer: Answer) {
+        self.answer_with(asker, move || answer);
+    }
+
+    /// Answers it with something that takes time to make, like what has to be read from the disk.
+    pub fn answer_with(mut self, asker: Asker, answer: impl FnOnce() -> Answer + Send + 'static) {
+        let send = move |query: &Query| {
+            let sent = match answer() {
+                Ok((key, bytes)) => query.reply(key, bytes).wait(),
+                Err(text) => query.reply_err(text).wait(),
+            };
+            if let Err(error) = sent {
+                debug!(%error, "an answer could not be sent");
+            }
+        };
+        if let Some(query) = mem::take(&mut self.query) {
+            self.replies.put(Task { asker, query, work: Box::new(send) });
+        }
+    }
+}
+
+impl Drop for Question {
+    fn drop(&mut self) {
+        if let Some(query) = mem::take(&mut self.query) {
+            self.replies.put(Task { asker: Asker::Nobody, query, work: Box::new(|_| ()) });
+        }
+    }
+}
+
+impl std::fmt::Debug for Question {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        f.debug_tuple("Question").field(&self.key()).finish()
+    }
+}

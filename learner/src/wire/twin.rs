@@ -1,0 +1,73 @@
+//! Two learners of one run name would answer each other's evaluators. The second one stops.
+
+use std::time::{Duration, Instant};
+
+use anyhow::anyhow;
+use quad_protocol::keys;
+use quad_service::Hint;
+use tracing::info;
+use zenoh::Session;
+use zenoh::pubsub::Subscriber;
+use zenoh::sample::{Sample, SampleKind};
+
+use super::{Life, zenoh_error};
+use crate::hub;
+use crate::inbox::Inbox;
+
+/// The token of a learner that was cut off lasts for as long as Zenoh takes to notice: five seconds.
+const PATIENCE: Duration = Duration::from_secs(8);
+/// How often it is looked for meanwhile, and how long an answer may take.
+const LOOK_AGAIN: Duration = Duration::from_millis(500);
+
+pub(super) const HINT: &str = "choose another name for the folder with --run-dir, or stop the other learner";
+
+/// Returns when no other learner of the run is there.
+///
+/// # Errors
+///
+/// One is still there when a dead one's token would have gone.
+pub(super) async fn wait_until_gone(session: &Session, life: &Life) -> anyhow::Result<()> {
+    let deadline = Instant::now() + PATIENCE;
+    let mut said = false;
+    while let Some(other) = another(session, life).await? {
+        if Instant::now() >= deadline {
+            return Err(is_there(life, other));
+        }
+        if !said {
+            info!("another learner of run {} was here a moment ago; waiting to see if it is gone", life.run);
+            said = true;
+        }
+        tokio::time::sleep(LOOK_AGAIN).await;
+    }
+    Ok(())
+}
+
+async fn another(session: &Session, life: &Life) -> anyhow::Result<Option<u64>> {
+    let asked = session.liveliness().get(keys::all_lives(&life.run)).timeout(LOOK_AGAIN).await;
+    let replies = asked.map_err(zenoh_error)?;
+    while let Ok(reply) = replies.recv_async().await {
+        let found = reply.result().ok().and_then(|token| keys::incarnation_of(token.key_expr().as_str()));
+        if let Some(other) = found.filter(|other| *other != life.incarnation) {
+            return Ok(Some(other));
+        }
+    }
+    Ok(None)
+}
+
+/// Ends the run when a learner shows up that was started earlier. (A later one stops by itself.)
+pub(super) async fn watch(session: &Session, life: &Life, hub: &Inbox<hub::Event>) -> anyhow::Result<Subscriber<()>> {
+    let (mine, inbox) = (life.clone(), hub.clone());
+    let callback = move |token: Sample| {
+        let found = keys::incarnation_of(token.key_expr().as_str());
+        let earlier = found.filter(|other| *other < mine.incarnation && token.kind() == SampleKind::Put);
+        if let Some(Err(error)) = earlier.map(|other| Err::<(), _>(is_there(&mine, other)).hint(HINT)) {
+            inbox.offer_change(hub::Event::Twin(error)).ok();
+        }
+    };
+    let tokens = session.liveliness().declare_subscriber(keys::all_lives(&life.run)).history(true).callback(callback);
+    tokens.await.map_err(zenoh_error)
+}
+
+fn is_there(life: &Life, other: u64) -> anyhow::Error {
+    anyhow!("there is another learner of run {} (incarnation {other}, this one is {})", life.run, life.incarnation)
+}
