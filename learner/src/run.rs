@@ -204,7 +204,7 @@ async fn conduct(
     let metrics_address = server.address.to_string();
     let conductor = Conductor {
         run,
-        incarnation: config.run.incarnation,
+        incarnation,
         run_dir: run_dir.clone(),
         metrics,
         metrics_address,
