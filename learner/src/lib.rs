@@ -14,6 +14,7 @@
 //! - [`scoreboard`] is the hub's state without any I/O.
 //! - [`wire`] declares everything on Zenoh; its callbacks fill an [`inbox`]; [`notice`] is what threads tell the main loop.
 //! - [`run_dir`] is the folder of a run, [`metrics`] are for Prometheus, [`display`] shows progress on the terminal.
+//! - [`doctor`] checks a machine before a run is trusted to it.
 //! - [`report`] and [`plot`] summarise the scores as tables and as a picture.
 
 #![deny(unsafe_code)]
@@ -26,6 +27,7 @@ pub mod config;
 pub mod datasets;
 pub mod device;
 pub mod display;
+pub mod doctor;
 pub mod hub;
 pub mod inbox;
 pub mod metrics;

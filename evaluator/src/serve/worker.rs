@@ -8,6 +8,7 @@ use anyhow::Context;
 use quad_dataset::environment::EnvironmentSpec;
 use quad_policy::{Policy, PolicyError, Precision};
 use quad_protocol::{EpisodeScore, Hash, Job, Name, Progress, ScoreReport};
+use quad_service::Beat;
 use tokio::sync::{Notify, watch};
 use tracing::{info, warn};
 
@@ -37,11 +38,12 @@ pub struct Worker {
     snapshot_arrived: Arc<Notify>,
     /// The policy of the last job: the next one is often about the same.
     policy: Option<(Hash, Arc<dyn Policy>)>,
+    beat: Beat,
 }
 
 impl Worker {
-    /// A worker for the runs that `found` names.
-    pub fn new(name: Name, precision: Precision, metrics: Metrics, found: watch::Receiver<Runs>) -> Worker {
+    /// A worker for the runs that `found` names, which says by `beat` that it is not stuck.
+    pub fn new(name: Name, precision: Precision, metrics: Metrics, found: watch::Receiver<Runs>, beat: Beat) -> Worker {
         Worker {
             name,
             precision,
@@ -52,12 +54,14 @@ impl Worker {
             gone: BTreeMap::new(),
             snapshot_arrived: Arc::new(Notify::new()),
             policy: None,
+            beat,
         }
     }
 
     /// Serves until it is dropped. Dropped in the middle of a job, it abandons the job.
     pub async fn run(mut self) -> anyhow::Error {
         loop {
+            self.beat.alive();
             self.follow_discovery().await;
             let now = Instant::now();
             let due =
@@ -127,6 +131,7 @@ impl Worker {
         };
         tokio::select! {
             () = timer => {}
+            () = tokio::time::sleep(self.beat.interval()) => {}
             changed = self.found.changed() => changed.context("nobody looks for learners any more")?,
             () = self.snapshot_arrived.notified() => self.runs.values_mut().for_each(RunClient::wake),
         }
@@ -220,6 +225,7 @@ impl Worker {
             let steps = self.metrics.environment_steps.get();
             if steps > told {
                 told = steps;
+                self.beat.alive();
                 run.publish(&Progress {
                     evaluator: self.name.clone(),
                     run: job.run.clone(),
