@@ -9,7 +9,7 @@ use quad_dataset::environment;
 use quad_policy::{ActionNoise, Precision};
 use quad_protocol::{CodecError, JobReply, JobRequest, Name, PROTOCOL_VERSION, decode_from, encode, keys};
 use quad_service::doctor::{Findings, certificates, machine, network};
-use quad_service::parse_endpoint;
+use quad_service::{Endpoints, parse_endpoint};
 use zenoh::Session;
 
 use crate::rollout::Rollout;
@@ -48,9 +48,10 @@ pub fn examine(args: &DoctorArgs) -> anyhow::Result<Findings> {
     if let Some(folder) = certificates::chosen(args.certificates.as_deref()) {
         certificates::folder(&mut findings, &folder);
     }
+    let endpoints = Endpoints { connect: vec![args.connect.clone()], ..Endpoints::default() };
     let runtime = tokio::runtime::Builder::new_multi_thread().worker_threads(2).enable_all().build()?;
     runtime.block_on(async {
-        if let Some(session) = network::reach(&mut findings, &args.connect).await {
+        if let Some(session) = network::reach(&mut findings, &endpoints).await {
             runs(&mut findings, &session).await?;
             session.close().await.map_err(|error| anyhow::anyhow!(error))?;
         }

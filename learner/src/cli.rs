@@ -262,6 +262,12 @@ mod tests {
     }
 
     #[test]
+    fn only_this_machine_sees_the_metrics_unless_told_otherwise() {
+        let Command::Train(train) = parse(&[]).unwrap().command else { panic!("not train") };
+        assert!(train.metrics.ip().is_loopback(), "{}", train.metrics);
+    }
+
+    #[test]
     fn wrong_command_lines_exit_with_2() {
         let wrong: [&[&str]; 9] = [
             &["--steps", "0"],

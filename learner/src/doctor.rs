@@ -6,6 +6,7 @@ use std::time::Duration;
 
 use quad_policy::Precision;
 use quad_protocol::{Name, keys};
+use quad_service::Endpoints;
 use quad_service::doctor::{Findings, certificates, disk, machine, network};
 use zenoh::Session;
 
@@ -64,9 +65,10 @@ fn hdf5(findings: &mut Findings) {
 }
 
 fn router(findings: &mut Findings, endpoint: &str, run_dir: &Path) -> anyhow::Result<()> {
+    let endpoints = Endpoints { connect: vec![endpoint.to_owned()], ..Endpoints::default() };
     let runtime = tokio::runtime::Builder::new_multi_thread().worker_threads(2).enable_all().build()?;
     runtime.block_on(async {
-        if let Some(session) = network::reach(findings, endpoint).await {
+        if let Some(session) = network::reach(findings, &endpoints).await {
             if let Some(run) = run_dir.file_name().and_then(|name| Name::new(name.to_str()?).ok()) {
                 namesake(findings, &session, &run).await;
             }

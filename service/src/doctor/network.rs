@@ -15,10 +15,12 @@ const CONNECT: Duration = Duration::from_secs(3);
 /// The same with what Zenoh, and perhaps TLS, have to say to each other.
 const SESSION: Duration = Duration::from_secs(5);
 
-/// Connects to `endpoint`, first by TCP alone, then with Zenoh; gives the session if there is one.
+/// Connects to the endpoint that is to be connected to, first by TCP alone, then with Zenoh; gives the session if there is
+/// one.
 ///
 /// Needs a multi-thread tokio runtime.
-pub async fn reach(findings: &mut Findings, endpoint: &str) -> Option<Session> {
+pub async fn reach(findings: &mut Findings, endpoints: &Endpoints) -> Option<Session> {
+    let endpoint = endpoints.connect.first()?;
     let address = address(endpoint);
     let connected = match timeout(CONNECT, TcpStream::connect(address)).await {
         Ok(connected) => connected.map_err(|error| (error.to_string(), hint(error.kind()))),
@@ -28,8 +30,7 @@ pub async fn reach(findings: &mut Findings, endpoint: &str) -> Option<Session> {
         findings.fail("connection", format!("{address}: {reason}"), hint);
         return None;
     }
-    let endpoints = Endpoints { connect: vec![endpoint.to_owned()], ..Endpoints::default() };
-    let (reason, hint) = match timeout(SESSION, open_session(&endpoints)).await {
+    let (reason, hint) = match timeout(SESSION, open_session(endpoints)).await {
         Ok(Ok(session)) => {
             findings.ok("connection", format!("{endpoint} is there, and speaks Zenoh"));
             return Some(session);
