@@ -2,7 +2,7 @@
 
 use std::fs::{self, OpenOptions};
 use std::io::{self, Write};
-use std::path::Path;
+use std::path::{Path, absolute};
 use std::time::{Duration, SystemTime};
 
 use rustix::fs::statvfs;
@@ -23,8 +23,8 @@ const CLOCK_TOLERANCE: Duration = Duration::from_secs(10);
 /// Checks a folder that a program will write to, or the one that it would be made in. `elsewhere` says how to choose
 /// another one. Nothing is left behind.
 pub fn folder(findings: &mut Findings, check: &str, path: &Path, elsewhere: &str) {
-    let existing = path.ancestors().find(|folder| folder.is_dir() || folder.as_os_str().is_empty());
-    let folder = existing.filter(|folder| !folder.as_os_str().is_empty()).unwrap_or(Path::new("."));
+    let path = &absolute(path).unwrap_or_else(|_| path.to_owned());
+    let folder = path.ancestors().find(|folder| folder.is_dir()).unwrap_or(path);
     let shown = match folder == path {
         true => path.display().to_string(),
         false => format!("{} (to be made in {})", path.display(), folder.display()),
