@@ -44,7 +44,7 @@ pub fn folder(findings: &mut Findings, folder: &Path) {
     let key = read(findings, &key, PrivateKeyDer::from_pem_file(&key));
     let now = SystemTime::now();
     if let Some(ca) = &ca {
-        validity(findings, "certificate authority", ca, now);
+        validity(findings, "authority", ca, now);
     }
     let Some(own) = own else { return };
     validity(findings, "certificate", &own[0], now);

@@ -7,7 +7,7 @@ use quad_service::{Endpoints, Health, open_session};
 
 use super::*;
 
-const LIMIT: Duration = Duration::from_millis(600);
+const LIMIT: Duration = Duration::from_secs(1);
 
 /// Acts slowly, and once very slowly.
 struct Sleeper {
@@ -34,7 +34,7 @@ impl Policy for Sleeper {
 
     fn act(&self, _: &[f32], _: usize, _: &mut [ActionNoise], actions: &mut [f32]) -> Result<(), PolicyError> {
         let stuck = self.calls.fetch_add(1, Relaxed) == self.stuck_at;
-        std::thread::sleep(if stuck { 4 * LIMIT } else { LIMIT / 12 });
+        std::thread::sleep(if stuck { 4 * LIMIT } else { LIMIT / 60 });
         actions.fill(0.0);
         Ok(())
     }
