@@ -54,7 +54,7 @@ fn precision(findings: &mut Findings) {
 }
 
 fn hdf5(findings: &mut Findings) {
-    match quad_dataset::library() {
+    match quad_dataset::hdf5_library() {
         (version, true) => findings.ok("HDF5", format!("{version}, with compression")),
         (version, false) => findings.fail(
             "HDF5",
