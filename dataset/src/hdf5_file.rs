@@ -25,6 +25,12 @@ const MAX_ELEMENT_BYTES: usize = 8;
 const NUMBERS: &str = "numbers";
 const FLAGS: &str = "booleans (h5py's enum, or numbers that are 0 or 1)";
 
+/// Version of the HDF5 library that this program found, and whether it reads compressed arrays, as D4RL's are.
+pub fn hdf5_library() -> (String, bool) {
+    let (major, minor, release) = hdf5::library_version();
+    (format!("{major}.{minor}.{release}"), hdf5::filters::deflate_available())
+}
+
 /// An open HDF5 file.
 pub(crate) struct Hdf5File {
     path: PathBuf,

@@ -9,6 +9,7 @@ use quad_dataset::environment;
 use quad_service::Hint;
 
 use crate::collect::{self, CollectError, Summary};
+use crate::doctor::{self, DoctorArgs};
 use crate::score::{self, ScoreArgs};
 use crate::serve::{self, ServeArgs};
 use crate::verify::{self, Report, VerifyError};
@@ -27,6 +28,7 @@ enum Command {
     Score(ScoreArgs),
     Collect(CollectArgs),
     VerifyDataset(VerifyArgs),
+    Doctor(DoctorArgs),
 }
 
 /// Record a dataset of mediocre behaviour to learn from, without downloading anything
@@ -89,6 +91,11 @@ impl Cli {
                 let report = spec.and_then(|spec| verify::verify(&args.file, spec)).hint_of(VerifyError::hint)?;
                 print(&if args.json { serde_json::to_string(&report)? } else { verified(&report) });
                 Ok(())
+            }
+            Command::Doctor(args) => {
+                let findings = doctor::examine(&args)?;
+                print(&if args.json { findings.json()? } else { findings.to_string() });
+                findings.verdict()
             }
         }
     }

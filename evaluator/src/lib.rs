@@ -10,10 +10,12 @@
 //! - [`verify`]: replays a recorded dataset and measures how far the simulation is from it.
 //! - [`score`]: scores saved policies, on this machine alone.
 //! - [`serve`]: finds runs on the network, evaluates their snapshots; [`metrics`]: its Prometheus metrics.
+//! - [`doctor`]: checks this machine before it is trusted with any of that.
 //! - [`cli`]: the command line.
 
 pub mod cli;
 pub mod collect;
+pub mod doctor;
 pub mod environment;
 pub mod metrics;
 pub mod rollout;

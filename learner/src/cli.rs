@@ -31,6 +31,9 @@ const FETCH_NOTE: &str = "\
 The file goes where D4RL keeps it: $D4RL_DATASET_DIR, or ~/.d4rl/datasets. $QUAD_DATASETS_URL, the address of a folder, is
 tried first. What a broken connection leaves is continued the next time.";
 
+const DOCTOR_NOTE: &str = "\
+A line per check: ok, warn or FAIL, and a hint where there is something to do. The exit code is 1 if anything failed.";
+
 /// Trains a diffusion policy and a critic ensemble from a file of transitions.
 #[derive(Debug, Parser)]
 #[command(name = "learner", version, arg_required_else_help = true)]
@@ -55,6 +58,8 @@ pub enum Command {
     Report(ReportArgs),
     /// Check by a run's folder alone that each episode is scored once, with the weights that are kept there
     Verify(VerifyArgs),
+    /// Check this machine before a run is trusted to it, and say what to do about what is wrong
+    Doctor(DoctorArgs),
 }
 
 /// Arguments of `learner train`.
@@ -207,6 +212,24 @@ pub struct VerifyArgs {
     pub same_as: Option<PathBuf>,
 }
 
+/// Arguments of `learner doctor`.
+#[derive(Debug, Args)]
+#[command(after_help = DOCTOR_NOTE)]
+pub struct DoctorArgs {
+    /// The router that the run is to join; without it, whether the learner can listen at its usual port is checked
+    #[arg(long, value_name = "ENDPOINT", value_parser = parse_endpoint)]
+    pub connect: Option<String>,
+    /// Folder of the run that is to begin or to go on
+    #[arg(long, value_name = "DIR", default_value = "runs")]
+    pub run_dir: PathBuf,
+    /// Folder of ca.pem, cert.pem and key.pem [default: $QUAD_CERTIFICATES; none]
+    #[arg(long, value_name = "DIR")]
+    pub certificates: Option<PathBuf>,
+    /// Print a JSON array of objects with verdict, check, what and, where there is something to do, hint
+    #[arg(long)]
+    pub json: bool,
+}
+
 /// Arguments of `learner report`.
 #[derive(Debug, Args)]
 pub struct ReportArgs {
@@ -260,6 +283,12 @@ mod tests {
         assert_eq!(train.changes(), expected);
         let Command::Train(train) = parse(&["--set", "seed=2", "--seed", "3"]).unwrap().command else { panic!() };
         assert_eq!(train.changes(), toml::toml! { dataset = "d.hdf5" seed = 3 });
+    }
+
+    #[test]
+    fn only_this_machine_sees_the_metrics_unless_told_otherwise() {
+        let Command::Train(train) = parse(&[]).unwrap().command else { panic!("not train") };
+        assert!(train.metrics.ip().is_loopback(), "{}", train.metrics);
     }
 
     #[test]

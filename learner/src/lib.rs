@@ -17,6 +17,7 @@
 //! - [`wire`] declares everything on Zenoh; its callbacks fill an [`inbox`], and [`replies`] answers without anybody waiting
 //!   for a peer that does not read; [`notice`] is what threads tell the main loop.
 //! - [`run_dir`] is the folder of a run, [`metrics`] are for Prometheus, [`display`] shows progress on the terminal.
+//! - [`doctor`] checks a machine before a run is trusted to it.
 //! - [`report`] and [`plot`] summarise the scores as tables and as a picture; [`verify`] checks them against the folder.
 
 #![deny(unsafe_code)]
@@ -29,6 +30,7 @@ pub mod config;
 pub mod datasets;
 pub mod device;
 pub mod display;
+pub mod doctor;
 pub mod hub;
 pub mod inbox;
 pub mod keeper;

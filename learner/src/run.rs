@@ -8,16 +8,19 @@ use anyhow::{Context, anyhow};
 use quad_dataset::{DatasetError, ReadOptions, Transitions, environment};
 use quad_policy::Precision;
 use quad_protocol::Name;
-use quad_service::{Endpoints, Hint, hinted};
+use quad_service::{Endpoints, Health, Hint, hinted};
 use tokio::sync::mpsc;
 use toml::Table;
 use tracing::{debug, info, warn};
 
-use crate::cli::{Cli, Command, DatasetsCommand, InspectArgs, PresetsArgs, ReportArgs, TrainArgs, VerifyArgs};
+use crate::cli::{
+    Cli, Command, DatasetsCommand, DoctorArgs, InspectArgs, PresetsArgs, ReportArgs, TrainArgs, VerifyArgs,
+};
 use crate::conduct::{Conductor, Ending, open_network};
 use crate::config::{self, DatasetInfo, Experiment, RunConfig, RunInfo};
 use crate::datasets::{self, LocalDataset, Source};
 use crate::display::Display;
+use crate::doctor;
 use crate::metrics::Metrics;
 use crate::plot;
 use crate::presets;
@@ -40,6 +43,7 @@ pub fn run(cli: &Cli) -> anyhow::Result<()> {
         Command::Datasets(command) => datasets(command),
         Command::Report(args) => report(args),
         Command::Verify(args) => verify(args),
+        Command::Doctor(args) => examine(args),
     }
 }
 
@@ -83,6 +87,12 @@ fn verify(args: &VerifyArgs) -> anyhow::Result<()> {
     }
     anyhow::ensure!(findings.iter().all(|(_, found)| found.all_held()), "not everything held");
     Ok(())
+}
+
+fn examine(args: &DoctorArgs) -> anyhow::Result<()> {
+    let findings = doctor::examine(args)?;
+    print(&if args.json { findings.json()? } else { findings.to_string() })?;
+    findings.verdict()
 }
 
 fn datasets(command: &DatasetsCommand) -> anyhow::Result<()> {
@@ -187,7 +197,7 @@ async fn conduct(
 ) -> anyhow::Result<(RunDir, Ending)> {
     let steps = config.experiment.steps;
     let (metrics, registry) = Metrics::new(&run, steps, config.experiment.definition()?.metrics)?;
-    let server = quad_service::serve_metrics(args.metrics, registry).await?;
+    let server = quad_service::serve_metrics(args.metrics, registry, Health::default()).await?;
     let endpoints = endpoints(args, config.experiment.eval_interval);
     let opening = open_network(&endpoints).await.hint(
         "if the port is taken, perhaps by another learner, choose a free one with --listen tcp/127.0.0.1:0, \

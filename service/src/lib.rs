@@ -6,17 +6,22 @@
 //!
 //! - `logging`: where log lines go.
 //! - `session`: the connection between learner and evaluators, over Zenoh.
+//! - `health`: whether the parts of a process still do their work.
 //! - `metrics_server`: `/metrics` and `/healthz`.
 //! - `shutdown`: the signals that end a process.
 //! - `exit`: how an error is shown to the user, and the exit code.
+//! - [`doctor`]: checks a machine before a run is trusted to it.
 
+pub mod doctor;
 mod exit;
+mod health;
 mod logging;
 mod metrics_server;
 mod session;
 mod shutdown;
 
 pub use exit::{Hint, hinted, run_main};
+pub use health::{Beat, Health};
 pub use logging::init_logging;
 pub use metrics_server::{BindError, MetricsServer, serve_metrics};
 pub use session::{Endpoints, SessionError, open_session, parse_endpoint, reachable_at};

@@ -1,17 +1,36 @@
 //! `/metrics` and `/healthz`.
 
+use std::collections::VecDeque;
 use std::io;
 use std::net::SocketAddr;
+use std::time::Duration;
 
 use axum::Router;
 use axum::extract::State;
 use axum::http::{StatusCode, header};
 use axum::response::IntoResponse;
 use axum::routing::get;
+use hyper::server::conn::http1;
+use hyper_util::rt::{TokioIo, TokioTimer};
+use hyper_util::service::TowerToHyperService;
 use prometheus::{Registry, TEXT_FORMAT, TextEncoder};
-use tokio::net::TcpListener;
-use tokio::task::JoinHandle;
-use tracing::error;
+use tokio::net::{TcpListener, TcpStream};
+use tokio::task::{AbortHandle, JoinHandle, JoinSet};
+use tokio::time::timeout;
+use tracing::{debug, warn};
+
+use crate::Health;
+
+/// A question is a few lines in one packet. Whoever has not sent it whole by then is sent away.
+const QUESTION: Duration = Duration::from_secs(3);
+/// A connection is for one question, and lasts at most this long however slowly its client reads.
+const CONNECTION: Duration = Duration::from_secs(15);
+/// Connections at a time. One more ends the oldest of them, so that those who only hold one do not keep others out.
+const MOST_CONNECTIONS: usize = 64;
+/// Bytes that are kept of a connection's question; hyper takes no fewer.
+const MOST_BUFFERED: usize = 8 << 10;
+/// When a connection cannot be accepted, most likely because too many files are open, the next try is after this time.
+const RETRY: Duration = Duration::from_secs(1);
 
 /// Serves for as long as it is held.
 #[derive(Debug)]
@@ -31,26 +50,74 @@ pub struct BindError {
     pub source: io::Error,
 }
 
-/// Serves over HTTP at `address`: what `registry` gathers at `/metrics`, in Prometheus's text format, and `ok` at
-/// `/healthz`.
-pub async fn serve_metrics(address: SocketAddr, registry: Registry) -> Result<MetricsServer, BindError> {
+/// Serves over HTTP at `address`: at `/metrics` what `registry` gathers, in Prometheus's text format; at `/healthz` `ok`,
+/// or status 503 and a line for each thing that is wrong.
+///
+/// Clients that send or read slowly, or only hold connections, are cut off; they cost a bounded amount of memory.
+///
+/// # Errors
+/// The address cannot be listened at.
+pub async fn serve_metrics(
+    address: SocketAddr,
+    registry: Registry,
+    health: Health,
+) -> Result<MetricsServer, BindError> {
     let bind_error = |source| BindError { address, source };
     let listener = TcpListener::bind(address).await.map_err(bind_error)?;
     let address = listener.local_addr().map_err(bind_error)?;
-    let router =
-        Router::new().route("/metrics", get(metrics)).route("/healthz", get(async || "ok\n")).with_state(registry);
-    let task = tokio::spawn(async move {
-        if let Err(error) = axum::serve(listener, router).await {
-            error!("the metrics server at {address} broke off: {error}");
-        }
-    });
+    let metrics = get(metrics).with_state(registry);
+    let router = Router::new().route("/metrics", metrics).route("/healthz", get(healthz).with_state(health));
+    let task = tokio::spawn(accept(listener, router));
     Ok(MetricsServer { address, task })
+}
+
+async fn accept(listener: TcpListener, router: Router) {
+    // Dropped with this task, it ends them all.
+    let mut connections = JoinSet::new();
+    let mut oldest_first: VecDeque<AbortHandle> = VecDeque::new();
+    loop {
+        let stream = match listener.accept().await {
+            Ok((stream, _)) => stream,
+            Err(error) => {
+                warn!("a connection to the metrics page cannot be accepted: {error}");
+                tokio::time::sleep(RETRY).await;
+                continue;
+            }
+        };
+        while connections.try_join_next().is_some() {}
+        oldest_first.retain(|connection| !connection.is_finished());
+        if oldest_first.len() >= MOST_CONNECTIONS
+            && let Some(oldest) = oldest_first.pop_front()
+        {
+            oldest.abort();
+        }
+        oldest_first.push_back(connections.spawn(answer(stream, router.clone())));
+    }
+}
+
+/// One question and its answer.
+async fn answer(stream: TcpStream, router: Router) {
+    let mut server = http1::Builder::new();
+    server.timer(TokioTimer::new()).header_read_timeout(QUESTION).max_buf_size(MOST_BUFFERED).keep_alive(false);
+    let exchange = server.serve_connection(TokioIo::new(stream), TowerToHyperService::new(router));
+    match timeout(CONNECTION, exchange).await {
+        Ok(Ok(())) => {}
+        Ok(Err(error)) => debug!("a connection to the metrics page broke off: {error}"),
+        Err(_) => debug!("a client of the metrics page took longer than {CONNECTION:?}"),
+    }
 }
 
 async fn metrics(State(registry): State<Registry>) -> impl IntoResponse {
     match TextEncoder::new().encode_to_string(&registry.gather()) {
         Ok(text) => Ok(([(header::CONTENT_TYPE, TEXT_FORMAT)], text)),
         Err(error) => Err((StatusCode::INTERNAL_SERVER_ERROR, error.to_string())),
+    }
+}
+
+async fn healthz(State(health): State<Health>) -> (StatusCode, String) {
+    match health.problems() {
+        problems if problems.is_empty() => (StatusCode::OK, "ok\n".to_owned()),
+        problems => (StatusCode::SERVICE_UNAVAILABLE, problems.join("\n") + "\n"),
     }
 }
 

@@ -3,18 +3,22 @@
 
 use std::io::{Read, Write};
 use std::net::{SocketAddr, TcpStream};
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
 use prometheus::{IntGauge, Registry};
-use quad_service::{MetricsServer, serve_metrics};
+use quad_service::{Health, MetricsServer, serve_metrics};
 
 const ANY_PORT: SocketAddr = SocketAddr::new(std::net::IpAddr::V4(std::net::Ipv4Addr::LOCALHOST), 0);
 
 async fn server() -> (MetricsServer, IntGauge) {
+    server_with(Health::default()).await
+}
+
+async fn server_with(health: Health) -> (MetricsServer, IntGauge) {
     let registry = Registry::new();
     let gauge = IntGauge::new("quad_test_apples", "Apples in the test.").unwrap();
     registry.register(Box::new(gauge.clone())).unwrap();
-    (serve_metrics(ANY_PORT, registry).await.unwrap(), gauge)
+    (serve_metrics(ANY_PORT, registry, health).await.unwrap(), gauge)
 }
 
 /// Head and body of the response.
@@ -55,15 +59,78 @@ async fn health_and_nothing_else() {
 }
 
 #[tokio::test]
+async fn ill_health_is_told_line_by_line() {
+    let health = Health::default();
+    let (server, _) = server_with(health.clone()).await;
+    let hub = health.part("hub", Duration::from_secs(3600));
+    hub.set_trouble(Some("the disk is full".to_owned()));
+    drop(health.part("training", Duration::from_secs(3600)));
+    let (head, body) = get(server.address, "/healthz").await;
+    assert!(head.starts_with("http/1.1 503"), "{head}");
+    assert_eq!(body, "hub: the disk is full\ntraining: it ended before its work was done\n");
+    let (head, _) = get(server.address, "/metrics").await;
+    assert!(head.starts_with("http/1.1 200"), "a sick process is still measured: {head}");
+}
+
+/// How long the server keeps a connection on which `sent` is all that it ever gets.
+fn kept(address: SocketAddr, sent: &str) -> Duration {
+    let mut stream = TcpStream::connect(address).unwrap();
+    stream.write_all(sent.as_bytes()).unwrap();
+    stream.set_read_timeout(Some(Duration::from_secs(30))).unwrap();
+    let start = Instant::now();
+    // Whether it says something before it hangs up does not matter, only that it does.
+    match stream.read_to_end(&mut Vec::new()) {
+        Ok(_) => {}
+        Err(error) => assert_eq!(error.kind(), std::io::ErrorKind::ConnectionReset),
+    }
+    start.elapsed()
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn half_a_question_and_silence_are_cut_off_within_seconds() {
+    let (server, _) = server().await;
+    for sent in ["GET /metrics HTTP/1.1\r\nHost: x", "GET /met", ""] {
+        let address = server.address;
+        let time = tokio::task::spawn_blocking(move || kept(address, sent)).await.unwrap();
+        assert!(time < Duration::from_secs(10), "{sent:?} was waited for {time:?}");
+    }
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn connections_are_not_kept_for_a_second_question() {
+    let (server, _) = server().await;
+    let address = server.address;
+    let question = "GET /healthz HTTP/1.1\r\nHost: x\r\n\r\n";
+    let time = tokio::task::spawn_blocking(move || kept(address, question)).await.unwrap();
+    assert!(time < Duration::from_secs(2), "it was kept for {time:?}");
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn a_hundred_idle_connections_keep_nobody_out() {
+    let (server, _) = server().await;
+    let connect = |_| TcpStream::connect(server.address).unwrap();
+    let mut idle: Vec<TcpStream> = (0..100).map(connect).collect();
+    let start = Instant::now();
+    let (head, _) = get(server.address, "/metrics").await;
+    assert!(head.starts_with("http/1.1 200"), "{head}");
+    assert!(start.elapsed() < Duration::from_secs(1), "the answer took {:?}", start.elapsed());
+    // The first ones made room for the others: there is a bound.
+    idle[0].set_read_timeout(Some(Duration::from_secs(1))).unwrap();
+    let closed =
+        idle[0].read(&mut [0]).map_or_else(|error| error.kind() == std::io::ErrorKind::ConnectionReset, |n| n == 0);
+    assert!(closed, "the oldest connection is still there");
+}
+
+#[tokio::test]
 async fn an_address_in_use_is_an_error_and_free_again_afterwards() {
     let (server, _) = server().await;
     let address = server.address;
-    let error = serve_metrics(address, Registry::new()).await.unwrap_err();
+    let error = serve_metrics(address, Registry::new(), Health::default()).await.unwrap_err();
     assert_eq!(error.to_string(), format!("cannot serve metrics at {address}"));
     assert_eq!(error.source.kind(), std::io::ErrorKind::AddrInUse);
     drop(server);
     for _ in 0..100 {
-        if serve_metrics(address, Registry::new()).await.is_ok() {
+        if serve_metrics(address, Registry::new(), Health::default()).await.is_ok() {
             return;
         }
         tokio::time::sleep(Duration::from_millis(50)).await;

@@ -1,6 +1,7 @@
 //! Prometheus: one to start, and what to ask any.
 
 use std::fs;
+use std::path::Path;
 use std::process::Command;
 
 use serde_json::Value;
@@ -15,10 +16,11 @@ pub struct Prometheus {
     pub address: String,
 }
 
-/// Starts Debian's Prometheus, which scrapes the pages of each job twice a second.
+/// Starts Debian's Prometheus with our alert rules, which scrapes the pages of each job twice a second.
 pub fn start(scratch: &Scratch, jobs: &[(&str, &[String])]) -> (Process, Prometheus) {
     let configuration = scratch.path().join("prometheus.yml");
-    let mut text = "scrape_configs:\n".to_owned();
+    let rules = Path::new(env!("CARGO_MANIFEST_DIR")).join("../deploy/prometheus/alerts.yml");
+    let mut text = format!("global:\n  evaluation_interval: 500ms\nrule_files: [{rules:?}]\nscrape_configs:\n");
     for (job, pages) in jobs {
         text.push_str(&format!("- job_name: {job}\n  scrape_interval: 500ms\n  scrape_timeout: 500ms\n"));
         text.push_str(&format!("  static_configs:\n  - targets: {pages:?}\n"));

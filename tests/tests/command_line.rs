@@ -14,13 +14,13 @@ fn run(program: &str, arguments: &[&str]) -> Output {
 #[test]
 fn help_says_what_there_is() {
     for (program, arguments, words) in [
-        ("learner", &["--help"][..], &["train", "presets", "report"][..]),
+        ("learner", &["--help"][..], &["train", "presets", "report", "doctor"][..]),
         (
             "learner",
             &["train", "--help"],
             &["--preset", "--dataset", "--run-dir", "--guidance", "--set", "--listen", "--connect"],
         ),
-        ("evaluator", &["--help"], &["serve", "score", "collect", "verify-dataset"]),
+        ("evaluator", &["--help"], &["serve", "score", "collect", "verify-dataset", "doctor"]),
         ("evaluator", &["serve", "--help"], &["--connect", "--metrics", "tcp/127.0.0.1:7447"]),
     ] {
         let output = run(program, arguments);

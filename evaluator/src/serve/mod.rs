@@ -30,7 +30,7 @@ use anyhow::Context;
 use clap::Args;
 use quad_policy::Precision;
 use quad_protocol::Name;
-use quad_service::{Hint, parse_endpoint};
+use quad_service::{Health, Hint, parse_endpoint};
 use rand::Rng;
 use tracing::{info, warn};
 
@@ -72,6 +72,9 @@ const HAND_BACK: Duration = Duration::from_secs(1);
 /// Then the process waits this long for its threads and for the session to close.
 const LEAVE: Duration = Duration::from_secs(1);
 
+/// The worker counts as stuck when it has got nowhere for this long. It waits up to half a minute for weights.
+const STUCK: Duration = Duration::from_secs(60);
+
 /// Serves until SIGINT or SIGTERM.
 pub fn serve(args: ServeArgs) -> anyhow::Result<()> {
     keep_heap_small();
@@ -95,10 +98,11 @@ async fn serve_until_stopped(args: ServeArgs) -> anyhow::Result<()> {
         warn!("{}", Precision::UNAVAILABLE);
     }
     let precision = args.precision.unwrap_or(Precision::Bf16);
+    let health = Health::default();
     // Serves for as long as it is held.
     let _server = match args.metrics {
         Some(address) => {
-            let server = quad_service::serve_metrics(address, metrics.registry.clone())
+            let server = quad_service::serve_metrics(address, metrics.registry.clone(), health.clone())
                 .await
                 .hint("choose another address or port for --metrics, or port 0 for a free one")?;
             info!("metrics at http://{}/metrics", server.address);
@@ -107,7 +111,7 @@ async fn serve_until_stopped(args: ServeArgs) -> anyhow::Result<()> {
         None => None,
     };
     let mut discovery = Discovery::start(args.connect, &metrics);
-    let worker = Worker::new(name, precision, metrics.clone(), discovery.runs())?;
+    let worker = Worker::new(name, precision, metrics.clone(), discovery.runs(), health.part("worker", STUCK))?;
     let held = worker.held();
     let mut work = std::pin::pin!(worker.run());
     let result = tokio::select! {

@@ -8,6 +8,7 @@ use anyhow::Context;
 use quad_dataset::environment::EnvironmentSpec;
 use quad_policy::{Policy, PolicyError, Precision};
 use quad_protocol::{CannotAct, EpisodeScore, Hash, Job, Name, ScoreReport};
+use quad_service::Beat;
 use tokio::sync::{Notify, watch};
 use tokio::time::{MissedTickBehavior, interval};
 use tracing::{info, warn};
@@ -46,10 +47,11 @@ pub struct Worker {
     held: Held,
     /// The policy of the last job: the next one is often about the same.
     policy: Option<(Hash, Arc<dyn Policy>)>,
+    beat: Beat,
 }
 
 impl Worker {
-    /// A worker for the runs that `found` names.
+    /// A worker for the runs that `found` names, which says by `beat` that it is not stuck.
     ///
     /// # Errors
     ///
@@ -59,6 +61,7 @@ impl Worker {
         precision: Precision,
         metrics: Metrics,
         found: watch::Receiver<Runs>,
+        beat: Beat,
     ) -> anyhow::Result<Worker> {
         let identity = Identity { evaluator, precision: Name::new(precision.in_effect().name())? };
         Ok(Worker {
@@ -72,6 +75,7 @@ impl Worker {
             budget: Budget::new(SNAPSHOTS),
             held: Held::default(),
             policy: None,
+            beat,
         })
     }
 
@@ -83,6 +87,7 @@ impl Worker {
     /// Serves until it is dropped. Dropped in the middle of a job, it abandons the job.
     pub async fn run(mut self) -> anyhow::Error {
         loop {
+            self.beat.alive();
             self.follow_discovery().await;
             let now = Instant::now();
             let due = self.runs.iter().filter(|(key, run)| self.is_there(key) && run.ready_at() <= now);
@@ -152,6 +157,7 @@ impl Worker {
         };
         tokio::select! {
             () = timer => {}
+            () = tokio::time::sleep(self.beat.interval()) => {}
             changed = self.found.changed() => changed.context("nobody looks for learners any more")?,
             () = self.snapshot_arrived.notified() => self.runs.values_mut().for_each(RunClient::wake_for_snapshot),
         }
@@ -267,6 +273,9 @@ impl Worker {
             let finished = running.finished_within(heartbeat(job)).await;
             let steps = running.steps_done();
             // Nothing to tell yet is told, too: the first step of a large policy takes its time.
+            if steps > told {
+                self.beat.alive();
+            }
             if steps > told || (steps == 0 && finished.is_none()) {
                 told = steps;
                 run.publish(job, (steps, running.episodes_done())).await;
@@ -281,3 +290,6 @@ impl Worker {
 fn heartbeat(job: &Job) -> Duration {
     HEARTBEAT.min(Duration::from_millis(job.lease_milliseconds / 3)).max(HEARTBEAT / 20)
 }
+
+#[cfg(test)]
+mod tests;

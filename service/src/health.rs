@@ -1,0 +1,160 @@
+//! Whether a process still does its work: its parts say that they are alive, `/healthz` tells who has stopped.
+
+use std::sync::atomic::{AtomicU64, Ordering::Relaxed};
+use std::sync::{Arc, Mutex, PoisonError};
+use std::time::{Duration, Instant};
+
+/// The parts of a process and how they are. Cheap to clone; all clones are the same.
+///
+/// Without parts, a process is healthy.
+#[derive(Clone, Debug, Default)]
+pub struct Health {
+    parts: Arc<Mutex<Vec<Arc<Part>>>>,
+}
+
+impl Health {
+    /// Adds a part of the process that promises to say so at least every `limit` while it is alive. It counts as alive
+    /// from now on.
+    pub fn part(&self, name: impl Into<String>, limit: Duration) -> Beat {
+        let part = Arc::new(Part {
+            name: name.into(),
+            limit,
+            start: Instant::now(),
+            last: AtomicU64::new(0),
+            state: Mutex::new(State { ending: Ending::Running, trouble: None }),
+        });
+        self.parts.lock().unwrap_or_else(PoisonError::into_inner).push(part.clone());
+        Beat { part }
+    }
+
+    /// What is wrong, a line each; nothing if all is well.
+    pub fn problems(&self) -> Vec<String> {
+        let parts = self.parts.lock().unwrap_or_else(PoisonError::into_inner);
+        parts.iter().flat_map(|part| part.problems()).collect()
+    }
+}
+
+/// What a part holds to say how it is. Dropped without [`finish`](Beat::finish), as by a panic of its thread, the part
+/// counts as broken.
+#[derive(Debug)]
+pub struct Beat {
+    part: Arc<Part>,
+}
+
+impl Beat {
+    /// Says that the part is alive: a look at the clock and an atomic store, so any thread may do it as often as it likes.
+    pub fn alive(&self) {
+        self.part.last.store(self.part.start.elapsed().as_millis() as u64, Relaxed);
+    }
+
+    /// How often to say so when there is nothing else to do: several times within the limit.
+    pub fn interval(&self) -> Duration {
+        self.part.limit / 4
+    }
+
+    /// Says what is wrong with the part although it is alive, like a full disk; `None` when it is over.
+    pub fn set_trouble(&self, trouble: Option<String>) {
+        self.part.state().trouble = trouble;
+    }
+
+    /// The part's work is done; it need not be alive any more.
+    pub fn finish(self) {
+        self.part.state().ending = Ending::Finished;
+    }
+}
+
+impl Drop for Beat {
+    fn drop(&mut self) {
+        let mut state = self.part.state();
+        if state.ending == Ending::Running {
+            state.ending = Ending::Broken;
+        }
+    }
+}
+
+#[derive(Debug)]
+struct Part {
+    name: String,
+    limit: Duration,
+    start: Instant,
+    /// Milliseconds from `start` to the last sign of life.
+    last: AtomicU64,
+    state: Mutex<State>,
+}
+
+#[derive(Debug)]
+struct State {
+    ending: Ending,
+    trouble: Option<String>,
+}
+
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+enum Ending {
+    Running,
+    Finished,
+    Broken,
+}
+
+impl Part {
+    fn state(&self) -> std::sync::MutexGuard<'_, State> {
+        self.state.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+
+    fn problems(&self) -> Vec<String> {
+        let State { ending, trouble } = &*self.state();
+        let silent = self.start.elapsed().saturating_sub(Duration::from_millis(self.last.load(Relaxed)));
+        let stopped = match ending {
+            Ending::Finished => return Vec::new(),
+            Ending::Broken => Some(format!("{}: it ended before its work was done", self.name)),
+            Ending::Running => (silent > self.limit)
+                .then(|| format!("{}: no sign of life for {:.0?}, {:?} are allowed", self.name, silent, self.limit)),
+        };
+        stopped.into_iter().chain(trouble.iter().map(|trouble| format!("{}: {trouble}", self.name))).collect()
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    const LONG: Duration = Duration::from_secs(3600);
+    const SHORT: Duration = Duration::from_millis(20);
+
+    #[test]
+    fn a_part_that_falls_silent_is_named_until_it_is_back() {
+        let health = Health::default();
+        assert!(health.problems().is_empty(), "no parts, no problems");
+        let (hub, _other) = (health.part("hub", SHORT), health.part("other", LONG));
+        assert!(health.problems().is_empty());
+        std::thread::sleep(2 * SHORT);
+        let problems = health.clone().problems();
+        assert!(problems.len() == 1 && problems[0].starts_with("hub: no sign of life for "), "{problems:?}");
+        hub.alive();
+        assert!(health.problems().is_empty());
+    }
+
+    #[test]
+    fn a_part_that_is_done_may_be_silent_and_one_that_broke_off_may_not() {
+        let health = Health::default();
+        health.part("done", SHORT).finish();
+        std::thread::sleep(2 * SHORT);
+        assert!(health.problems().is_empty());
+        let beat = health.part("training", LONG);
+        let panicked = std::thread::spawn(move || {
+            beat.alive();
+            panic!("on purpose");
+        });
+        assert!(panicked.join().is_err());
+        assert_eq!(health.problems(), ["training: it ended before its work was done"]);
+    }
+
+    #[test]
+    fn trouble_is_told_as_long_as_it_lasts() {
+        let health = Health::default();
+        let beat = health.part("checkpoints", LONG);
+        beat.set_trouble(Some("the disk is full since 12:00".to_owned()));
+        assert_eq!(health.problems(), ["checkpoints: the disk is full since 12:00"]);
+        beat.set_trouble(None);
+        assert!(health.problems().is_empty());
+    }
+}
