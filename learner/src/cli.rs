@@ -64,13 +64,17 @@ pub struct TrainArgs {
     /// Folder of this run; its last part names the run [default: runs/PRESET-VARIANT-seedSEED]
     #[arg(long, value_name = "DIR")]
     pub run_dir: Option<PathBuf>,
-    /// Listen for evaluators here, e.g. tcp/127.0.0.1:7447, or tcp/0.0.0.0:7447 for other machines
-    /// [default: tcp/127.0.0.1:7447; any free port with --eval-interval 0]
+    /// Listen for evaluators here, e.g. tcp/127.0.0.1:7447, or tls/0.0.0.0:7447 for other machines
+    /// [default: tcp/127.0.0.1:7447, or tls/… with --certificates; any free port with --eval-interval 0]
     #[arg(long, value_name = "ENDPOINT", value_parser = parse_endpoint, conflicts_with = "connect")]
     pub listen: Option<String>,
     /// Join a Zenoh router instead, where evaluators are found, e.g. tcp/router:7447
     #[arg(long, value_name = "ENDPOINT", value_parser = parse_endpoint)]
     pub connect: Option<String>,
+    /// Folder with ca.pem, cert.pem and key.pem: evaluators must show a certificate of the same authority, and endpoints
+    /// are tls/HOST:PORT (docs/security.md)
+    #[arg(long, value_name = "DIR", env = "QUAD_CERTIFICATES")]
+    pub certificates: Option<PathBuf>,
     /// Serve /metrics and /healthz here; port 0 takes a free one (see DIR/endpoints.json)
     #[arg(long, value_name = "ADDR:PORT", default_value = "127.0.0.1:0")]
     pub metrics: SocketAddr,

@@ -87,13 +87,14 @@ impl Bench {
 
         let port = TcpListener::bind("127.0.0.1:0").unwrap().local_addr().unwrap().port();
         let endpoint = format!("tcp/127.0.0.1:{port}");
-        let session = open_session(&Endpoints { listen: vec![endpoint.clone()], connect: Vec::new() }).await.unwrap();
+        let session =
+            open_session(&Endpoints { listen: vec![endpoint.clone()], ..Endpoints::default() }).await.unwrap();
         let wire = Wire::declare(session, &run, &hub, &publisher, &metrics, || Ok(())).await.unwrap();
         Self { run, run_dir, endpoint, metrics, notices, publisher, hub, _wire: wire, _folder: folder }
     }
 
     async fn client(&self) -> Session {
-        open_session(&Endpoints { listen: Vec::new(), connect: vec![self.endpoint.clone()] }).await.unwrap()
+        open_session(&Endpoints { connect: vec![self.endpoint.clone()], ..Endpoints::default() }).await.unwrap()
     }
 
     async fn snapshot(&mut self, step: u64) {
