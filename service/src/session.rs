@@ -207,7 +207,6 @@ fn config(endpoints: &Endpoints) -> zenoh::Result<Config> {
     ];
     if let Some(certificates) = &endpoints.certificates {
         settings.push(("transport/link/tls", certificates.settings()));
-        settings.push(("transport/link/protocols", json!(["tls"])));
         if listens {
             settings.push(("access_control", access::rules()?));
             settings.push(("low_pass_filter", access::sizes()?));
