@@ -343,13 +343,18 @@ fn what_cannot_be_safe_is_refused_before_anything_starts() {
     let elsewhere = Certificates::make().unwrap();
     let scratch = Scratch::new();
     let preset = scratch.preset("run", Setting::default());
+    // Whatever would start nevertheless is stopped, with exit code 124.
+    let start = |program: &str| {
+        let mut command = Command::new("timeout");
+        command.arg(PATIENCE.as_secs().to_string()).arg(binary(program));
+        command
+    };
     let learner = |arguments: &[&str]| {
-        let mut command = Command::new(binary("learner"));
+        let mut command = start("learner");
         command.arg("train").arg("--preset").arg(&preset).arg("--dataset").arg(scratch.dataset());
         command.arg("--run-dir").arg(scratch.path().join("run")).args(arguments).output().unwrap()
     };
-    let evaluator =
-        |arguments: &[&str]| Command::new(binary("evaluator")).arg("serve").args(arguments).output().unwrap();
+    let evaluator = |arguments: &[&str]| start("evaluator").arg("serve").args(arguments).output().unwrap();
     let (good, tls) = (certificates.argument("evaluator"), format!("tls/127.0.0.1:{}", free_port()));
 
     let open = evaluator(&["--connect", "tcp/127.0.0.1:1", "--certificates", &good]);
@@ -376,7 +381,7 @@ fn what_cannot_be_safe_is_refused_before_anything_starts() {
     assert!(!scratch.path().join("run").exists(), "a refused start leaves a folder behind");
 
     // The environment variable is the flag, and without an endpoint the default one is protected.
-    let mut command = Command::new(binary("evaluator"));
+    let mut command = start("evaluator");
     command.arg("serve").env("QUAD_CERTIFICATES", certificates.of("nowhere"));
     assert_refused(&command.output().unwrap(), "nowhere/ca.pem", "certificates.sh");
 }
