@@ -39,6 +39,7 @@ install_packages() {
   if [ -n "$TESTS" ]; then
     python3 -c 'import ensurepip, venv' >/dev/null 2>&1 || missing+=(python3-venv)
     have shellcheck || missing+=(shellcheck)
+    have openssl || missing+=(openssl)
   fi
   [ ${#missing[@]} -gt 0 ] || return 0
 

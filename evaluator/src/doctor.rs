@@ -9,10 +9,11 @@ use quad_dataset::environment;
 use quad_policy::{ActionNoise, Precision};
 use quad_protocol::{CodecError, JobReply, JobRequest, Name, PROTOCOL_VERSION, decode_from, encode, keys};
 use quad_service::doctor::{Findings, certificates, machine, network};
-use quad_service::{Endpoints, parse_endpoint};
+use quad_service::{Certificates, Endpoints, Role, default_endpoint, parse_endpoint};
 use zenoh::Session;
 
 use crate::rollout::Rollout;
+use crate::serve::DEFAULT_PORT;
 
 /// How long learners are waited for.
 const ANSWER: Duration = Duration::from_secs(5);
@@ -24,11 +25,11 @@ A line per check: ok, warn or FAIL, and a hint where there is something to do. T
 #[derive(Args, Debug)]
 #[command(after_help = AFTER_HELP)]
 pub struct DoctorArgs {
-    /// Zenoh endpoint of a learner or a router
-    #[arg(long, value_name = "ENDPOINT", default_value = "tcp/127.0.0.1:7447", value_parser = parse_endpoint)]
-    connect: String,
-    /// Folder of ca.pem, cert.pem and key.pem [default: $QUAD_CERTIFICATES; none]
-    #[arg(long, value_name = "DIR")]
+    /// Zenoh endpoint of a learner or a router [default: tcp/127.0.0.1:7447, or tls/… with --certificates]
+    #[arg(long, value_name = "ENDPOINT", value_parser = parse_endpoint)]
+    connect: Option<String>,
+    /// Folder with ca.pem, cert.pem and key.pem, for endpoints tls/HOST:PORT (docs/security.md)
+    #[arg(long, value_name = "DIR", env = "QUAD_CERTIFICATES")]
     certificates: Option<PathBuf>,
     /// Print a JSON array of objects with verdict, check, what and, where there is something to do, hint
     #[arg(long)]
@@ -45,10 +46,12 @@ pub fn examine(args: &DoctorArgs) -> anyhow::Result<Findings> {
     machine::open_files(&mut findings);
     precision(&mut findings);
     simulator(&mut findings);
-    if let Some(folder) = certificates::chosen(args.certificates.as_deref()) {
-        certificates::folder(&mut findings, &folder);
-    }
-    let endpoints = Endpoints { connect: vec![args.connect.clone()], ..Endpoints::default() };
+    let certificates = args.certificates.as_deref().and_then(|folder| {
+        certificates::folder(&mut findings, folder);
+        Certificates::read(folder, Role::Evaluator).ok()
+    });
+    let endpoint = args.connect.clone().unwrap_or_else(|| default_endpoint(certificates.as_ref(), DEFAULT_PORT));
+    let endpoints = Endpoints { connect: vec![endpoint], certificates, ..Endpoints::default() };
     let runtime = tokio::runtime::Builder::new_multi_thread().worker_threads(2).enable_all().build()?;
     runtime.block_on(async {
         if let Some(session) = network::reach(&mut findings, &endpoints).await {

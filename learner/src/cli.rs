@@ -82,13 +82,17 @@ pub struct TrainArgs {
     /// Begin anew: a run that is in the folder already is kept under another name
     #[arg(long)]
     pub fresh: bool,
-    /// Listen for evaluators here, e.g. tcp/127.0.0.1:7447, or tcp/0.0.0.0:7447 for other machines
-    /// [default: tcp/127.0.0.1:7447; any free port with --eval-interval 0]
+    /// Listen for evaluators here, e.g. tcp/127.0.0.1:7447, or tls/0.0.0.0:7447 for other machines
+    /// [default: tcp/127.0.0.1:7447, or tls/… with --certificates; any free port with --eval-interval 0]
     #[arg(long, value_name = "ENDPOINT", value_parser = parse_endpoint, conflicts_with = "connect")]
     pub listen: Option<String>,
     /// Join a Zenoh router instead, where evaluators are found, e.g. tcp/router:7447
     #[arg(long, value_name = "ENDPOINT", value_parser = parse_endpoint)]
     pub connect: Option<String>,
+    /// Folder with ca.pem, cert.pem and key.pem: evaluators must show a certificate of the same authority, and endpoints
+    /// are tls/HOST:PORT (docs/security.md)
+    #[arg(long, value_name = "DIR", env = "QUAD_CERTIFICATES")]
+    pub certificates: Option<PathBuf>,
     /// Serve /metrics and /healthz here; port 0 takes a free one (see DIR/endpoints.json)
     #[arg(long, value_name = "ADDR:PORT", default_value = "127.0.0.1:0")]
     pub metrics: SocketAddr,
@@ -222,8 +226,8 @@ pub struct DoctorArgs {
     /// Folder of the run that is to begin or to go on
     #[arg(long, value_name = "DIR", default_value = "runs")]
     pub run_dir: PathBuf,
-    /// Folder of ca.pem, cert.pem and key.pem [default: $QUAD_CERTIFICATES; none]
-    #[arg(long, value_name = "DIR")]
+    /// Folder with ca.pem, cert.pem and key.pem, for endpoints tls/HOST:PORT (docs/security.md)
+    #[arg(long, value_name = "DIR", env = "QUAD_CERTIFICATES")]
     pub certificates: Option<PathBuf>,
     /// Print a JSON array of objects with verdict, check, what and, where there is something to do, hint
     #[arg(long)]

@@ -6,8 +6,8 @@ use std::time::Duration;
 
 use quad_policy::Precision;
 use quad_protocol::{Name, keys};
-use quad_service::Endpoints;
 use quad_service::doctor::{Findings, certificates, disk, machine, network};
+use quad_service::{Certificates, Endpoints, Role};
 use zenoh::Session;
 
 use crate::cli::DoctorArgs;
@@ -33,11 +33,15 @@ pub fn examine(args: &DoctorArgs) -> anyhow::Result<Findings> {
         Ok(folder) => disk::folder(&mut findings, "datasets", &folder, "another folder is chosen by D4RL_DATASET_DIR"),
         Err(error) => findings.warn("datasets", format!("{error:#}"), "name a folder in D4RL_DATASET_DIR"),
     }
-    if let Some(folder) = certificates::chosen(args.certificates.as_deref()) {
-        certificates::folder(&mut findings, &folder);
-    }
+    let certificates = args.certificates.as_deref().and_then(|folder| {
+        certificates::folder(&mut findings, folder);
+        Certificates::read(folder, Role::Learner).ok()
+    });
     match &args.connect {
-        Some(endpoint) => router(&mut findings, endpoint, &args.run_dir)?,
+        Some(endpoint) => {
+            let endpoints = Endpoints { connect: vec![endpoint.clone()], certificates, ..Endpoints::default() };
+            router(&mut findings, &endpoints, &args.run_dir)?;
+        }
         None => port(&mut findings),
     }
     Ok(findings)
@@ -64,11 +68,10 @@ fn hdf5(findings: &mut Findings) {
     }
 }
 
-fn router(findings: &mut Findings, endpoint: &str, run_dir: &Path) -> anyhow::Result<()> {
-    let endpoints = Endpoints { connect: vec![endpoint.to_owned()], ..Endpoints::default() };
+fn router(findings: &mut Findings, endpoints: &Endpoints, run_dir: &Path) -> anyhow::Result<()> {
     let runtime = tokio::runtime::Builder::new_multi_thread().worker_threads(2).enable_all().build()?;
     runtime.block_on(async {
-        if let Some(session) = network::reach(findings, &endpoints).await {
+        if let Some(session) = network::reach(findings, endpoints).await {
             if let Some(run) = run_dir.file_name().and_then(|name| Name::new(name.to_str()?).ok()) {
                 namesake(findings, &session, &run).await;
             }

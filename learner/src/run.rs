@@ -8,7 +8,9 @@ use anyhow::{Context, anyhow};
 use quad_dataset::{DatasetError, ReadOptions, Transitions, environment};
 use quad_policy::Precision;
 use quad_protocol::Name;
-use quad_service::{Endpoints, Health, Hint, hinted};
+use quad_service::{
+    Certificates, CertificatesError, Endpoints, Health, Hint, Role, SessionError, default_endpoint, hinted,
+};
 use tokio::sync::mpsc;
 use toml::Table;
 use tracing::{debug, info, warn};
@@ -31,9 +33,9 @@ use crate::threads::{Run, Threads};
 use crate::verify;
 
 /// Where evaluators look by default.
-const DEFAULT_ENDPOINT: &str = "tcp/127.0.0.1:7447";
+const DEFAULT_PORT: u16 = 7447;
 /// For a run without evaluations, which needs no known port: several of them may run at a time.
-const ANY_ENDPOINT: &str = "tcp/127.0.0.1:0";
+const ANY_PORT: u16 = 0;
 
 /// Does what the command line says.
 pub fn run(cli: &Cli) -> anyhow::Result<()> {
@@ -142,6 +144,7 @@ fn train(args: &TrainArgs) -> anyhow::Result<()> {
     };
     let name = run_name(&path)?;
     let begun = resume::open(path.clone())?;
+    let endpoints = endpoints(args, experiment.eval_interval)?;
 
     args.device.check(experiment.precision)?;
     let dataset = source.obtain().hint(record_hint(&experiment))?;
@@ -163,7 +166,7 @@ fn train(args: &TrainArgs) -> anyhow::Result<()> {
 
     // Zenoh and the training thread have threads of their own; this runtime serves the metrics and the main loop.
     let runtime = tokio::runtime::Builder::new_multi_thread().worker_threads(2).enable_all().build()?;
-    let (run_dir, ending) = runtime.block_on(conduct(args, &path, begun, name, &config, transitions))?;
+    let (run_dir, ending) = runtime.block_on(conduct(args, endpoints, &path, begun, name, &config, transitions))?;
     conclude(&run_dir, &config, ending)
 }
 
@@ -189,6 +192,7 @@ fn check_batch(transitions: &Transitions, experiment: &Experiment) -> anyhow::Re
 
 async fn conduct(
     args: &TrainArgs,
+    endpoints: Endpoints,
     path: &Path,
     begun: Option<Begun>,
     run: Name,
@@ -198,11 +202,9 @@ async fn conduct(
     let steps = config.experiment.steps;
     let (metrics, registry) = Metrics::new(&run, steps, config.experiment.definition()?.metrics)?;
     let server = quad_service::serve_metrics(args.metrics, registry, Health::default()).await?;
-    let endpoints = endpoints(args, config.experiment.eval_interval);
-    let opening = open_network(&endpoints).await.hint(
-        "if the port is taken, perhaps by another learner, choose a free one with --listen tcp/127.0.0.1:0, \
-         or join a router with --connect",
-    )?;
+    let opening = open_network(&endpoints).await.hint_of(|error| {
+        error.downcast_ref().map_or("join a router with --connect, or listen with --listen", SessionError::hint)
+    })?;
     // From here on nothing outside can be wrong any more, so a refused start leaves no folder behind.
     let (run_dir, scores, past) = take_up(path, begun, args.fresh, config)?;
     let (notify, notices) = mpsc::unbounded_channel();
@@ -244,13 +246,17 @@ fn now() -> anyhow::Result<u64> {
     Ok(SystemTime::now().duration_since(UNIX_EPOCH)?.as_millis() as u64)
 }
 
-fn endpoints(args: &TrainArgs, eval_interval: u64) -> Endpoints {
-    let default = if eval_interval == 0 { ANY_ENDPOINT } else { DEFAULT_ENDPOINT };
+fn endpoints(args: &TrainArgs, eval_interval: u64) -> anyhow::Result<Endpoints> {
+    let certificates = args.certificates.as_deref().map(|folder| Certificates::read(folder, Role::Learner));
+    let certificates = certificates.transpose().hint_of(CertificatesError::hint)?;
+    let port = if eval_interval == 0 { ANY_PORT } else { DEFAULT_PORT };
     let listen = match (&args.listen, &args.connect) {
-        (None, None) => vec![default.to_owned()],
+        (None, None) => vec![default_endpoint(certificates.as_ref(), port)],
         (listen, _) => Vec::from_iter(listen.clone()),
     };
-    Endpoints { listen, connect: Vec::from_iter(args.connect.clone()) }
+    let endpoints = Endpoints { listen, connect: Vec::from_iter(args.connect.clone()), certificates };
+    endpoints.check().hint_of(SessionError::hint)?;
+    Ok(endpoints)
 }
 
 /// Writes the report, however the run ended; a run that did not complete is an error.

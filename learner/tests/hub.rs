@@ -89,14 +89,15 @@ impl Bench {
 
         let port = TcpListener::bind("127.0.0.1:0").unwrap().local_addr().unwrap().port();
         let endpoint = format!("tcp/127.0.0.1:{port}");
-        let session = open_session(&Endpoints { listen: vec![endpoint.clone()], connect: Vec::new() }).await.unwrap();
+        let session =
+            open_session(&Endpoints { listen: vec![endpoint.clone()], ..Endpoints::default() }).await.unwrap();
         let life = Life { run: run.clone(), incarnation: INCARNATION };
         let wire = Wire::declare(session, life, &hub, &publisher, &metrics, || Ok(())).await.unwrap();
         Self { run, run_dir, endpoint, metrics, notices, publisher, hub, _wire: wire, _folder: folder }
     }
 
     async fn client(&self) -> Session {
-        open_session(&Endpoints { listen: Vec::new(), connect: vec![self.endpoint.clone()] }).await.unwrap()
+        open_session(&Endpoints { connect: vec![self.endpoint.clone()], ..Endpoints::default() }).await.unwrap()
     }
 
     async fn snapshot(&mut self, step: u64) {
@@ -424,7 +425,7 @@ async fn progress_that_was_heard_or_guessed_does_not_hold_a_job() {
 
 /// Asks for weights a hundred times, and then reads nothing: the process stops itself.
 async fn reads_nothing(endpoint: String) {
-    let endpoints = Endpoints { listen: Vec::new(), connect: vec![endpoint] };
+    let endpoints = Endpoints { connect: vec![endpoint], ..Endpoints::default() };
     let session = open_session(&endpoints).await.unwrap();
     for _ in 0..100 {
         let key = keys::weights_at(&name("bench"), 10);

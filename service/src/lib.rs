@@ -5,13 +5,16 @@
 //! In reading order, which is the order of a process's life:
 //!
 //! - `logging`: where log lines go.
-//! - `session`: the connection between learner and evaluators, over Zenoh.
+//! - `session`: the connection between learner and evaluators, over Zenoh; `certificates`: who a program is there;
+//!   `access`: what others may do.
 //! - `health`: whether the parts of a process still do their work.
 //! - `metrics_server`: `/metrics` and `/healthz`.
 //! - `shutdown`: the signals that end a process.
 //! - `exit`: how an error is shown to the user, and the exit code.
 //! - [`doctor`]: checks a machine before a run is trusted to it.
 
+mod access;
+mod certificates;
 pub mod doctor;
 mod exit;
 mod health;
@@ -20,9 +23,10 @@ mod metrics_server;
 mod session;
 mod shutdown;
 
+pub use certificates::{Certificates, CertificatesError, Role};
 pub use exit::{Hint, hinted, run_main};
 pub use health::{Beat, Health};
 pub use logging::init_logging;
 pub use metrics_server::{BindError, MetricsServer, serve_metrics};
-pub use session::{Endpoints, SessionError, open_session, parse_endpoint, reachable_at};
+pub use session::{Endpoints, SessionError, default_endpoint, open_session, parse_endpoint, reachable_at};
 pub use shutdown::shutdown_signal;

@@ -5,27 +5,43 @@ use std::time::Duration;
 
 use serde_json::{Value, json};
 use tokio::sync::oneshot;
+use tokio::time::timeout;
+use tracing::warn;
 use zenoh::config::EndPoint;
 use zenoh::{Config, Session, Wait};
+
+use crate::access;
+use crate::certificates::Certificates;
 
 /// A process that is frozen or disconnected counts as gone after this time. (One that ends or is killed is noticed at
 /// once.) Half of Zenoh's default; a machine that is busy training may still miss several keep-alive messages in it.
 const LEASE: Duration = Duration::from_secs(5);
-/// Largest message that is taken in, bytes: the largest snapshot that may be sent (64 MiB) and what Zenoh adds.
-const MAX_MESSAGE_SIZE: u64 = 65 << 20;
+/// Largest message that a client takes in, bytes: the largest snapshot that may be sent (64 MiB) and what Zenoh adds.
+const MAX_SNAPSHOT_SIZE: u64 = 65 << 20;
+/// Largest message that a session takes in that listens, bytes: claims, reports and progress, of which 1 MiB is the most,
+/// and what Zenoh adds. Each of many connections can start 16 messages (8 priorities, reliable or not) that Zenoh keeps
+/// until they are whole: 65 MiB for each would be 1 GiB for each connection.
+const MAX_REQUEST_SIZE: u64 = 2 << 20;
+/// Most connections of a session that listens. Each is an open file, of which many systems allow a process 1024; the rest
+/// is for datasets, logs and metrics. Beyond it, connections are refused; without it, files could not be opened any more.
+const MAX_SESSIONS: u64 = 768;
 /// First and longest pause between two tries to connect. A learner or router that comes back should not be waited for
 /// longer than it takes to notice.
 const RETRY: [Duration; 2] = [Duration::from_millis(250), Duration::from_secs(2)];
 /// How long a large message that may be dropped waits for a receiver that does not keep up. Zenoh's 50 ms are not
 /// enough for a snapshot when training has taken all cores; a receiver that hangs must not hold up the others for long.
 const DROP_AFTER: Duration = Duration::from_millis(500);
+/// A client that has no connection after this time says so.
+const PATIENCE: Duration = Duration::from_secs(10);
 /// A session asks itself what it listens at, so there is no network in between.
 const SELF_QUERY_TIMEOUT: Duration = Duration::from_secs(5);
 
-/// The one protocol that Zenoh is built with here.
-const PROTOCOL: &str = "tcp/";
+/// The protocols that Zenoh is built with here: readable by anybody in between, and encrypted and authenticated.
+const OPEN: &str = "tcp/";
+const PROTECTED: &str = "tls/";
 
-/// Where a session meets the others, as Zenoh's endpoints: `tcp/127.0.0.1:7447`.
+/// Where a session meets the others, as Zenoh's endpoints: `tcp/127.0.0.1:7447`, or with certificates
+/// `tls/127.0.0.1:7447`.
 ///
 /// There is no scouting: nobody is found that was not named. A session that listens is a peer, to which others connect
 /// directly; one that does not is a client of the peer or router that it connects to.
@@ -35,6 +51,9 @@ pub struct Endpoints {
     pub listen: Vec<String>,
     /// Connect to these. A client keeps one connection: to talk to several meeting points, open a session for each.
     pub connect: Vec<String>,
+    /// With them, every connection is by TLS, and both sides show who they are. Whoever connects to a session that
+    /// listens may do what deploy/zenoh/router-tls.json5 allows.
+    pub certificates: Option<Certificates>,
 }
 
 /// There is no session, or it does not answer.
@@ -44,9 +63,21 @@ pub enum SessionError {
     #[error("no endpoint to listen at or to connect to")]
     NoEndpoint,
     /// Not an endpoint that this program can use. Zenoh would try for ever to connect to one of another protocol.
-    #[error("{endpoint:?} is not an endpoint; write it like {PROTOCOL}127.0.0.1:7447")]
+    #[error("{endpoint:?} is not an endpoint; write it like {OPEN}127.0.0.1:7447 or {PROTECTED}127.0.0.1:7447")]
     NotAnEndpoint {
         /// What was given.
+        endpoint: String,
+    },
+    /// Certificates are there, but would not be used.
+    #[error("certificates are given, but the connection at {endpoint} would be open to anybody")]
+    Open {
+        /// The endpoint.
+        endpoint: String,
+    },
+    /// Certificates are not there, but would be needed.
+    #[error("{endpoint} needs certificates")]
+    NoCertificates {
+        /// The endpoint.
         endpoint: String,
     },
     /// It cannot be listened at, or its options are wrong.
@@ -62,13 +93,56 @@ pub enum SessionError {
     Unknown,
 }
 
+impl SessionError {
+    /// What to do about it.
+    pub fn hint(&self) -> &'static str {
+        match self {
+            SessionError::Open { .. } => "write the endpoint like tls/HOST:PORT, or leave --certificates away",
+            SessionError::NoCertificates { .. } => {
+                "name their folder by --certificates DIR or QUAD_CERTIFICATES; deploy/zenoh/certificates.sh makes one"
+            }
+            _ => {
+                "if the port is taken, perhaps by another learner, choose a free one with --listen tcp/127.0.0.1:0, \
+                 or join a router with --connect"
+            }
+        }
+    }
+}
+
+impl Endpoints {
+    /// Tells early what [`open_session`] would refuse.
+    ///
+    /// # Errors
+    ///
+    /// None or malformed ones; tcp/ with certificates, and tls/ without.
+    pub fn check(&self) -> Result<(), SessionError> {
+        if self.listen.is_empty() && self.connect.is_empty() {
+            return Err(SessionError::NoEndpoint);
+        }
+        for endpoint in self.listen.iter().chain(&self.connect) {
+            let endpoint = parse_endpoint(endpoint)?;
+            match (endpoint.starts_with(PROTECTED), &self.certificates) {
+                (false, Some(_)) => return Err(SessionError::Open { endpoint }),
+                (true, None) => return Err(SessionError::NoCertificates { endpoint }),
+                _ => {}
+            }
+        }
+        Ok(())
+    }
+}
+
+/// Where learner and evaluator of one machine meet, at `port`, if nothing else is said.
+pub fn default_endpoint(certificates: Option<&Certificates>, port: u16) -> String {
+    format!("{}127.0.0.1:{port}", if certificates.is_some() { PROTECTED } else { OPEN })
+}
+
 /// Checks an endpoint that a person wrote, and gives it back as it is: a `value_parser` for a command line.
 ///
 /// # Errors
 ///
-/// [`SessionError::NotAnEndpoint`]: it is malformed, or names another protocol than TCP.
+/// [`SessionError::NotAnEndpoint`]: it is malformed, or names another protocol than TCP and TLS.
 pub fn parse_endpoint(text: &str) -> Result<String, SessionError> {
-    if text.starts_with(PROTOCOL) && text.parse::<EndPoint>().is_ok() {
+    if [OPEN, PROTECTED].iter().any(|protocol| text.starts_with(protocol)) && text.parse::<EndPoint>().is_ok() {
         return Ok(text.to_owned());
     }
     Err(SessionError::NotAnEndpoint { endpoint: text.to_owned() })
@@ -80,12 +154,7 @@ pub fn parse_endpoint(text: &str) -> Result<String, SessionError> {
 /// point that has not started yet, until this future is dropped, and later connects again whenever the connection is
 /// lost.
 pub async fn open_session(endpoints: &Endpoints) -> Result<Session, SessionError> {
-    if endpoints.listen.is_empty() && endpoints.connect.is_empty() {
-        return Err(SessionError::NoEndpoint);
-    }
-    for endpoint in endpoints.listen.iter().chain(&endpoints.connect) {
-        parse_endpoint(endpoint)?;
-    }
+    endpoints.check()?;
     let wrong = |error| {
         let endpoints = [&endpoints.listen[..], &endpoints.connect[..]].concat().join(", ");
         SessionError::Endpoint { endpoints, reason: for_people(error) }
@@ -93,16 +162,29 @@ pub async fn open_session(endpoints: &Endpoints) -> Result<Session, SessionError
     let config = config(endpoints).map_err(wrong)?;
     // Zenoh's future blocks its thread until there is a connection, so it gets one of its own, which is never
     // joined: dropping this future gives up waiting, and does not keep the process from ending.
-    let (sender, opened) = oneshot::channel();
+    let (sender, mut opened) = oneshot::channel();
     let open = move || drop(sender.send(zenoh::open(config).wait()));
     thread::Builder::new().name("zenoh-open".to_owned()).spawn(open).map_err(|error| wrong(error.into()))?;
-    opened.await.map_err(|error| wrong(error.into()))?.map_err(wrong)
+    let opened = match timeout(PATIENCE, &mut opened).await {
+        Ok(opened) => opened,
+        Err(_) => {
+            // Zenoh keeps its reasons to itself, and goes on.
+            warn!(
+                "no connection to {} yet: nobody is there, or one of the two refuses the other's certificate; \
+                 with RUST_LOG=zenoh::net::runtime=debug you see each try",
+                endpoints.connect.join(", ")
+            );
+            opened.await
+        }
+    };
+    opened.map_err(|error| wrong(error.into()))?.map_err(wrong)
 }
 
 fn config(endpoints: &Endpoints) -> zenoh::Result<Config> {
-    let mode = if endpoints.listen.is_empty() { "client" } else { "peer" };
+    let listens = !endpoints.listen.is_empty();
+    let mode = if listens { "peer" } else { "client" };
     let retry = RETRY.map(|pause| pause.as_millis() as u64);
-    let settings = [
+    let mut settings = vec![
         ("mode", json!(mode)),
         ("listen/endpoints", json!(endpoints.listen)),
         ("connect/endpoints", json!(endpoints.connect)),
@@ -117,11 +199,19 @@ fn config(endpoints: &Endpoints) -> zenoh::Result<Config> {
             "transport/link/tx/queue/congestion_control/drop/max_wait_before_drop_fragments",
             json!(DROP_AFTER.as_micros() as u64),
         ),
-        ("transport/link/rx/max_message_size", json!(MAX_MESSAGE_SIZE)),
+        ("transport/link/rx/max_message_size", json!(if listens { MAX_REQUEST_SIZE } else { MAX_SNAPSHOT_SIZE })),
+        ("transport/unicast/max_sessions", json!(MAX_SESSIONS)),
         // The only stable way to learn a port that the system chose. Others could read the configuration there, so it
         // is closed where it is not needed.
         ("adminspace/enabled", json!(endpoints.listen.iter().any(|endpoint| leaves_port_open(endpoint)))),
     ];
+    if let Some(certificates) = &endpoints.certificates {
+        settings.push(("transport/link/tls", certificates.settings()));
+        if listens {
+            settings.push(("access_control", access::rules()?));
+            settings.push(("low_pass_filter", access::sizes()?));
+        }
+    }
     let mut config = Config::default();
     for (key, value) in settings {
         config.insert_json5(key, &value.to_string())?;

@@ -62,7 +62,10 @@ async fn declare_learner(session: &Session, run: &str) -> impl Sized + use<> {
     answers.spawn(async move {
         while let Ok(query) = queryable.recv_async().await {
             let mut bytes = query.payload().unwrap().to_bytes().into_owned();
-            bytes.reverse();
+            match &bytes[..] {
+                b"weights" => bytes.resize(SNAPSHOT, 0),
+                _ => bytes.reverse(),
+            }
             query.reply(query.key_expr().clone(), bytes).await.unwrap();
         }
     });
@@ -99,7 +102,7 @@ async fn talk(learner: &Session, evaluator: &Session, run: &str) {
     learner.put(&weights_key, snapshot.clone()).congestion_control(CongestionControl::Block).await.unwrap();
     let sample = timeout(PATIENCE, weights.recv_async()).await.expect("no weights arrived").unwrap();
     assert!(sample.payload().to_bytes() == snapshot, "the weights arrived changed");
-    assert_eq!(ask(evaluator, run, snapshot.clone()).await.unwrap().len(), SNAPSHOT);
+    assert_eq!(ask(evaluator, run, b"weights".to_vec()).await.unwrap().len(), SNAPSHOT);
 
     let progress_key = format!("quad/{run}/progress/e");
     evaluator.put(&progress_key, "half").await.unwrap();
@@ -126,11 +129,18 @@ async fn a_peer_serves_several_clients() {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn clients_of_one_peer_meet_through_it() {
-    let (_meeting_point, endpoint) = meeting_point().await;
-    let learner = open_session(&connecting_to(&endpoint)).await.unwrap();
+async fn a_session_that_listens_takes_in_no_large_message() {
+    let (learner, endpoint) = meeting_point().await;
+    let progress = learner.declare_subscriber("quad/run/progress/*").await.unwrap();
+    let _declared = declare_learner(&learner, "run").await;
     let evaluator = open_session(&connecting_to(&endpoint)).await.unwrap();
-    talk(&learner, &evaluator, "run").await;
+    let largest_report = vec![1; 1 << 20];
+    assert_eq!(ask(&evaluator, "run", largest_report.clone()).await.unwrap(), largest_report);
+    for size in [3 << 20, 1] {
+        evaluator.put("quad/run/progress/e", vec![1; size]).congestion_control(CongestionControl::Block).await.unwrap();
+    }
+    let sample = timeout(PATIENCE, progress.recv_async()).await.expect("no progress arrived").unwrap();
+    assert_eq!(sample.payload().len(), 1, "a message of megabytes was taken in");
 }
 
 #[tokio::test(flavor = "multi_thread")]
@@ -198,7 +208,9 @@ async fn what_cannot_work_is_an_error_at_once() {
 
 #[test]
 fn endpoints_on_a_command_line() {
-    for endpoint in ["tcp/127.0.0.1:7447", "tcp/[::1]:0", "tcp/learner.example:7447", "tcp/0.0.0.0:0#iface=lo"] {
+    for endpoint in
+        ["tcp/127.0.0.1:7447", "tcp/[::1]:0", "tcp/learner.example:7447", "tcp/0.0.0.0:0#iface=lo", "tls/a:1"]
+    {
         assert_eq!(parse_endpoint(endpoint).unwrap(), endpoint);
     }
     for wrong in ["127.0.0.1:7447", "udp/127.0.0.1:7447", "tcp", "tcp/", ""] {

@@ -1,4 +1,4 @@
-//! Programs that are not ours: Python with packages, Prometheus.
+//! Programs that are not ours: Python with packages, Prometheus, openssl.
 
 use std::path::{Path, PathBuf};
 use std::process::Command;
@@ -33,6 +33,18 @@ pub fn run_python(python: &Path, script: &str, arguments: &[&Path]) -> String {
     let errors = String::from_utf8_lossy(&output.stderr);
     assert!(output.status.success(), "{} ended with {}:\n{errors}", script.display(), output.status);
     String::from_utf8_lossy(&output.stdout).into_owned()
+}
+
+/// Makes certificates with deploy/zenoh/certificates.sh in `folder`; false if the test is to be skipped.
+pub fn certificates(folder: &Path, arguments: &[&str]) -> bool {
+    if Command::new("openssl").arg("version").output().is_err() {
+        missing("openssl", "install it with: apt-get install --no-install-recommends openssl");
+        return false;
+    }
+    let script = Path::new(env!("CARGO_MANIFEST_DIR")).join("../deploy/zenoh/certificates.sh");
+    let output = Command::new(script).arg("--in").arg(folder).args(arguments).output().expect("there is bash");
+    assert!(output.status.success(), "{arguments:?}: {}", String::from_utf8_lossy(&output.stderr));
+    true
 }
 
 /// Whether programs of Debian's package `prometheus` are there; if not, the test is to be skipped.

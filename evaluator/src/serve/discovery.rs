@@ -5,7 +5,7 @@ use std::convert::Infallible;
 
 use anyhow::Context;
 use quad_protocol::{Name, keys};
-use quad_service::{Endpoints, open_session};
+use quad_service::{Certificates, Endpoints, open_session};
 use tokio::sync::watch;
 use tokio::task::JoinSet;
 use tracing::{debug, info, warn};
@@ -47,11 +47,11 @@ impl Discovery {
     ///
     /// Each endpoint gets a session of its own, because a Zenoh client keeps one connection: with one session,
     /// a second learner's endpoint would only be a spare for the first.
-    pub fn start(endpoints: Vec<String>, metrics: &Metrics) -> Discovery {
+    pub fn start(endpoints: Vec<String>, certificates: Option<&Certificates>, metrics: &Metrics) -> Discovery {
         let (found, runs) = watch::channel(Runs::new());
         let mut tasks = JoinSet::new();
         for (index, endpoint) in endpoints.into_iter().enumerate() {
-            tasks.spawn(watch_endpoint(index, endpoint, found.clone(), metrics.clone()));
+            tasks.spawn(watch_endpoint(index, endpoint, certificates.cloned(), found.clone(), metrics.clone()));
         }
         Discovery { runs, tasks }
     }
@@ -75,11 +75,13 @@ impl Discovery {
 async fn watch_endpoint(
     index: usize,
     endpoint: String,
+    certificates: Option<Certificates>,
     found: watch::Sender<Runs>,
     metrics: Metrics,
 ) -> anyhow::Result<Infallible> {
     info!(endpoint, "waiting for a learner or a router");
-    let session = open_session(&Endpoints { listen: Vec::new(), connect: vec![endpoint.clone()] }).await?;
+    let endpoints = Endpoints { connect: vec![endpoint.clone()], certificates, ..Endpoints::default() };
+    let session = open_session(&endpoints).await?;
     info!(endpoint, "connected");
     let tokens = session
         .liveliness()

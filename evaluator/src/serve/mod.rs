@@ -23,6 +23,7 @@ mod snapshots;
 mod worker;
 
 use std::net::SocketAddr;
+use std::path::{Path, PathBuf};
 use std::sync::PoisonError;
 use std::time::Duration;
 
@@ -30,7 +31,9 @@ use anyhow::Context;
 use clap::Args;
 use quad_policy::Precision;
 use quad_protocol::Name;
-use quad_service::{Health, Hint, parse_endpoint};
+use quad_service::{
+    Certificates, CertificatesError, Endpoints, Health, Hint, Role, SessionError, default_endpoint, parse_endpoint,
+};
 use rand::Rng;
 use tracing::{info, warn};
 
@@ -45,6 +48,7 @@ Runs are found by themselves, also those that start later; several are served in
 Examples:
   evaluator serve                                       the learner of this machine
   evaluator serve --connect tcp/learner.example:7447    a learner or router elsewhere
+  evaluator serve --connect tls/learner.example:7447 --certificates certificates/box7    … that asks who comes
   evaluator serve --metrics 127.0.0.1:9101              with http://127.0.0.1:9101/metrics
 
 RAYON_NUM_THREADS bounds the processor cores that are used; without it, all are.";
@@ -54,8 +58,12 @@ RAYON_NUM_THREADS bounds the processor cores that are used; without it, all are.
 #[command(after_help = AFTER_HELP)]
 pub struct ServeArgs {
     /// Zenoh endpoint of a learner or a router; may be given several times
-    #[arg(long, value_name = "ENDPOINT", default_value = "tcp/127.0.0.1:7447", value_parser = parse_endpoint)]
+    /// [default: tcp/127.0.0.1:7447, or tls/… with --certificates]
+    #[arg(long, value_name = "ENDPOINT", value_parser = parse_endpoint)]
     connect: Vec<String>,
+    /// Folder with ca.pem, cert.pem and key.pem: who this evaluator is for endpoints like tls/HOST:PORT (docs/security.md)
+    #[arg(long, value_name = "DIR", env = "QUAD_CERTIFICATES")]
+    certificates: Option<PathBuf>,
     /// Where to serve /metrics and /healthz; port 0 takes a free one
     #[arg(long, value_name = "ADDR:PORT")]
     metrics: Option<SocketAddr>,
@@ -67,6 +75,8 @@ pub struct ServeArgs {
     precision: Option<Precision>,
 }
 
+/// Where a learner of this machine listens by default.
+pub(crate) const DEFAULT_PORT: u16 = 7447;
 /// When it is told to stop, it hands its job back within this time.
 const HAND_BACK: Duration = Duration::from_secs(1);
 /// Then the process waits this long for its threads and for the session to close.
@@ -93,6 +103,7 @@ async fn serve_until_stopped(args: ServeArgs) -> anyhow::Result<()> {
     let stop = quad_service::shutdown_signal();
     let metrics = Metrics::new().context("cannot register the metrics")?;
     let name = args.name.map_or_else(unique_name, Ok)?;
+    let endpoints = endpoints(args.connect, args.certificates.as_deref())?;
     info!(evaluator = %name, "ready to serve");
     if args.precision.is_some_and(|wanted| !wanted.is_available()) {
         warn!("{}", Precision::UNAVAILABLE);
@@ -110,7 +121,7 @@ async fn serve_until_stopped(args: ServeArgs) -> anyhow::Result<()> {
         }
         None => None,
     };
-    let mut discovery = Discovery::start(args.connect, &metrics);
+    let mut discovery = Discovery::start(endpoints.connect, endpoints.certificates.as_ref(), &metrics);
     let worker = Worker::new(name, precision, metrics.clone(), discovery.runs(), health.part("worker", STUCK))?;
     let held = worker.held();
     let mut work = std::pin::pin!(worker.run());
@@ -129,6 +140,17 @@ async fn serve_until_stopped(args: ServeArgs) -> anyhow::Result<()> {
     let (episodes, steps) = (metrics.episodes.get(), metrics.environment_steps.get());
     info!(episodes, steps, "leaving");
     result
+}
+
+fn endpoints(mut connect: Vec<String>, certificates: Option<&Path>) -> anyhow::Result<Endpoints> {
+    let certificates = certificates.map(|folder| Certificates::read(folder, Role::Evaluator));
+    let certificates = certificates.transpose().hint_of(CertificatesError::hint)?;
+    if connect.is_empty() {
+        connect.push(default_endpoint(certificates.as_ref(), DEFAULT_PORT));
+    }
+    let endpoints = Endpoints { connect, certificates, ..Endpoints::default() };
+    endpoints.check().hint_of(SessionError::hint)?;
+    Ok(endpoints)
 }
 
 /// Gives a freed snapshot's memory back to the system at once.

@@ -2,8 +2,7 @@
 //!
 //! The folder has `ca.pem`, which others' certificates must be signed by, and one's own `cert.pem` with its `key.pem`.
 
-use std::env;
-use std::path::{Path, PathBuf};
+use std::path::Path;
 use std::sync::Arc;
 use std::time::{Duration, SystemTime, UNIX_EPOCH};
 
@@ -21,15 +20,7 @@ use super::Findings;
 const SOON: Duration = Duration::from_secs(30 * 24 * 3600);
 const DAY: u64 = 24 * 3600;
 
-/// Names the folder, unless the command line does.
-const VARIABLE: &str = "QUAD_CERTIFICATES";
 const MAKE: &str = "make new ones, or copy all three files from where they were made";
-
-/// The folder that was named on the command line or in the environment, if any.
-pub fn chosen(argument: Option<&Path>) -> Option<PathBuf> {
-    let variable = || env::var_os(VARIABLE).filter(|value| !value.is_empty()).map(PathBuf::from);
-    argument.map(Path::to_owned).or_else(variable)
-}
 
 /// Checks the certificates in `folder`, with the time that it is now.
 pub fn folder(findings: &mut Findings, folder: &Path) {

@@ -2,7 +2,7 @@
 
 use std::sync::atomic::{AtomicBool, AtomicU32, Ordering::Relaxed};
 
-use quad_policy::ActionNoise;
+use quad_policy::{ActionNoise, Cost};
 use quad_protocol::Lease;
 use quad_service::{Endpoints, Health, open_session};
 
@@ -32,6 +32,10 @@ impl Policy for Sleeper {
 
     fn samples_candidates(&self) -> bool {
         false
+    }
+
+    fn cost(&self, _: usize, _: usize) -> Cost {
+        Cost { bytes: 0, products: 0 }
     }
 
     fn act(&self, _: &[f32], _: usize, _: &mut [ActionNoise], actions: &mut [f32]) -> Result<(), PolicyError> {

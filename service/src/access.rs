@@ -1,0 +1,42 @@
+//! What those who connect to a learner may do and send: the rules of the router's configuration.
+
+use serde_json::{Value, json};
+use zenoh::Config;
+
+/// The rules stand there once, for routers and for learners that listen themselves.
+const ROUTER: &str = include_str!("../../deploy/zenoh/router-tls.json5");
+
+/// Zenoh's `access_control` for a learner's own session.
+///
+/// A router lets learners publish and answer. At a learner nobody else may: it does so itself, and access control is
+/// about those who connect.
+pub(crate) fn rules() -> zenoh::Result<Value> {
+    let mut rules = of_router("access_control")?;
+    if let Some(policies) = rules["policies"].as_array_mut() {
+        policies.retain(|policy| policy["subjects"] != json!(["learner"]));
+    }
+    Ok(rules)
+}
+
+/// Zenoh's `low_pass_filter`: the largest message of each kind.
+pub(crate) fn sizes() -> zenoh::Result<Value> {
+    of_router("low_pass_filter")
+}
+
+fn of_router(key: &str) -> zenoh::Result<Value> {
+    Ok(serde_json::from_str(&Config::from_json5(ROUTER)?.get_json(key)?)?)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn at_a_learner_nobody_is_a_learner() {
+        let rules = rules().unwrap();
+        assert_eq!((&rules["enabled"], &rules["default_permission"]), (&json!(true), &json!("deny")));
+        let subjects: Vec<_> = rules["policies"].as_array().unwrap().iter().map(|policy| &policy["subjects"]).collect();
+        assert_eq!(subjects, [&json!(["evaluator"]), &json!(["monitor"])]);
+        assert!(!sizes().unwrap().as_array().unwrap().is_empty());
+    }
+}
