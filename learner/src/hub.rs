@@ -12,7 +12,7 @@ use quad_protocol::{
     EpisodeScore, Hash, JobReply, JobRequest, Message, Name, Progress, RecordedScores, ScoreReply, ScoreReport, decode,
     encode, episode_seeds, keys,
 };
-use quad_service::hinted;
+use quad_service::{Beat, hinted};
 use tokio::sync::mpsc::UnboundedSender;
 use tracing::{debug, error, warn};
 use zenoh::bytes::ZBytes;
@@ -115,9 +115,10 @@ impl Hub {
     }
 
     /// The thread's work, until it is told to stop.
-    pub fn run(mut self, messages: &Messages<Event>) {
+    pub fn run(mut self, messages: &Messages<Event>, beat: &Beat) {
         let mut ticked = Instant::now();
         while let Ok(event) = messages.next(TICK) {
+            beat.alive();
             match event {
                 None => {}
                 Some(Event::Stop) => return,

@@ -11,6 +11,7 @@ use std::time::{Duration, Instant, SystemTime, UNIX_EPOCH};
 
 use quad_dataset::Task;
 use quad_protocol::{Hash, Origin};
+use quad_service::Beat;
 use tokio::sync::mpsc::UnboundedSender;
 use tracing::{debug, warn};
 
@@ -93,9 +94,10 @@ impl Desk {
     }
 
     /// What is next. A checkpoint comes after the snapshots before it: who goes on from it does not make them again.
-    fn next(&self) -> Option<Work> {
+    fn next(&self, beat: &Beat) -> Option<Work> {
         let mut waiting = self.lock();
         loop {
+            beat.alive();
             waiting.busy = Some(Instant::now());
             if let Some(policy) = waiting.snapshots.pop_front() {
                 return Some(Work::Snapshot(policy));
@@ -110,7 +112,7 @@ impl Desk {
             if waiting.closed {
                 return None;
             }
-            waiting = self.shared.1.wait(waiting).unwrap_or_else(PoisonError::into_inner);
+            waiting = self.shared.1.wait_timeout(waiting, beat.interval()).unwrap_or_else(PoisonError::into_inner).0;
         }
     }
 
@@ -184,8 +186,8 @@ impl Keeper {
     }
 
     /// The thread's work, until the desk is closed and empty.
-    pub fn run(mut self) {
-        while let Some(work) = self.desk.next() {
+    pub fn run(mut self, beat: &Beat) {
+        while let Some(work) = self.desk.next(beat) {
             let kept = match &work {
                 Work::Snapshot(policy) => self.keep(policy),
                 Work::Checkpoint(checkpoint) => self.save(checkpoint),
@@ -196,10 +198,12 @@ impl Keeper {
             };
             match kept {
                 Ok(bytes) => {
+                    beat.set_trouble(None);
                     self.over();
                     self.desk.done(bytes);
                 }
                 Err(error) => {
+                    beat.set_trouble(Some(format!("the run cannot be saved: {error:#}")));
                     self.say(&error);
                     self.desk.put_back(work);
                     std::thread::sleep(RETRY);

@@ -2,12 +2,12 @@
 //! answers evaluators that missed one.
 
 use std::collections::BTreeMap;
-use std::time::Duration;
 
 use anyhow::Context;
 use quad_dataset::Task;
 use quad_policy::Description;
 use quad_protocol::{Hash, Name, Schema, Snapshot, WeightsRequest, decode, encode, keys};
+use quad_service::Beat;
 use tokio::sync::mpsc::UnboundedSender;
 use tracing::debug;
 use zenoh::Wait;
@@ -20,9 +20,6 @@ use crate::metrics::Metrics;
 use crate::notice::Notice;
 use crate::replies::{Asker, Question};
 use crate::run_dir::RunDir;
-
-/// Longest wait for a message. The thread does nothing between messages, so the value does not matter.
-const IDLE: Duration = Duration::from_secs(60);
 
 /// Messages to the thread.
 #[derive(Debug)]
@@ -91,11 +88,12 @@ impl SnapshotPublisher {
     }
 
     /// The thread's work, until it is told to stop.
-    pub fn run(mut self, messages: &Messages<Event>) {
+    pub fn run(mut self, messages: &Messages<Event>, beat: &Beat) {
         for (&step, &weights) in &self.hashes {
             self.hub.send(hub::Event::Evaluate { step, weights });
         }
-        while let Ok(event) = messages.next(IDLE) {
+        while let Ok(event) = messages.next(beat.interval()) {
+            beat.alive();
             match event {
                 None => {}
                 Some(Event::Kept(snapshot)) => {

@@ -201,7 +201,8 @@ async fn conduct(
 ) -> anyhow::Result<(RunDir, Ending)> {
     let steps = config.experiment.steps;
     let (metrics, registry) = Metrics::new(&run, steps, config.experiment.definition()?.metrics)?;
-    let server = quad_service::serve_metrics(args.metrics, registry, Health::default()).await?;
+    let health = Health::default();
+    let server = quad_service::serve_metrics(args.metrics, registry, health.clone()).await?;
     let opening = open_network(&endpoints).await.hint_of(|error| {
         error.downcast_ref().map_or("join a router with --connect, or listen with --listen", SessionError::hint)
     })?;
@@ -211,7 +212,7 @@ async fn conduct(
     let incarnation = now()?;
     let checkpoint_every = Duration::from_secs(args.checkpoint_seconds);
     let state = Run { name: run.clone(), incarnation, config, dir: &run_dir, scores, past, checkpoint_every };
-    let threads = Threads::start(state, transitions, &metrics, &notify)?;
+    let threads = Threads::start(state, transitions, &metrics, &health, &notify)?;
     let display = Display::start(metrics.clone(), steps);
     let metrics_address = server.address.to_string();
     let conductor = Conductor {

@@ -11,7 +11,7 @@ use std::time::Duration;
 use anyhow::{Context, anyhow};
 use quad_dataset::{BatchSampler, Task, Transitions};
 use quad_protocol::Name;
-use quad_service::hinted;
+use quad_service::{Beat, Health, hinted};
 use tokio::sync::mpsc::UnboundedSender;
 use tokio::sync::oneshot;
 use tracing::warn;
@@ -35,6 +35,10 @@ use crate::train::{Outcome, Outlets, Plan, Row, TrainError, train};
 const JOB_EPISODES: usize = 5;
 /// An evaluator tells its progress about once a second, and Zenoh notices a lost one after about 5 s.
 const LEASE: Duration = Duration::from_secs(15);
+/// A thread that answers others, or writes to the disk, is stuck if it has said nothing for so long.
+const STUCK: Duration = Duration::from_secs(30);
+/// So is training, whose slowest steps take seconds.
+const TRAINING_STUCK: Duration = Duration::from_secs(300);
 /// Lines of `metrics.jsonl` that may wait for the disk.
 const ROWS_WAITING: usize = 1024;
 
@@ -87,6 +91,7 @@ impl Threads {
         run: Run<'_>,
         transitions: Transitions,
         metrics: &Metrics,
+        health: &Health,
         notices: &UnboundedSender<Notice>,
     ) -> anyhow::Result<Self> {
         let Run { name, incarnation, config, dir, scores, past, checkpoint_every } = run;
@@ -107,7 +112,8 @@ impl Threads {
         scoreboard.remember(earlier);
         let state = Hub::new(name.clone(), plan, scoreboard, scores, metrics.clone(), notices.clone());
         let (hub, hub_messages) = inbox();
-        let hub_thread = spawn("hub", notices, move || state.run(&hub_messages))?;
+        let hub_thread =
+            spawn("hub", notices, with(health.part("hub", STUCK), move |beat| state.run(&hub_messages, beat)))?;
 
         let identity = Identity { run: name, incarnation, task: task.clone() };
         let state = SnapshotPublisher::new(
@@ -119,7 +125,11 @@ impl Threads {
             snapshots.clone(),
         );
         let (publisher, publisher_messages) = inbox();
-        let publisher_thread = spawn("publisher", notices, move || state.run(&publisher_messages))?;
+        let publisher_thread = spawn(
+            "publisher",
+            notices,
+            with(health.part("publisher", STUCK), move |beat| state.run(&publisher_messages, beat)),
+        )?;
 
         let desk = Desk::default();
         let provenance = Provenance { task, plan, candidates: experiment.candidates };
@@ -132,7 +142,7 @@ impl Threads {
             notices.clone(),
             snapshots,
         );
-        let keeper = spawn("keeper", notices, move || state.run())?;
+        let keeper = spawn("keeper", notices, with(health.part("keeper", STUCK), move |beat| state.run(beat)))?;
 
         let step = checkpoint.as_ref().map_or(0, |checkpoint| checkpoint.step);
         metrics.training.gradient_steps.inc_by(step);
@@ -154,10 +164,11 @@ impl Threads {
             desk: desk.clone(),
             stop: stop.clone(),
         };
-        let training = spawn("training", notices, move || {
+        let work = move |beat: &Beat| {
             // Nobody listens any more if the process is ending.
-            tell.send(trainer.run()).ok();
-        })?;
+            tell.send(trainer.run(beat)).ok();
+        };
+        let training = spawn("training", notices, with(health.part("training", TRAINING_STUCK), work))?;
         Ok(Self { publisher, hub, trained, desk, stop, training, rows, keeper, publisher_thread, hub_thread })
     }
 
@@ -188,6 +199,14 @@ type Thread = JoinHandle<Result<(), Panicked>>;
 struct Panicked {
     thread: String,
     message: String,
+}
+
+/// Work that says that it is alive, and when it is done. If it panics its health says so.
+fn with(beat: Beat, work: impl FnOnce(&Beat)) -> impl FnOnce() {
+    move || {
+        work(&beat);
+        beat.finish();
+    }
 }
 
 /// Starts a thread. If it panics the run ends: without it the process would look alive and do nothing.
@@ -229,7 +248,7 @@ struct Trainer {
 }
 
 impl Trainer {
-    fn run(self) -> TrainingResult {
+    fn run(self, beat: &Beat) -> TrainingResult {
         let experiment = &self.experiment;
         let setting = Setting {
             observation_dim: self.transitions.observation_dim(),
@@ -256,6 +275,7 @@ impl Trainer {
             snapshot: &|policy| self.desk.snapshot(policy, &self.stop),
             checkpoint: &|checkpoint| self.desk.checkpoint(checkpoint),
             stop: &self.stop,
+            beat,
         };
         let plan = Plan {
             steps: experiment.steps,

@@ -8,6 +8,7 @@ use std::time::{Duration, Instant};
 
 use quad_dataset::{Batch, BatchSampler, Transitions};
 use quad_policy::PolicyError;
+use quad_service::Beat;
 use serde::ser::SerializeMap;
 use serde::{Serialize, Serializer};
 use tracing::debug;
@@ -47,6 +48,8 @@ pub struct Outlets<'a> {
     pub checkpoint: &'a dyn Fn(Checkpoint),
     /// Set by somebody who wants training to end early.
     pub stop: &'a AtomicBool,
+    /// Told after every step.
+    pub beat: &'a Beat,
 }
 
 /// The policy after a gradient step, as it is handed over by training.
@@ -148,6 +151,7 @@ pub fn train(
         let values = agent.update(&batch).map_err(|source| TrainError::at(step, source))?;
         check_finite(step, agent.metrics(), &values)?;
         let updated = Instant::now();
+        outlets.beat.alive();
         outlets.metrics.observe(&values, updated - begin);
         mean.add(&values);
 

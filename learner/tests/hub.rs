@@ -17,7 +17,7 @@ use quad_protocol::{
     CannotAct, EpisodeScore, Hash, Job, JobReply, JobRequest, Lease, Message, Name, Origin, Progress, RecordedScores,
     ScoreReply, ScoreReport, Snapshot, WeightsRequest, decode, encode, keys,
 };
-use quad_service::{Endpoints, open_session};
+use quad_service::{Beat, Endpoints, Health, open_session};
 use safetensors::Dtype;
 use safetensors::tensor::TensorView;
 use tokio::sync::mpsc::UnboundedReceiver;
@@ -38,6 +38,10 @@ struct Bench {
     hub: Inbox<hub::Event>,
     _wire: Wire,
     _folder: tempfile::TempDir,
+}
+
+fn beat() -> Beat {
+    Health::default().part("a thread", PATIENCE)
 }
 
 fn name(text: &str) -> Name {
@@ -80,12 +84,12 @@ impl Bench {
         let log = run_dir.score_log().unwrap();
         let state = Hub::new(run.clone(), plan, Scoreboard::new(rules), log, metrics.clone(), notify.clone());
         let (hub, messages) = inbox();
-        std::thread::spawn(move || state.run(&messages));
+        std::thread::spawn(move || state.run(&messages, &beat()));
         let identity = Identity { run: run.clone(), incarnation: INCARNATION, task };
         let past = BTreeMap::new();
         let state = SnapshotPublisher::new(identity, run_dir.clone(), metrics.clone(), hub.clone(), notify, past);
         let (publisher, messages) = inbox();
-        std::thread::spawn(move || state.run(&messages));
+        std::thread::spawn(move || state.run(&messages, &beat()));
 
         let port = TcpListener::bind("127.0.0.1:0").unwrap().local_addr().unwrap().port();
         let endpoint = format!("tcp/127.0.0.1:{port}");

@@ -16,6 +16,7 @@ use quad_learner::run_dir::Checkpoint;
 use quad_learner::train::{self, Outcome, Outlets, Plan, TrainError, train};
 use quad_policy::Precision;
 use quad_protocol::Name;
+use quad_service::Health;
 
 struct Result {
     outcome: std::result::Result<Outcome, TrainError>,
@@ -93,6 +94,7 @@ fn run_from(from: Option<&Checkpoint>, plan: Plan, algorithm: &str, table: &toml
         snapshot: &|snapshot| snapshots.borrow_mut().push((snapshot.step, snapshot.evaluate)),
         checkpoint: &|checkpoint| checkpoints.borrow_mut().push(checkpoint),
         stop: &AtomicBool::new(stop),
+        beat: &Health::default().part("training", Duration::from_secs(60)),
     };
     let outcome = train(&mut agent, &transitions, &mut sampler, plan, &outlets);
     drop(outlets);

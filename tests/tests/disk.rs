@@ -63,6 +63,8 @@ fn a_full_disk_delays_scores_and_checkpoints_until_there_is_room() {
     wait_for_metric(&learner, "disk_trouble", |trouble| trouble == 1.0);
     let (steps, scores) = (metric(&learner, "gradient_steps_total").unwrap(), learner.scores().len());
     learner.process.wait_for_log("No space left on device", PATIENCE);
+    let (status, health) = http::get(&learner.metrics(), "/healthz").expect("the learner answers");
+    assert!(status == 503 && health.contains("keeper: the run cannot be saved"), "{status} {health}");
     wait_for_metric(&learner, "gradient_steps_total", |now| now == setting.steps as f64 || now > steps + 100.0);
     assert!(learner.scores().len() <= scores + 8, "a score counts as kept though there was no room for it");
 
