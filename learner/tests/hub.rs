@@ -419,11 +419,11 @@ async fn progress_that_was_heard_or_guessed_does_not_hold_a_job() {
     assert!(bench.rejected("wrong_proof") > 5 && bench.rejected("not_advanced") > 5);
 }
 
-/// Asks for weights a hundred times, and then reads nothing: the process stops itself.
+/// Asks for weights more often than answers may wait, and then reads nothing: the process stops itself.
 async fn reads_nothing(endpoint: String) {
     let endpoints = Endpoints { listen: Vec::new(), connect: vec![endpoint] };
     let session = open_session(&endpoints).await.unwrap();
-    for _ in 0..100 {
+    for _ in 0..125 {
         let key = keys::weights_at(&name("bench"), 10);
         session.get(key).timeout(PATIENCE).callback(drop).await.unwrap();
     }
