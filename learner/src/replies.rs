@@ -173,8 +173,10 @@ impl Shared {
                 if *closed {
                     return;
                 }
-                let waited = self.changed.wait_timeout(state, GRACE);
-                state = waited.unwrap_or_else(PoisonError::into_inner).0;
+                state = match waiting.is_empty() {
+                    true => self.changed.wait(state).unwrap_or_else(PoisonError::into_inner),
+                    false => self.changed.wait_timeout(state, GRACE).unwrap_or_else(PoisonError::into_inner).0,
+                };
                 continue;
             };
             busy.push(asker.clone());
