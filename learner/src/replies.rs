@@ -5,6 +5,9 @@
 //! It is shared fairly among those who ask, as far as they can be told apart: by the names that they give. Whoever gives none
 //! shares a place with all others who do not. (One who gives many names can take all places, for five seconds with each
 //! connection; against that only access control helps.)
+//!
+//! What is left is Zenoh's own: when it closes the connection of a peer that is still being sent to, its one sending thread
+//! waits for that sender, so the peers of this session hear nothing for up to five seconds. They connect again by themselves.
 
 use std::collections::VecDeque;
 use std::mem;
