@@ -423,7 +423,7 @@ async fn progress_that_was_heard_or_guessed_does_not_hold_a_job() {
 async fn reads_nothing(endpoint: String) {
     let endpoints = Endpoints { listen: Vec::new(), connect: vec![endpoint] };
     let session = open_session(&endpoints).await.unwrap();
-    for _ in 0..125 {
+    for _ in 0..170 {
         let key = keys::weights_at(&name("bench"), 10);
         session.get(key).timeout(PATIENCE).callback(drop).await.unwrap();
     }
