@@ -7,7 +7,7 @@ use prometheus::{Counter, Histogram, HistogramOpts, IntCounter, IntCounterVec, I
 pub enum JobOutcome {
     /// Its scores were acknowledged.
     Scored,
-    /// It was given up: this evaluator is leaving, or the learner refused the scores or never came back.
+    /// It was given up: this evaluator is leaving and hands it back, or the learner refused the scores or never came back.
     Abandoned,
     /// Its weights or its environment could not be used, or its policy could not act.
     Failed,

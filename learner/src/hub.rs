@@ -2,9 +2,9 @@
 //! single thread needs no locks, and its messages are small, so none delays the next one for long. Others send its answers.
 
 mod announcer;
+mod evaluators;
 mod rejection;
 
-use std::collections::{BTreeMap, BTreeSet};
 use std::time::{Duration, Instant};
 
 use anyhow::anyhow;
@@ -27,15 +27,11 @@ use crate::replies::{Asker, Question};
 use crate::run_dir::{Log, ScoreLine};
 use crate::scoreboard::{Claim, Lost, OtherWeights, Scoreboard};
 
-use announcer::Announcer;
+use evaluators::Evaluators;
 use rejection::Rejection;
 
 /// How often expired leases are looked for.
 const TICK: Duration = Duration::from_millis(250);
-/// The metrics of an evaluator that has left are dropped this long after its last progress message.
-const FORGET_AFTER: Duration = Duration::from_secs(600);
-/// Most evaluators that the learner tracks. No real pool is this large; the limit is for floods of made-up names.
-const MOST_EVALUATORS: usize = 1024;
 
 /// Messages to the thread.
 #[derive(Debug)]
@@ -82,10 +78,8 @@ pub struct Hub {
     scores: Log,
     metrics: Metrics,
     notices: UnboundedSender<Notice>,
-    announcer: Announcer,
+    evaluators: Evaluators,
     session: Option<Session>,
-    present: BTreeSet<Name>,
-    last_seen: BTreeMap<Name, Instant>,
     training_completed: bool,
 }
 
@@ -104,12 +98,10 @@ impl Hub {
             plan,
             scoreboard,
             scores,
+            evaluators: Evaluators::new(metrics.evaluators.clone(), notices.clone()),
             metrics,
-            announcer: Announcer::new(notices.clone()),
             notices,
             session: None,
-            present: BTreeSet::new(),
-            last_seen: BTreeMap::new(),
             training_completed: false,
         }
     }
@@ -274,50 +266,30 @@ impl Hub {
         let progress: Progress = parse(Some(sample.payload()))?;
         let now = Instant::now();
         self.scoreboard.progress(&progress, now)?;
-        if self.last_seen.len() >= MOST_EVALUATORS && !self.last_seen.contains_key(&progress.evaluator) {
-            return Err(Rejection::Crowd);
-        }
-        self.metrics.evaluators.observe(&progress);
-        self.last_seen.insert(progress.evaluator, now);
-        Ok(())
+        self.evaluators.heard(progress, now)
     }
 
     fn liveliness(&mut self, sample: &Sample) -> Result<(), Rejection> {
         let evaluator = keys::evaluator_of(sample.key_expr().as_str()).ok_or(Rejection::Name)?;
         match sample.kind() {
-            SampleKind::Put if self.present.len() >= MOST_EVALUATORS => return Err(Rejection::Crowd),
-            SampleKind::Put => {
-                if self.present.insert(evaluator.clone()) {
-                    self.announcer.joined(evaluator);
-                }
+            SampleKind::Put => self.evaluators.joined(evaluator)?,
+            SampleKind::Delete if self.evaluators.remove(&evaluator) => {
+                let lost = self.scoreboard.evaluator_gone(&evaluator);
+                self.evaluators.left(evaluator, lost.jobs);
+                self.lost(lost);
             }
-            SampleKind::Delete => {
-                if self.present.remove(&evaluator) {
-                    let lost = self.scoreboard.evaluator_gone(&evaluator);
-                    self.announcer.left(evaluator, lost.jobs);
-                    self.lost(lost);
-                }
-            }
+            SampleKind::Delete => {}
         }
-        self.metrics.evaluators.present.set(self.present.len() as i64);
         Ok(())
     }
 
     fn tick(&mut self, now: Instant) {
-        self.announcer.tick(now);
+        self.evaluators.tick(now);
         let expired = self.scoreboard.expire(now);
         if expired.jobs > 0 {
             self.notices.send(Notice::JobsExpired(expired.jobs)).ok();
         }
         self.lost(expired);
-        let (present, metrics) = (&self.present, &self.metrics.evaluators);
-        self.last_seen.retain(|evaluator, seen| {
-            let keep = present.contains(evaluator) || now.duration_since(*seen) < FORGET_AFTER;
-            if !keep {
-                metrics.forget(evaluator);
-            }
-            keep
-        });
     }
 
     fn lost(&mut self, lost: Lost) {

@@ -5,6 +5,9 @@
 //! It is shared fairly among those who ask, as far as they can be told apart: by the names that they give. Whoever gives none
 //! shares a place with all others who do not. (One who gives many names can take all places, for five seconds with each
 //! connection; against that only access control helps.)
+//!
+//! What is left is Zenoh's own: when it closes the connection of a peer that is still being sent to, its one sending thread
+//! waits for that sender, so the peers of this session hear nothing for up to five seconds. They connect again by themselves.
 
 use std::collections::VecDeque;
 use std::mem;
@@ -23,6 +26,9 @@ use crate::metrics::Metrics;
 
 /// Threads that answer.
 const THREADS: usize = 12;
+/// A query is dropped so long after its answer: Zenoh's own thread still holds it while it hands it over, and whoever drops it
+/// last may have to wait for the peer.
+const GRACE: Duration = Duration::from_millis(50);
 /// Most answers that may wait, of all and of one of those who ask.
 const MOST_WAITING: usize = 512;
 const MOST_WAITING_OF_ONE: usize = 64;
@@ -52,13 +58,25 @@ impl Asker {
 /// An answer: the key and the message, or an error for people.
 pub type Answer = Result<(String, ZBytes), String>;
 
-/// What makes an answer, on the thread that sends it.
+/// What makes an answer and sends it.
 type Work = Box<dyn FnOnce(&Query) + Send>;
 
 struct Task {
     asker: Asker,
     query: Query,
-    work: Work,
+    /// If there is none any more, the query is only to be dropped.
+    work: Option<Work>,
+    not_before: Instant,
+}
+
+impl Task {
+    fn answer(asker: Asker, query: Query, work: Work) -> Self {
+        Self { asker, query, work: Some(work), not_before: Instant::now() }
+    }
+
+    fn drop_later(asker: Asker, query: Query) -> Self {
+        Self { asker, query, work: None, not_before: Instant::now() + GRACE }
+    }
 }
 
 #[derive(Default)]
@@ -134,7 +152,7 @@ impl Replies {
         match asker {
             // The end of the road: whoever floods us with questions and does not read now waits here itself.
             Asker::Nobody => drop(query),
-            _ => self.put(Task { asker: Asker::Nobody, query, work: Box::new(|_| ()) }),
+            _ => self.put(Task::drop_later(Asker::Nobody, query)),
         }
     }
 }
@@ -147,22 +165,37 @@ impl Shared {
     fn work(&self) {
         let mut state = self.lock();
         loop {
-            let State { waiting, busy, .. } = &mut *state;
-            let may_start =
-                |task: &Task| busy.iter().filter(|asker| **asker == task.asker).count() < task.asker.most_threads();
+            let now = Instant::now();
+            let State { waiting, busy, closed } = &mut *state;
+            let may_start = |task: &Task| {
+                let threads = busy.iter().filter(|asker| **asker == task.asker).count();
+                threads < task.asker.most_threads() && (task.not_before <= now || *closed)
+            };
             let next = waiting.iter().position(may_start).and_then(|place| waiting.remove(place));
-            let Some(Task { asker, query, work }) = next else {
-                if state.closed {
+            let Some(Task { asker, query, work, .. }) = next else {
+                if *closed {
                     return;
                 }
-                state = self.changed.wait(state).unwrap_or_else(PoisonError::into_inner);
+                state = match waiting.is_empty() {
+                    true => self.changed.wait(state).unwrap_or_else(PoisonError::into_inner),
+                    false => self.changed.wait_timeout(state, GRACE).unwrap_or_else(PoisonError::into_inner).0,
+                };
                 continue;
             };
             busy.push(asker.clone());
             drop(state);
-            work(&query);
-            drop(query);
+            let answered = match work {
+                Some(work) => {
+                    work(&query);
+                    Some(Task::drop_later(asker.clone(), query))
+                }
+                None => {
+                    drop(query);
+                    None
+                }
+            };
             state = self.lock();
+            state.waiting.extend(answered);
             if let Some(place) = state.busy.iter().position(|other| *other == asker) {
                 state.busy.swap_remove(place);
             }
@@ -205,7 +238,7 @@ impl Question {
             }
         };
         if let Some(query) = mem::take(&mut self.query) {
-            self.replies.put(Task { asker, query, work: Box::new(send) });
+            self.replies.put(Task::answer(asker, query, Box::new(send)));
         }
     }
 }
@@ -213,7 +246,7 @@ impl Question {
 impl Drop for Question {
     fn drop(&mut self) {
         if let Some(query) = mem::take(&mut self.query) {
-            self.replies.put(Task { asker: Asker::Nobody, query, work: Box::new(|_| ()) });
+            self.replies.put(Task::drop_later(Asker::Nobody, query));
         }
     }
 }

@@ -1,8 +1,8 @@
 //! Bytes from the wire are not trusted: whatever strangers send, and however much, is counted, and the work goes on.
 #![allow(clippy::unwrap_used, clippy::expect_used)]
 
-use std::sync::Mutex;
 use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering};
+use std::sync::{Arc, Mutex};
 use std::time::{Duration, Instant};
 
 use quad_protocol::{
@@ -250,31 +250,27 @@ async fn a_flood_takes_bounded_memory_and_the_run_completes() {
     learner.process.wait_for_log("training is done", PATIENCE);
     let quiet = learner.process.peak_memory();
 
-    let stop = AtomicBool::new(false);
-    let page = learner.metrics();
-    let work = async {
-        tokio::task::block_in_place(|| {
-            for reason in ["unknown_incarnation", "unknown_weights", "unknown_step", "too_many_evaluators"] {
-                eventually(&format!("the learner counts {reason}"), PATIENCE, || {
-                    let label = format!("reason=\"{reason}\"");
-                    let page = http::metrics(&page)?;
-                    (http::sum(&page, "quad_learner_rejected_messages_total", &label) > 100.0).then_some(())
-                });
-            }
-            let evaluator = scratch.evaluator("steady", &endpoint);
-            eventually("the first scores", PATIENCE, || (!learner.scores().is_empty()).then_some(()));
-            let flooded = learner.process.peak_memory();
-            let status = learner.process.wait(PATIENCE);
-            assert!(status.success(), "the learner ended with {status}");
-            drop(evaluator);
-            stop.store(true, Ordering::Relaxed);
-            flooded
-        })
-    };
-    let (flooded, ()) = tokio::join!(work, async {
-        let (session, run, stop) = (session.clone(), run.clone(), &stop);
-        flood(&session, &run, stop).await;
+    let stop = Arc::new(AtomicBool::new(false));
+    let flooding = tokio::spawn({
+        let (session, run, stop) = (session.clone(), run.clone(), stop.clone());
+        async move { flood(&session, &run, &stop).await }
     });
+    let page = learner.metrics();
+    for reason in ["unknown_incarnation", "unknown_weights", "unknown_step", "too_many_evaluators"] {
+        eventually(&format!("the learner counts {reason}"), PATIENCE, || {
+            let label = format!("reason=\"{reason}\"");
+            let page = http::metrics(&page)?;
+            (http::sum(&page, "quad_learner_rejected_messages_total", &label) > 100.0).then_some(())
+        });
+    }
+    let evaluator = scratch.evaluator("steady", &endpoint);
+    eventually("the first scores", PATIENCE, || (!learner.scores().is_empty()).then_some(()));
+    let flooded = learner.process.peak_memory();
+    let status = learner.process.wait(PATIENCE);
+    assert!(status.success(), "the learner ended with {status}");
+    drop(evaluator);
+    stop.store(true, Ordering::Relaxed);
+    flooding.await.unwrap();
     learner.assert_complete(&setting);
     let growth = flooded.saturating_sub(quiet) >> 20;
     assert!(growth < 200, "the flood took {growth} MiB");

@@ -6,7 +6,8 @@
 //!
 //! - `discovery`: finds the runs, by their learners' liveliness tokens.
 //! - `worker`: the main loop, which serves the runs in turn.
-//! - `run`: everything that is exchanged with the learner of one run; `query`: a query to a learner.
+//! - `run`: everything that is exchanged with the learner of one run; `query`: a query to a learner; `hand_back`: a job that
+//!   is not done goes back.
 //! - `snapshots`: keeps the newest snapshot of a run, within a `budget`; `loading`: makes a policy of one.
 //! - `job`: all episodes of a job, as one batch.
 //!
@@ -15,6 +16,7 @@
 
 mod budget;
 mod discovery;
+mod hand_back;
 mod job;
 mod loading;
 mod query;

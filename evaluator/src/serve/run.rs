@@ -16,6 +16,7 @@ use zenoh::liveliness::LivelinessToken;
 
 use super::budget::Budget;
 use super::discovery::Found;
+use super::hand_back::HandBack;
 use super::query::ask;
 use super::snapshots::SnapshotReceiver;
 use crate::metrics::{JobOutcome, Metrics};
@@ -208,12 +209,7 @@ impl RunClient {
 
     /// What hands `job` back, also when this client is busy.
     pub fn hand_back(&self, job: &Job) -> HandBack {
-        HandBack {
-            session: self.session.clone(),
-            metrics: self.metrics.clone(),
-            evaluator: self.identity.evaluator.clone(),
-            job: job.clone(),
-        }
+        HandBack::new(self.session.clone(), self.metrics.clone(), self.identity.evaluator.clone(), job.clone())
     }
 
     /// The snapshot that `job` names: as it was published, or asked for where that was missed.
@@ -299,32 +295,6 @@ impl RunClient {
         if let Some(report) = self.undelivered {
             warn!(run = %self.run, step = report.step, "the learner did not come back for its scores");
             self.metrics.job(JobOutcome::Abandoned);
-        }
-    }
-}
-
-/// A job that is to be handed back, so that it need not wait for the end of its lease.
-pub struct HandBack {
-    session: Session,
-    metrics: Metrics,
-    evaluator: Name,
-    job: Job,
-}
-
-impl HandBack {
-    /// Hands it back, within `patience`. Best effort: without it, the lease runs out.
-    pub async fn send(self, patience: Duration) {
-        let Job { id, lease, run, incarnation, .. } = self.job;
-        let fitting = move |reply: &JobReply| match reply {
-            JobReply::HandedBack { incarnation: of, .. } if *of == incarnation => Ok(()),
-            JobReply::HandedBack { .. } => Err("other_incarnation"),
-            _ => Err("unexpected"),
-        };
-        let Ok(request) = encode(&JobRequest::HandBack { evaluator: self.evaluator, job: id, lease }) else { return };
-        match ask(&self.session, keys::jobs(&run), request, patience, &self.metrics, fitting).await {
-            Ok(JobReply::HandedBack { accepted: true, .. }) => info!(%run, "a job was handed back"),
-            Ok(_) => debug!(%run, "a job that was to be handed back had been taken away"),
-            Err(error) => debug!(%run, %error, "a job could not be handed back"),
         }
     }
 }

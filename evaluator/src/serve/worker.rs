@@ -10,14 +10,14 @@ use quad_policy::{Policy, PolicyError, Precision};
 use quad_protocol::{CannotAct, EpisodeScore, Hash, Job, Name, ScoreReport};
 use quad_service::Beat;
 use tokio::sync::{Notify, watch};
-use tokio::time::{MissedTickBehavior, interval};
 use tracing::{info, warn};
 
 use super::budget::Budget;
 use super::discovery::{RunKey, Runs};
+use super::hand_back::HandBack;
 use super::job::{self, Running};
 use super::loading::policy_for;
-use super::run::{HandBack, Identity, RunClient};
+use super::run::{Identity, RunClient};
 use crate::environment;
 use crate::metrics::{JobOutcome, Metrics};
 
@@ -228,13 +228,12 @@ impl Worker {
         let metrics = self.metrics.clone();
         let policy = {
             // The learner grants some time for this, as long as it hears that somebody is at it.
-            let mut heartbeat = interval(heartbeat(job));
-            heartbeat.set_missed_tick_behavior(MissedTickBehavior::Delay);
+            run.publish(job, (0, 0)).await;
             let mut loading = std::pin::pin!(self.policy(job, run));
             loop {
                 tokio::select! {
                     policy = &mut loading => break policy?,
-                    _ = heartbeat.tick() => run.publish(job, (0, 0)).await,
+                    () = tokio::time::sleep(heartbeat(job)) => run.publish(job, (0, 0)).await,
                 }
             }
         };

@@ -16,6 +16,8 @@ use crate::inbox::Inbox;
 
 /// The token of a learner that was cut off lasts for as long as Zenoh takes to notice: five seconds.
 const PATIENCE: Duration = Duration::from_secs(8);
+/// So long after the start an earlier learner of the name ends this one. Later only a stranger would come up with one.
+const TOGETHER: Duration = Duration::from_secs(10);
 /// How often it is looked for meanwhile, and how long an answer may take.
 const LOOK_AGAIN: Duration = Duration::from_millis(500);
 
@@ -54,12 +56,14 @@ async fn another(session: &Session, life: &Life) -> anyhow::Result<Option<u64>> 
     Ok(None)
 }
 
-/// Ends the run when a learner shows up that was started earlier. (A later one stops by itself.)
+/// Ends the run when a learner shows up that was started a little earlier. (A later one stops by itself.)
 pub(super) async fn watch(session: &Session, life: &Life, hub: &Inbox<hub::Event>) -> anyhow::Result<Subscriber<()>> {
     let (mine, inbox) = (life.clone(), hub.clone());
+    let start = Instant::now();
     let callback = move |token: Sample| {
+        let together = start.elapsed() < TOGETHER && token.kind() == SampleKind::Put;
         let found = keys::incarnation_of(token.key_expr().as_str());
-        let earlier = found.filter(|other| *other < mine.incarnation && token.kind() == SampleKind::Put);
+        let earlier = found.filter(|other| together && *other < mine.incarnation);
         if let Some(Err(error)) = earlier.map(|other| Err::<(), _>(is_there(&mine, other)).hint(HINT)) {
             inbox.offer_change(hub::Event::Twin(error)).ok();
         }

@@ -1,0 +1,80 @@
+//! Which evaluators are connected, and when each last told its progress.
+
+use std::collections::{BTreeMap, BTreeSet};
+use std::time::{Duration, Instant};
+
+use quad_protocol::{Name, Progress};
+use tokio::sync::mpsc::UnboundedSender;
+
+use super::announcer::Announcer;
+use super::rejection::Rejection;
+use crate::metrics::EvaluatorMetrics;
+use crate::notice::Notice;
+
+/// The metrics of an evaluator that has left are dropped this long after its last progress message.
+const FORGET_AFTER: Duration = Duration::from_secs(600);
+/// Most evaluators that the learner tracks. No real pool is this large; the limit is for floods of made-up names.
+const MOST_EVALUATORS: usize = 1024;
+
+/// Those that are connected, and those that were heard of not long ago.
+pub(super) struct Evaluators {
+    metrics: EvaluatorMetrics,
+    announcer: Announcer,
+    present: BTreeSet<Name>,
+    last_seen: BTreeMap<Name, Instant>,
+}
+
+impl Evaluators {
+    /// None yet.
+    pub fn new(metrics: EvaluatorMetrics, notices: UnboundedSender<Notice>) -> Self {
+        Self { metrics, announcer: Announcer::new(notices), present: BTreeSet::new(), last_seen: BTreeMap::new() }
+    }
+
+    /// One connected.
+    pub fn joined(&mut self, evaluator: Name) -> Result<(), Rejection> {
+        if self.present.len() >= MOST_EVALUATORS && !self.present.contains(&evaluator) {
+            return Err(Rejection::Crowd);
+        }
+        let is_new = self.present.insert(evaluator.clone());
+        self.metrics.present.set(self.present.len() as i64);
+        if is_new {
+            self.announcer.joined(evaluator);
+        }
+        Ok(())
+    }
+
+    /// Whether one that leaves was connected.
+    pub fn remove(&mut self, evaluator: &Name) -> bool {
+        let was_present = self.present.remove(evaluator);
+        self.metrics.present.set(self.present.len() as i64);
+        was_present
+    }
+
+    /// One has left; `jobs` of it were taken back.
+    pub fn left(&mut self, evaluator: Name, jobs: usize) {
+        self.announcer.left(evaluator, jobs);
+    }
+
+    /// One told its progress.
+    pub fn heard(&mut self, progress: Progress, now: Instant) -> Result<(), Rejection> {
+        if self.last_seen.len() >= MOST_EVALUATORS && !self.last_seen.contains_key(&progress.evaluator) {
+            return Err(Rejection::Crowd);
+        }
+        self.metrics.observe(&progress);
+        self.last_seen.insert(progress.evaluator, now);
+        Ok(())
+    }
+
+    /// Forgets those that are long gone, and tells of many that came or went.
+    pub fn tick(&mut self, now: Instant) {
+        self.announcer.tick(now);
+        let (present, metrics) = (&self.present, &self.metrics);
+        self.last_seen.retain(|evaluator, seen| {
+            let keep = present.contains(evaluator) || now.duration_since(*seen) < FORGET_AFTER;
+            if !keep {
+                metrics.forget(evaluator);
+            }
+            keep
+        });
+    }
+}
