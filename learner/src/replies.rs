@@ -29,9 +29,10 @@ const THREADS: usize = 12;
 /// A query is dropped so long after its answer: Zenoh's own thread still holds it while it hands it over, and whoever drops it
 /// last may have to wait for the peer.
 const GRACE: Duration = Duration::from_millis(50);
-/// Most answers that may wait, of all and of one of those who ask.
+/// Most answers that may wait: of all, of one of those who ask, and queries that are only dropped, which take no room.
 const MOST_WAITING: usize = 512;
 const MOST_WAITING_OF_ONE: usize = 64;
+const MOST_DROPPED: usize = 256;
 
 /// Who gets an answer.
 #[derive(Clone, Debug, PartialEq, Eq)]
@@ -140,7 +141,8 @@ impl Replies {
     fn put(&self, task: Task) {
         let mut state = self.shared.lock();
         let of_one = state.waiting.iter().filter(|waiting| waiting.asker == task.asker).count();
-        if state.waiting.len() < MOST_WAITING && of_one < MOST_WAITING_OF_ONE {
+        let most = if task.asker == Asker::Nobody { MOST_DROPPED } else { MOST_WAITING_OF_ONE };
+        if state.waiting.len() < MOST_WAITING && of_one < most {
             state.waiting.push_back(task);
             drop(state);
             self.shared.changed.notify_all();
