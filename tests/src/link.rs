@@ -1,0 +1,93 @@
+//! A network connection that a test can cut, freeze and slow down: whoever connects to it is led on to somebody else.
+
+use std::io::{ErrorKind, Read, Write};
+use std::net::{Shutdown, TcpListener, TcpStream};
+use std::sync::atomic::{AtomicBool, AtomicU64, Ordering::Relaxed};
+use std::sync::{Arc, Mutex};
+use std::thread;
+use std::time::Duration;
+
+/// How often a connection without traffic looks whether it still is one.
+const GLANCE: Duration = Duration::from_millis(20);
+
+/// Leads every connection to its address on to a port of this machine.
+#[derive(Clone)]
+pub struct Link {
+    /// Where to connect to, as `tcp/host:port`.
+    pub endpoint: String,
+    state: Arc<State>,
+}
+
+#[derive(Default)]
+struct State {
+    frozen: AtomicBool,
+    delay_milliseconds: AtomicU64,
+    streams: Mutex<Vec<TcpStream>>,
+}
+
+impl Link {
+    /// To a port that somebody may listen at, now or later.
+    pub fn to(port: u16) -> Link {
+        let listener = TcpListener::bind("127.0.0.1:0").expect("there is a free port");
+        let endpoint = format!("tcp/{}", listener.local_addr().expect("it is bound"));
+        let state = Arc::new(State::default());
+        let shared = state.clone();
+        thread::spawn(move || {
+            for near in listener.incoming().flatten() {
+                // With nobody there, the connection ends at once.
+                let Ok(far) = TcpStream::connect(("127.0.0.1", port)) else { continue };
+                let streams = || Some([near.try_clone().ok()?, far.try_clone().ok()?]);
+                let Some(copies) = streams() else { continue };
+                let mut open = shared.streams.lock().expect("nobody panics with it");
+                open.retain(|stream| stream.peer_addr().is_ok());
+                open.extend(copies);
+                for (from, to) in [(&near, &far), (&far, &near)] {
+                    let (Ok(from), Ok(to)) = (from.try_clone(), to.try_clone()) else { continue };
+                    let state = shared.clone();
+                    thread::spawn(move || carry(from, to, &state));
+                }
+            }
+        });
+        Link { endpoint, state }
+    }
+
+    /// Ends all connections; new ones are welcome.
+    pub fn cut(&self) {
+        for stream in self.state.streams.lock().expect("nobody panics with it").drain(..) {
+            stream.shutdown(Shutdown::Both).ok();
+        }
+    }
+
+    /// From now on nothing goes through, and nobody is told, or everything goes through again.
+    pub fn freeze(&self, frozen: bool) {
+        self.state.frozen.store(frozen, Relaxed);
+    }
+
+    /// Holds up each packet for so long.
+    pub fn delay(&self, delay: Duration) {
+        self.state.delay_milliseconds.store(delay.as_millis() as u64, Relaxed);
+    }
+}
+
+fn carry(mut from: TcpStream, mut to: TcpStream, state: &State) {
+    from.set_read_timeout(Some(GLANCE)).ok();
+    let mut block = [0; 1 << 16];
+    loop {
+        match from.read(&mut block) {
+            Ok(0) => break,
+            Ok(length) => {
+                thread::sleep(Duration::from_millis(state.delay_milliseconds.load(Relaxed)));
+                while state.frozen.load(Relaxed) {
+                    thread::sleep(GLANCE);
+                }
+                if to.write_all(&block[..length]).is_err() {
+                    break;
+                }
+            }
+            Err(error) if matches!(error.kind(), ErrorKind::WouldBlock | ErrorKind::TimedOut) => {}
+            Err(_) => break,
+        }
+    }
+    from.shutdown(Shutdown::Both).ok();
+    to.shutdown(Shutdown::Both).ok();
+}
