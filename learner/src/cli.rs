@@ -79,6 +79,9 @@ pub struct TrainArgs {
     /// Seconds between two checkpoints, so many of which a crash may cost; longer where saving would take 1 % of the time
     #[arg(long, value_name = "N", default_value_t = 30)]
     pub checkpoint_seconds: u64,
+    /// Share of the episodes, 0 to 1, that another evaluator scores a second time: a score that differs in a bit is reported
+    #[arg(long, value_name = "SHARE", default_value_t = 0.0, value_parser = parse_share)]
+    pub audit: f64,
     /// Begin anew: a run that is in the folder already is kept under another name
     #[arg(long)]
     pub fresh: bool,
@@ -251,6 +254,11 @@ pub struct ReportArgs {
     pub plot: Option<PathBuf>,
 }
 
+fn parse_share(text: &str) -> Result<f64, String> {
+    let share = text.parse().ok().filter(|share| (0.0..=1.0).contains(share));
+    share.ok_or_else(|| "it must be a number from 0 to 1".to_owned())
+}
+
 fn parse_preset(text: &str) -> Result<String, String> {
     if presets::is_path(text) || presets::names().any(|name| name == text) {
         return Ok(text.to_owned());
@@ -297,7 +305,8 @@ mod tests {
 
     #[test]
     fn wrong_command_lines_exit_with_2() {
-        let wrong: [&[&str]; 9] = [
+        let wrong: [&[&str]; 10] = [
+            &["--audit", "5"],
             &["--steps", "0"],
             &["--candidates", "0"],
             &["--seed", "9223372036854775808"],

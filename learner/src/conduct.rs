@@ -200,6 +200,9 @@ impl Conductor {
                 let present = evaluators(self.metrics.evaluators.present.get());
                 format!("training is done; waiting for the scores of {pending} episodes ({present} here)")
             }
+            Notice::ScoresDiffer([first, second]) => {
+                format!("evaluators {first} and {second} differ in the score of an episode: see audits.jsonl")
+            }
             Notice::DiskTrouble(error) => format!(
                 "the run cannot be saved: {error}; training goes on, and it is tried again until the disk takes it"
             ),

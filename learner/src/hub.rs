@@ -24,8 +24,8 @@ use crate::inbox::Messages;
 use crate::metrics::Metrics;
 use crate::notice::Notice;
 use crate::replies::{Asker, Question};
-use crate::run_dir::{Log, ScoreLine};
-use crate::scoreboard::{Claim, Lost, OtherWeights, Scoreboard};
+use crate::run_dir::{AuditLine, Log, ScoreLine};
+use crate::scoreboard::{Audited, Claim, Lost, OtherWeights, Scoreboard};
 
 use evaluators::Evaluators;
 use rejection::Rejection;
@@ -70,12 +70,21 @@ pub struct EvaluationPlan {
     pub episodes: u32,
 }
 
+/// What the thread writes.
+#[derive(Debug)]
+pub struct Logs {
+    /// `scores.jsonl`.
+    pub scores: Log,
+    /// Where episodes are written down that were scored twice, if any are to be.
+    pub audits: Option<Log>,
+}
+
 /// State of the thread.
 pub struct Hub {
     run: Name,
     plan: EvaluationPlan,
     scoreboard: Scoreboard,
-    scores: Log,
+    logs: Logs,
     metrics: Metrics,
     notices: UnboundedSender<Notice>,
     evaluators: Evaluators,
@@ -89,7 +98,7 @@ impl Hub {
         run: Name,
         plan: EvaluationPlan,
         scoreboard: Scoreboard,
-        scores: Log,
+        logs: Logs,
         metrics: Metrics,
         notices: UnboundedSender<Notice>,
     ) -> Self {
@@ -97,7 +106,7 @@ impl Hub {
             run,
             plan,
             scoreboard,
-            scores,
+            logs,
             evaluators: Evaluators::new(metrics.evaluators.clone(), notices.clone()),
             metrics,
             notices,
@@ -177,7 +186,8 @@ impl Hub {
     fn job(&mut self, request: JobRequest) -> (JobReply, Name) {
         match request {
             JobRequest::Claim { evaluator, attempt, environments, precision } => {
-                let claim = Claim { evaluator: &evaluator, attempt, environments: &environments };
+                let claim =
+                    Claim { evaluator: &evaluator, attempt, environments: &environments, precision: &precision };
                 let handed_out = self.scoreboard.handed_out();
                 let reply = self.scoreboard.claim(claim, Instant::now());
                 if let JobReply::Job(job) = &reply {
@@ -220,13 +230,14 @@ impl Hub {
         if !screened.new.is_empty() {
             let lines: Vec<_> = screened.new.iter().map(|score| ScoreLine::new(report, score)).collect();
             // If this fails nothing is counted, so the scores are new again when the evaluator delivers them once more.
-            self.scores.append(&lines)?;
+            self.logs.scores.append(&lines)?;
         }
         let recorded = self.scoreboard.record(report, &screened.new);
         let evaluation = &self.metrics.evaluation;
         evaluation.scores_recorded.inc_by(screened.new.len() as u64);
         evaluation.scores_duplicate.inc_by(screened.duplicates.into());
         evaluation.jobs_completed.inc_by(recorded.jobs_completed as u64);
+        self.audited(&recorded.audited, &report.precision);
         if let Some(scores) = recorded.evaluation_completed {
             self.show(report.step, &scores);
             *completed = Some(Notice::Evaluated { step: report.step, scores });
@@ -237,6 +248,25 @@ impl Hub {
             self.publish(report, screened.new);
         }
         Ok(reply)
+    }
+
+    /// Writes down which episodes were scored twice, and says which of them differ.
+    fn audited(&mut self, audited: &[Audited], precision: &Name) {
+        for audited in audited {
+            let (seed, names) = (audited.first.0.seed, [&audited.first.1, &audited.second.1]);
+            self.metrics.evaluation.audits(audited.agree()).inc();
+            if !audited.agree() {
+                let [first, second] = [audited.first.0, audited.second.0].map(|score| score.episode_return);
+                error!(step = audited.step, seed, %precision, first, second, "{} and {} differ", names[0], names[1]);
+                self.notices.send(Notice::ScoresDiffer(names.map(Clone::clone))).ok();
+            }
+        }
+        let lines: Vec<_> = audited.iter().map(|audited| AuditLine::new(audited, precision)).collect();
+        if let Some(log) = self.logs.audits.as_mut().filter(|_| !lines.is_empty())
+            && let Err(error) = log.append(&lines)
+        {
+            error!(%error, "the audits could not be saved");
+        }
     }
 
     /// Lets the metrics show a complete evaluation, if it is the newest.

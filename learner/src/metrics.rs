@@ -57,6 +57,7 @@ pub struct EvaluationMetrics {
     pub jobs_handed_back: IntCounter,
     pub episodes_pending: IntGauge,
     pub episodes_missing: IntGauge,
+    audits: IntCounterVec,
     pub scores_recorded: IntCounter,
     pub scores_duplicate: IntCounter,
     pub score: Gauge,
@@ -146,6 +147,10 @@ impl Metrics {
             jobs_completed: jobs.get_metric_with_label_values(&["completed"])?,
             jobs_expired: jobs.get_metric_with_label_values(&["expired"])?,
             jobs_handed_back: jobs.get_metric_with_label_values(&["handed_back"])?,
+            audits: make.add(IntCounterVec::new(
+                Opts::new(full("audits_total"), "Episodes that were scored a second time, by outcome"),
+                &["outcome"],
+            ))?,
             episodes_missing: make.count(
                 "episodes_missing",
                 "Episodes that are not handed out any more, after too many lost evaluators",
@@ -163,6 +168,8 @@ impl Metrics {
             checkpoint_bytes: make.count("checkpoint_bytes", "Size of the newest checkpoint")?,
             trouble: make.count("disk_trouble", "1 while the disk does not take what is to be kept, else 0")?,
         };
+        // From the beginning, so that the first of them is an increase.
+        ["agree", "differ"].map(|outcome| evaluation.audits.with_label_values(&[outcome]));
         let labelled = |name: &str, help: &str| Opts::new(full(name), help);
         let evaluators = EvaluatorMetrics {
             present: make.count("evaluators", "Evaluators present")?,
@@ -201,6 +208,13 @@ impl TrainingMetrics {
         for ((_, gauge), value) in self.algorithm.iter().zip(values) {
             gauge.set(f64::from(*value));
         }
+    }
+}
+
+impl EvaluationMetrics {
+    /// Episodes whose two scores agree, or differ.
+    pub fn audits(&self, agree: bool) -> IntCounter {
+        self.audits.with_label_values(&[if agree { "agree" } else { "differ" }])
     }
 }
 

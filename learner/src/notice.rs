@@ -39,6 +39,8 @@ pub enum Notice {
     },
     /// All gradient steps are done, and no score is outstanding that may still come.
     Settled,
+    /// These two evaluators have different scores of the same episode.
+    ScoresDiffer([Name; 2]),
     /// The disk does not take what is to be kept; what it says.
     DiskTrouble(String),
     /// The disk takes it again.

@@ -211,7 +211,8 @@ async fn conduct(
     let (notify, notices) = mpsc::unbounded_channel();
     let incarnation = now()?;
     let checkpoint_every = Duration::from_secs(args.checkpoint_seconds);
-    let state = Run { name: run.clone(), incarnation, config, dir: &run_dir, scores, past, checkpoint_every };
+    let (name, audit) = (run.clone(), args.audit);
+    let state = Run { name, incarnation, config, dir: &run_dir, scores, past, checkpoint_every, audit };
     let threads = Threads::start(state, transitions, &metrics, &health, &notify)?;
     let display = Display::start(metrics.clone(), steps);
     let metrics_address = server.address.to_string();

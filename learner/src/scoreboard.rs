@@ -5,6 +5,7 @@
 //! happened too often. For each (step, seed) the first score that is delivered counts, and no other, whoever delivers it. The
 //! current time is an argument, for tests. `job` has the rules of a lease, `refusal` why a message is not accepted.
 
+mod audit;
 mod job;
 mod refusal;
 
@@ -14,6 +15,8 @@ use std::time::{Duration, Instant};
 use quad_dataset::Task;
 use quad_protocol::{EpisodeScore, Hash, Job, JobReply, Lease, Name, Progress, ScoreReport};
 
+pub use audit::Audited;
+use audit::Audits;
 use job::OpenJob;
 pub use refusal::Refusal;
 use refusal::require;
@@ -46,6 +49,8 @@ pub struct Rules {
     pub job_episodes: usize,
     /// How long a job may stay without progress.
     pub lease: Duration,
+    /// Share of the episodes that are scored a second time, 0 to 1.
+    pub audit: f64,
 }
 
 /// The state of all evaluations of a run.
@@ -58,6 +63,7 @@ pub struct Scoreboard {
     next_job: u64,
     /// Scores of an earlier life, by step, whose evaluation has not been asked for in this one.
     earlier: BTreeMap<u64, Earlier>,
+    audits: Audits,
 }
 
 /// Training has come by a step again, and its weights are not those that were scored.
@@ -113,6 +119,8 @@ pub struct Recorded {
     pub jobs_completed: usize,
     /// All episodes of its evaluation are scored: their scores.
     pub evaluation_completed: Option<Vec<EpisodeScore>>,
+    /// Episodes that were scored a second time.
+    pub audited: Vec<Audited>,
 }
 
 /// Jobs that were taken back.
@@ -133,12 +141,16 @@ pub struct Claim<'a> {
     pub attempt: u64,
     /// The environments that it has.
     pub environments: &'a [String],
+    /// The arithmetic that it computes in.
+    pub precision: &'a Name,
 }
 
 impl Scoreboard {
     /// An empty one.
     pub fn new(rules: Rules) -> Self {
-        Self { rules, evaluations: BTreeMap::new(), jobs: BTreeMap::new(), next_job: 1, earlier: BTreeMap::new() }
+        let audits = Audits::new(rules.audit);
+        let (evaluations, jobs, earlier) = (BTreeMap::new(), BTreeMap::new(), BTreeMap::new());
+        Self { rules, evaluations, jobs, next_job: 1, earlier, audits }
     }
 
     /// Which start of the learner this is.
@@ -202,7 +214,7 @@ impl Scoreboard {
         self.evaluations.iter().flat_map(of).collect()
     }
 
-    /// Hands out a job: waiting episodes of the oldest step that has any. An evaluator has one job at a time; asked the same
+    /// Hands out a job: episodes that are to be scored again, or else waiting ones of the oldest step. An evaluator has one job at a time; asked the same
     /// again, because the answer was lost, the answer is the same.
     pub fn claim(&mut self, claim: Claim<'_>, now: Instant) -> JobReply {
         let incarnation = self.rules.incarnation;
@@ -217,23 +229,29 @@ impl Scoreboard {
             };
         }
         let id = self.next_job;
-        for (&step, evaluation) in &mut self.evaluations {
+        let most = self.rules.job_episodes;
+        let audit = self.audits.hand_out(id, claim.evaluator, claim.precision, most);
+        let Some(episodes) = audit.or_else(|| self.hand_out(id, most)) else { return wait(ASK_AGAIN) };
+        let job = OpenJob::new(claim.evaluator.clone(), claim.attempt, episodes, self.rules.lease, now);
+        let message = self.message(id, &job);
+        self.jobs.insert(id, job);
+        self.next_job += 1;
+        message.map_or(wait(ASK_AGAIN), JobReply::Job)
+    }
+
+    /// Waiting episodes of the oldest step that has any.
+    fn hand_out(&mut self, job: u64, most: usize) -> Option<(u64, Vec<u64>)> {
+        self.evaluations.iter_mut().find_map(|(&step, evaluation)| {
             let waiting = evaluation.episodes.iter_mut().filter(|e| matches!(e.state, EpisodeState::Waiting));
-            let mut seeds = Vec::new();
-            for episode in waiting.take(self.rules.job_episodes) {
-                episode.state = EpisodeState::HandedOut { job: id };
-                seeds.push(episode.seed);
-            }
-            if seeds.is_empty() {
-                continue;
-            }
-            let job = OpenJob::new(claim.evaluator.clone(), claim.attempt, (step, seeds), self.rules.lease, now);
-            let message = self.message(id, &job);
-            self.jobs.insert(id, job);
-            self.next_job += 1;
-            return message.map_or(wait(ASK_AGAIN), JobReply::Job);
-        }
-        wait(ASK_AGAIN)
+            let seeds: Vec<_> = waiting
+                .take(most)
+                .map(|episode| {
+                    episode.state = EpisodeState::HandedOut { job };
+                    episode.seed
+                })
+                .collect();
+            (!seeds.is_empty()).then_some((step, seeds))
+        })
     }
 
     /// The job as it is handed out.
@@ -320,11 +338,14 @@ impl Scoreboard {
                 episode.state = EpisodeState::Scored(*score);
             }
         }
+        let audited = self.audits.compare(report);
+        self.audits.add(report, new);
         let done = |seed| evaluation.episode(seed).is_some_and(|e| matches!(e.state, EpisodeState::Scored(_)));
-        let open = self.jobs.len();
-        self.jobs.retain(|_, job| job.step != report.step || !job.seeds.iter().copied().all(done));
+        let (open, audits) = (self.jobs.len(), &self.audits);
+        self.jobs
+            .retain(|&id, job| job.step != report.step || !job.seeds.iter().copied().all(done) || audits.is_open(id));
         let evaluation_completed = if new.is_empty() { None } else { evaluation.scores() };
-        Recorded { jobs_completed: open - self.jobs.len(), evaluation_completed }
+        Recorded { jobs_completed: open - self.jobs.len(), evaluation_completed, audited }
     }
 
     /// Takes back the jobs whose lease has run out.
@@ -345,6 +366,7 @@ impl Scoreboard {
 
     /// Lets the episodes of a job that has ended wait for the next; gives those that were lost too often.
     fn release(&mut self, id: u64, job: &OpenJob, lost: u32) -> Vec<(u64, u64)> {
+        self.audits.release(id);
         let mut given_up = Vec::new();
         let Some(evaluation) = self.evaluations.get_mut(&job.step) else { return given_up };
         for episode in &mut evaluation.episodes {

@@ -20,7 +20,7 @@ use crate::agent::Agent;
 use crate::algorithms::Setting;
 use crate::config::{Experiment, RunConfig};
 use crate::device::Device;
-use crate::hub::{self, EvaluationPlan, Hub};
+use crate::hub::{self, EvaluationPlan, Hub, Logs};
 use crate::inbox::{Inbox, inbox};
 use crate::keeper::{Desk, Keeper, Provenance};
 use crate::metrics::{Metrics, TrainingMetrics};
@@ -83,6 +83,8 @@ pub struct Run<'a> {
     pub past: Past,
     /// Least time between two checkpoints.
     pub checkpoint_every: Duration,
+    /// Share of the episodes that are scored twice.
+    pub audit: f64,
 }
 
 impl Threads {
@@ -94,7 +96,7 @@ impl Threads {
         health: &Health,
         notices: &UnboundedSender<Notice>,
     ) -> anyhow::Result<Self> {
-        let Run { name, incarnation, config, dir, scores, past, checkpoint_every } = run;
+        let Run { name, incarnation, config, dir, scores, past, checkpoint_every, audit } = run;
         let Past { checkpoint, snapshots, scores: earlier } = past;
         let experiment = &config.experiment;
         let task = Task::new(&experiment.environment, transitions.observation_dim(), transitions.action_dim());
@@ -106,11 +108,14 @@ impl Threads {
             candidates: experiment.candidates,
             job_episodes: JOB_EPISODES,
             lease: LEASE,
+            audit,
         };
         let plan = EvaluationPlan { seed: experiment.seed, episodes: experiment.episodes };
         let mut scoreboard = Scoreboard::new(rules);
         scoreboard.remember(earlier);
-        let state = Hub::new(name.clone(), plan, scoreboard, scores, metrics.clone(), notices.clone());
+        let audits = if audit > 0.0 { Some(dir.audit_log()?) } else { None };
+        let logs = Logs { scores, audits };
+        let state = Hub::new(name.clone(), plan, scoreboard, logs, metrics.clone(), notices.clone());
         let (hub, hub_messages) = inbox();
         let hub_thread =
             spawn("hub", notices, with(health.part("hub", STUCK), move |beat| state.run(&hub_messages, beat)))?;

@@ -5,7 +5,7 @@ use std::collections::{BTreeMap, HashMap};
 use std::net::TcpListener;
 use std::time::{Duration, Instant};
 
-use quad_learner::hub::{self, EvaluationPlan, Hub};
+use quad_learner::hub::{self, EvaluationPlan, Hub, Logs};
 use quad_learner::inbox::{Inbox, inbox};
 use quad_learner::metrics::Metrics;
 use quad_learner::notice::Notice;
@@ -79,10 +79,11 @@ impl Bench {
             candidates: 3,
             job_episodes: 2,
             lease: LEASE,
+            audit: 0.0,
         };
         let plan = EvaluationPlan { seed: 1, episodes: 4 };
-        let log = run_dir.score_log().unwrap();
-        let state = Hub::new(run.clone(), plan, Scoreboard::new(rules), log, metrics.clone(), notify.clone());
+        let logs = Logs { scores: run_dir.score_log().unwrap(), audits: None };
+        let state = Hub::new(run.clone(), plan, Scoreboard::new(rules), logs, metrics.clone(), notify.clone());
         let (hub, messages) = inbox();
         std::thread::spawn(move || state.run(&messages, &beat()));
         let identity = Identity { run: run.clone(), incarnation: INCARNATION, task };

@@ -3,6 +3,7 @@
 
 use std::time::{Duration, Instant};
 
+use quad_learner::resume::Earlier;
 use quad_learner::scoreboard::{Claim, Lost, Recorded, Refusal, Rules, Scoreboard, Screened};
 use quad_protocol::{CannotAct, EpisodeScore, Hash, Job, JobReply, Lease, Name, Progress, ScoreReport};
 
@@ -67,6 +68,10 @@ fn progress(job: &Job, evaluator: &str, steps_done: u64) -> Progress {
 impl Bench {
     /// Evaluations of steps 1000 and 2000, seven episodes each: seeds 1..=7 and 11..=17.
     fn new() -> Self {
+        Self::with_audit(0.0)
+    }
+
+    fn with_audit(audit: f64) -> Self {
         let rules = Rules {
             run: name("run"),
             incarnation: INCARNATION,
@@ -75,6 +80,7 @@ impl Bench {
             candidates: 10,
             job_episodes: 5,
             lease: LEASE,
+            audit,
         };
         let mut board = Scoreboard::new(rules);
         board.add_evaluation(2000, hash(2000), &Vec::from_iter(11..=17)).unwrap();
@@ -89,7 +95,10 @@ impl Bench {
     fn claim(&mut self, evaluator: &str, attempt: u64, seconds: u64) -> JobReply {
         let now = self.at(seconds);
         let environments = ["ant".to_owned(), "hopper".to_owned()];
-        self.board.claim(Claim { evaluator: &name(evaluator), attempt, environments: &environments }, now)
+        self.board.claim(
+            Claim { evaluator: &name(evaluator), attempt, environments: &environments, precision: &name("f32") },
+            now,
+        )
     }
 
     fn job(&mut self, evaluator: &str, seconds: u64) -> Job {
@@ -138,7 +147,7 @@ fn an_evaluator_without_the_environment_gets_nothing() {
     let mut bench = Bench::new();
     for environments in [vec![], vec!["ant".to_owned()]] {
         let now = bench.at(0);
-        let claim = Claim { evaluator: &name("a"), attempt: 1, environments: &environments };
+        let claim = Claim { evaluator: &name("a"), attempt: 1, environments: &environments, precision: &name("f32") };
         assert!(matches!(bench.board.claim(claim, now), JobReply::Wait { .. }));
     }
 }
@@ -160,7 +169,7 @@ fn scores_complete_a_job_and_an_evaluation_once() {
     let (first, second) = (bench.job("a", 0), bench.job("b", 0));
     let (screened, recorded) = bench.deliver(&full_report(&first, "a")).unwrap();
     assert_eq!((screened.new.len(), screened.duplicates), (5, 0));
-    assert_eq!(recorded, Recorded { jobs_completed: 1, evaluation_completed: None });
+    assert_eq!(recorded, Recorded { jobs_completed: 1, ..Recorded::default() });
     assert_eq!(bench.board.pending(), 9);
 
     let (_, recorded) = bench.deliver(&full_report(&second, "b")).unwrap();
@@ -430,4 +439,54 @@ fn an_evaluation_asked_for_twice_is_one() {
     bench.board.add_evaluation(1000, hash(1000), &Vec::from_iter(1..=7)).unwrap();
     assert_eq!((bench.board.pending(), bench.job("b", 0).seeds), (14, vec![6, 7]));
     assert_eq!(job.seeds.len(), 5);
+}
+
+#[test]
+fn an_audited_episode_is_scored_again_by_another_evaluator_of_the_same_precision_and_counts_once() {
+    let mut bench = Bench::with_audit(1.0);
+    let first = bench.job("a", 0);
+    let (_, recorded) = bench.deliver(&full_report(&first, "a")).unwrap();
+    assert_eq!((recorded.jobs_completed, recorded.audited.len()), (1, 0));
+
+    // Not by itself; what it delivers again is no second opinion.
+    assert!(bench.deliver(&full_report(&first, "a")).unwrap().1.audited.is_empty());
+    assert_eq!(bench.job("a", 1).seeds, [6, 7]);
+    // Not in another arithmetic.
+    let environments = ["hopper".to_owned()];
+    let (evaluator, precision) = (name("c"), name("bf16"));
+    let claim = Claim { evaluator: &evaluator, attempt: 1, environments: &environments, precision: &precision };
+    let JobReply::Job(other) = bench.board.claim(claim, bench.at(1)) else { panic!("there is work") };
+    assert_eq!(other.step, 2000);
+
+    // By another one, before all that waits; whoever is lost with it loses nothing.
+    let again = bench.job("b", 2);
+    assert_eq!((again.step, again.seeds.clone(), again.weights), (1000, first.seeds.clone(), first.weights));
+    assert_eq!(bench.board.evaluator_gone(&name("b")).given_up, []);
+    let again = bench.job("d", 3);
+    assert_eq!(again.seeds, first.seeds);
+    let mut report = full_report(&again, "d");
+    let changed = report.episodes[2].seed;
+    report.episodes[2] = score(changed, 500.0f64.next_up());
+    let (screened, recorded) = bench.deliver(&report).unwrap();
+    assert_eq!((screened.new.len(), screened.duplicates, recorded.jobs_completed), (0, 5, 1));
+    let differ: Vec<_> = recorded.audited.iter().filter(|audited| !audited.agree()).collect();
+    assert_eq!((recorded.audited.len(), differ.len()), (5, 1));
+    assert_eq!((differ[0].first.0.seed, &differ[0].first.1, &differ[0].second.1), (changed, &name("a"), &name("d")));
+    assert!(matches!(bench.board.screen(&report), Ok(Screened { duplicates: 5, .. })), "nothing was changed by it");
+}
+
+#[test]
+fn scores_of_an_earlier_life_count_and_other_weights_are_found_out() {
+    let mut bench = Bench::new();
+    let earlier = Earlier { weights: hash(3000).to_string(), episodes: vec![score(22, 400.0)] };
+    let whole = Earlier { weights: hash(4000).to_string(), episodes: vec![score(32, 1.0), score(31, 2.0)] };
+    bench.board.remember([(3000, earlier), (4000, whole)].into());
+    let pending = bench.board.pending();
+    assert_eq!(bench.board.add_evaluation(3000, hash(3000), &[21, 22, 23]), Ok(None));
+    assert_eq!(bench.board.pending(), pending + 2);
+    let complete = bench.board.add_evaluation(4000, hash(4000), &[31, 32]).unwrap().unwrap();
+    assert_eq!(complete, [score(31, 2.0), score(32, 1.0)]);
+    assert_eq!(bench.board.add_evaluation(4000, hash(4000), &[31, 32]), Ok(None), "asked for again");
+    let error = bench.board.add_evaluation(3000, hash(1), &[21, 22, 23]).unwrap_err();
+    assert_eq!((error.step, error.found, error.scored), (3000, hash(1), hash(3000).to_string()));
 }

@@ -5,6 +5,7 @@
 //! endpoints.json                     where this learner can be reached; written as soon as it listens
 //! metrics.jsonl                      training metrics, a line every hundred gradient steps
 //! scores.jsonl                       a line per scored episode, written before the evaluator gets its acknowledgement
+//! audits.jsonl                       a line per episode that was scored twice, with --audit
 //! snapshots/step_000003000.safetensors   target actor and target critics; written before the evaluation of it begins
 //! checkpoints/step_000003000_….safetensors   the newest three states of the training, to go on from
 //! report.json, learning_curve.svg    written at the end
@@ -20,10 +21,11 @@ use std::fs;
 use std::io;
 use std::path::{Path, PathBuf};
 
-use quad_protocol::{EpisodeScore, ScoreReport};
+use quad_protocol::{EpisodeScore, Name, ScoreReport};
 use serde::{Deserialize, Serialize};
 
 use crate::config::RunConfig;
+use crate::scoreboard::Audited;
 pub use checkpoints::Checkpoint;
 use checkpoints::Checkpoints;
 use durable::replace;
@@ -111,6 +113,38 @@ impl ScoreLine {
     pub fn episode(&self) -> EpisodeScore {
         let Self { seed, episode_return, length, score, .. } = *self;
         EpisodeScore { seed, episode_return, length, score }
+    }
+}
+
+/// A line of `audits.jsonl`: an episode that two evaluators of the same precision have scored.
+#[derive(Clone, Debug, PartialEq, Serialize)]
+pub struct AuditLine {
+    /// Gradient step of the snapshot.
+    pub step: u64,
+    /// Seed of the episode.
+    pub seed: u64,
+    /// Arithmetic that the policy was computed in.
+    pub precision: String,
+    /// Who measured the score that counts, and who the other one.
+    pub evaluators: [String; 2],
+    /// Their returns.
+    pub returns: [f64; 2],
+    /// Whether both scores are the same, bit for bit.
+    pub agree: bool,
+}
+
+impl AuditLine {
+    /// The line for an episode that was scored twice.
+    pub fn new(audited: &Audited, precision: &Name) -> Self {
+        let Audited { step, first, second } = audited;
+        Self {
+            step: *step,
+            seed: first.0.seed,
+            precision: precision.to_string(),
+            evaluators: [first, second].map(|(_, evaluator)| evaluator.to_string()),
+            returns: [first, second].map(|(score, _)| score.episode_return),
+            agree: audited.agree(),
+        }
     }
 }
 
@@ -243,6 +277,11 @@ impl RunDir {
     /// [`RunDirError::InUse`] if another learner works in this folder.
     pub fn score_log(&self) -> Result<Log, RunDirError> {
         Log::open(self.path.join("scores.jsonl"), true)
+    }
+
+    /// `audits.jsonl`, opened for appending.
+    pub fn audit_log(&self) -> Result<Log, RunDirError> {
+        Log::open(self.path.join("audits.jsonl"), false)
     }
 
     /// `metrics.jsonl`, opened for appending, without the lines after `step`: a learner that goes on from there writes them

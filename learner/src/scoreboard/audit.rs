@@ -1,0 +1,120 @@
+//! Audits: a share of the episodes is scored a second time, by another evaluator of the same precision. The same weights and
+//! seed give the same score, bit for bit, so a difference is a broken machine, another simulator, or a lie (BOINC's idea).
+
+use std::collections::BTreeMap;
+
+use quad_protocol::{EpisodeScore, Hash, Name, ScoreReport};
+
+/// The episodes that are to be scored again.
+#[derive(Debug)]
+pub(super) struct Audits {
+    /// Share of the episodes, 0 to 1.
+    share: f64,
+    waiting: BTreeMap<(u64, u64), Waiting>,
+}
+
+#[derive(Debug)]
+struct Waiting {
+    first: EpisodeScore,
+    evaluator: Name,
+    precision: Name,
+    /// The job that it is handed out with.
+    job: Option<u64>,
+}
+
+/// An episode that was scored twice.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Audited {
+    /// Gradient step of its snapshot.
+    pub step: u64,
+    /// The score that counts, and who measured it.
+    pub first: (EpisodeScore, Name),
+    /// The other one.
+    pub second: (EpisodeScore, Name),
+}
+
+impl Audited {
+    /// Whether both are the same, bit for bit.
+    pub fn agree(&self) -> bool {
+        let bits = |score: &EpisodeScore| (score.episode_return.to_bits(), score.score.to_bits(), score.length);
+        bits(&self.first.0) == bits(&self.second.0)
+    }
+}
+
+impl Audits {
+    /// Of that share of the episodes.
+    pub fn new(share: f64) -> Self {
+        Self { share, waiting: BTreeMap::new() }
+    }
+
+    /// Takes in scores that are new; the seed and the step decide which of them are scored again.
+    pub fn add(&mut self, report: &ScoreReport, new: &[EpisodeScore]) {
+        for first in new.iter().filter(|score| is_chosen(self.share, report.step, score.seed)) {
+            let (evaluator, precision) = (report.evaluator.clone(), report.precision.clone());
+            self.waiting.insert((report.step, first.seed), Waiting { first: *first, evaluator, precision, job: None });
+        }
+    }
+
+    /// Hands out episodes of one step that `evaluator` can check; nothing if there are none.
+    pub fn hand_out(&mut self, job: u64, evaluator: &Name, precision: &Name, most: usize) -> Option<(u64, Vec<u64>)> {
+        let fits = |waiting: &Waiting| {
+            waiting.job.is_none() && waiting.evaluator != *evaluator && waiting.precision == *precision
+        };
+        let step = self.waiting.iter().find(|(_, waiting)| fits(waiting)).map(|(&(step, _), _)| step)?;
+        let mut seeds = Vec::new();
+        for (&(_, seed), waiting) in self.waiting.range_mut((step, 0)..=(step, u64::MAX)) {
+            if seeds.len() < most && fits(waiting) {
+                waiting.job = Some(job);
+                seeds.push(seed);
+            }
+        }
+        Some((step, seeds))
+    }
+
+    /// Lets the episodes of a job that has ended wait for another evaluator.
+    pub fn release(&mut self, job: u64) {
+        self.waiting.values_mut().filter(|waiting| waiting.job == Some(job)).for_each(|waiting| waiting.job = None);
+    }
+
+    /// Whether a job still has episodes to score again.
+    pub fn is_open(&self, job: u64) -> bool {
+        self.waiting.values().any(|waiting| waiting.job == Some(job))
+    }
+
+    /// Compares what a report has scored again with what was scored first.
+    pub fn compare(&mut self, report: &ScoreReport) -> Vec<Audited> {
+        let mut audited = Vec::new();
+        for second in &report.episodes {
+            let key = (report.step, second.seed);
+            let by_another =
+                |first: &Waiting| first.evaluator != report.evaluator && first.precision == report.precision;
+            if self.waiting.get(&key).is_some_and(by_another)
+                && let Some(Waiting { first, evaluator, .. }) = self.waiting.remove(&key)
+            {
+                let second = (*second, report.evaluator.clone());
+                audited.push(Audited { step: report.step, first: (first, evaluator), second });
+            }
+        }
+        audited
+    }
+}
+
+/// A function of step and seed alone, which evaluators could compute, but so that no simple choice of theirs avoids it.
+fn is_chosen(share: f64, step: u64, seed: u64) -> bool {
+    let hash = Hash::of(&[step.to_le_bytes(), seed.to_le_bytes()].concat()).to_string();
+    let number = u32::from_str_radix(&hash[..8], 16).unwrap_or(0);
+    f64::from(number) < share * 2f64.powi(32)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_share_is_chosen() {
+        for (share, least, most) in [(0.0, 0, 0), (0.05, 400, 600), (1.0, 10_000, 10_000)] {
+            let chosen = (0..10_000).filter(|&seed| is_chosen(share, 1000, seed)).count();
+            assert!((least..=most).contains(&chosen), "{chosen} of 10000 at {share}");
+        }
+    }
+}

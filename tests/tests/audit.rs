@@ -1,0 +1,83 @@
+//! `--audit`: what one evaluator says is checked by another, and a lie is found out.
+#![allow(clippy::unwrap_used, clippy::expect_used)]
+
+use std::fs;
+use std::time::Duration;
+
+use quad_dataset::environment;
+use quad_protocol::{EpisodeScore, JobReply, JobRequest, Message, Name, ScoreReply, ScoreReport, decode, encode, keys};
+use quad_tests::router::router;
+use quad_tests::system::{Scratch, Setting, free_port};
+use quad_tests::{PATIENCE, eventually, http};
+use serde_json::Value;
+use zenoh::Session;
+
+async fn ask<A: Message>(session: &Session, key: String, question: Vec<u8>) -> A {
+    loop {
+        let replies = session.get(&key).payload(question.clone()).timeout(Duration::from_secs(5)).await.unwrap();
+        if let Ok(reply) = replies.recv_async().await
+            && let Ok(sample) = reply.into_result()
+        {
+            return decode(&sample.payload().to_bytes()).unwrap();
+        }
+    }
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn scores_that_were_made_up_are_found_out_by_the_next_evaluator() {
+    let scratch = Scratch::new();
+    let setting = Setting { episodes: 4, ..Setting::default() };
+    let endpoint = format!("tcp/127.0.0.1:{}", free_port());
+    let session = router(&endpoint).await;
+    let mut learner = scratch.learner_with("run", setting, &["--connect", &endpoint, "--audit", "1"]);
+
+    // A job done by nobody: its scores are possible, but not true.
+    let name = |text: &str| Name::new(text).unwrap();
+    let (run, liar, precision) = (name("run"), name("liar"), name("f32"));
+    let environments = vec!["hopper".to_owned()];
+    let claim = JobRequest::Claim { evaluator: liar.clone(), attempt: 1, environments, precision: precision.clone() };
+    let job = loop {
+        match ask(&session, keys::jobs(&run), encode(&claim).unwrap()).await {
+            JobReply::Job(job) => break job,
+            _ => tokio::time::sleep(Duration::from_millis(50)).await,
+        }
+    };
+    let hopper = environment::find("hopper").unwrap();
+    let score =
+        |&seed: &u64| EpisodeScore { seed, episode_return: 5.0, length: 10, score: hopper.normalised_score(5.0) };
+    let report = ScoreReport {
+        evaluator: liar,
+        run: run.clone(),
+        incarnation: job.incarnation,
+        job: job.id,
+        step: job.step,
+        weights: job.weights,
+        precision,
+        episodes: job.seeds.iter().map(score).collect(),
+        cannot_act: None,
+    };
+    let reply: ScoreReply = ask(&session, keys::scores(&run), encode(&report).unwrap()).await;
+    assert!(matches!(reply, ScoreReply::Recorded { new: 4, .. }), "{reply:?}");
+
+    let _honest: Vec<_> = ["honest", "true"]
+        .map(|name| scratch.evaluator_with(name, &["--connect", &endpoint, "--precision", "f32"]))
+        .into();
+    let page = eventually("the lie is found out", PATIENCE, || {
+        let page = http::metrics(&learner.metrics())?;
+        (http::sum(&page, "quad_learner_audits_total", "outcome=\"differ\"") == 4.0).then_some(page)
+    });
+    assert!(http::sum(&page, "quad_learner_scores_duplicate_total", "") >= 4.0);
+    let status = learner.process.wait(PATIENCE);
+    assert!(status.success(), "the learner ended with {status}");
+    learner.assert_complete(&setting);
+    assert!(learner.process.log().contains("evaluators liar and "), "{}", learner.process.log());
+
+    let lines = fs::read_to_string(learner.run_dir.join("audits.jsonl")).unwrap();
+    let lines: Vec<Value> = lines.lines().map(|line| serde_json::from_str(line).unwrap()).collect();
+    for line in &lines {
+        let lied = line["evaluators"][0] == "liar";
+        assert_eq!((line["agree"] == false, line["step"] == job.step), (lied, lied), "{line}");
+        assert_ne!(line["evaluators"][0], line["evaluators"][1], "{line}");
+    }
+    assert!(lines.len() > 4, "honest scores are checked, too");
+}
