@@ -169,7 +169,9 @@ impl Metrics {
             trouble: make.count("disk_trouble", "1 while the disk does not take what is to be kept, else 0")?,
         };
         // From the beginning, so that the first of them is an increase.
-        ["agree", "differ"].map(|outcome| evaluation.audits.with_label_values(&[outcome]));
+        for agree in [true, false] {
+            evaluation.audits(agree);
+        }
         let labelled = |name: &str, help: &str| Opts::new(full(name), help);
         let evaluators = EvaluatorMetrics {
             present: make.count("evaluators", "Evaluators present")?,
