@@ -4,28 +4,26 @@
 mod announcer;
 mod evaluators;
 mod rejection;
+mod scores;
 
 use std::time::{Duration, Instant};
 
-use anyhow::anyhow;
 use quad_protocol::{
-    EpisodeScore, Hash, JobReply, JobRequest, Message, Name, Progress, RecordedScores, ScoreReply, ScoreReport, decode,
-    encode, episode_seeds, keys,
+    Hash, JobReply, JobRequest, Message, Name, Progress, ScoreReport, decode, encode, episode_seeds, keys,
 };
 use quad_service::{Beat, hinted};
 use tokio::sync::mpsc::UnboundedSender;
 use tracing::{debug, error, warn};
+use zenoh::Session;
 use zenoh::bytes::ZBytes;
-use zenoh::qos::CongestionControl;
 use zenoh::sample::{Sample, SampleKind};
-use zenoh::{Session, Wait};
 
 use crate::inbox::Messages;
 use crate::metrics::Metrics;
 use crate::notice::Notice;
 use crate::replies::{Asker, Question};
-use crate::run_dir::{AuditLine, Log, ScoreLine};
-use crate::scoreboard::{Audited, Claim, Lost, OtherWeights, Scoreboard};
+use crate::run_dir::Log;
+use crate::scoreboard::{Claim, Lost, OtherWeights, Scoreboard};
 
 use evaluators::Evaluators;
 use rejection::Rejection;
@@ -203,92 +201,6 @@ impl Hub {
                 self.metrics.evaluation.jobs_handed_back.inc_by(accepted.into());
                 (JobReply::HandedBack { incarnation: self.scoreboard.incarnation(), accepted }, evaluator)
             }
-        }
-    }
-
-    /// Checks the scores, writes the new ones to disk, counts them. Only then does the caller acknowledge the report.
-    fn report(&mut self, report: &ScoreReport, completed: &mut Option<Notice>) -> Result<ScoreReply, Rejection> {
-        let incarnation = self.scoreboard.incarnation();
-        let screened = match report.cannot_act {
-            Some(_) => self.scoreboard.screen_complaint(report).map(|()| None),
-            None => self.scoreboard.screen(report).map(Some),
-        };
-        let screened = match screened {
-            Ok(Some(screened)) => screened,
-            Ok(None) => {
-                let reason = report.cannot_act.as_ref().map(|complaint| complaint.reason.as_str()).unwrap_or_default();
-                let (step, evaluator) = (report.step, &report.evaluator);
-                let broken = anyhow!("the policy of step {step} cannot act: {reason} (evaluator {evaluator})");
-                self.notices.send(Notice::Failed(broken)).ok();
-                return Ok(ScoreReply::Recorded { incarnation, new: 0, duplicates: 0 });
-            }
-            Err(refusal) => {
-                self.reject(&Rejection::Refused(refusal));
-                return Ok(ScoreReply::Refused { incarnation, reason: refusal.to_string() });
-            }
-        };
-        if !screened.new.is_empty() {
-            let lines: Vec<_> = screened.new.iter().map(|score| ScoreLine::new(report, score)).collect();
-            // If this fails nothing is counted, so the scores are new again when the evaluator delivers them once more.
-            self.logs.scores.append(&lines)?;
-        }
-        let recorded = self.scoreboard.record(report, &screened.new);
-        let evaluation = &self.metrics.evaluation;
-        evaluation.scores_recorded.inc_by(screened.new.len() as u64);
-        evaluation.scores_duplicate.inc_by(screened.duplicates.into());
-        evaluation.jobs_completed.inc_by(recorded.jobs_completed as u64);
-        self.audited(&recorded.audited, &report.precision);
-        if let Some(scores) = recorded.evaluation_completed {
-            self.show(report.step, &scores);
-            *completed = Some(Notice::Evaluated { step: report.step, scores });
-        }
-        let (new, duplicates) = (screened.new.len() as u32, screened.duplicates);
-        let reply = ScoreReply::Recorded { incarnation, new, duplicates };
-        if !screened.new.is_empty() {
-            self.publish(report, screened.new);
-        }
-        Ok(reply)
-    }
-
-    /// Writes down which episodes were scored twice, and says which of them differ.
-    fn audited(&mut self, audited: &[Audited], precision: &Name) {
-        for audited in audited {
-            let (seed, names) = (audited.first.0.seed, [&audited.first.1, &audited.second.1]);
-            self.metrics.evaluation.audits(audited.agree()).inc();
-            if !audited.agree() {
-                let [first, second] = [audited.first.0, audited.second.0].map(|score| score.episode_return);
-                error!(step = audited.step, seed, %precision, first, second, "{} and {} differ", names[0], names[1]);
-                self.notices.send(Notice::ScoresDiffer(names.map(Clone::clone))).ok();
-            }
-        }
-        let lines: Vec<_> = audited.iter().map(|audited| AuditLine::new(audited, precision)).collect();
-        if let Some(log) = self.logs.audits.as_mut().filter(|_| !lines.is_empty())
-            && let Err(error) = log.append(&lines)
-        {
-            error!(%error, "the audits could not be saved");
-        }
-    }
-
-    /// Lets the metrics show a complete evaluation, if it is the newest.
-    fn show(&self, step: u64, scores: &[EpisodeScore]) {
-        let evaluation = &self.metrics.evaluation;
-        if let Ok(step) = i64::try_from(step)
-            && step >= evaluation.step.get()
-        {
-            evaluation.score.set(scores.iter().map(|score| score.score).sum::<f64>() / scores.len() as f64);
-            evaluation.step.set(step);
-        }
-    }
-
-    /// Publishes recorded scores for observers. The system works without any, so a failure does not matter.
-    fn publish(&self, report: &ScoreReport, episodes: Vec<EpisodeScore>) {
-        let Some(session) = &self.session else { return };
-        let ScoreReport { run, step, weights, evaluator, .. } = report.clone();
-        let recorded = RecordedScores { run, step, weights, evaluator, episodes };
-        let Ok(bytes) = encode(&recorded) else { return };
-        let put = session.put(keys::scores_at(&self.run, report.step), bytes);
-        if let Err(error) = put.congestion_control(CongestionControl::Drop).wait() {
-            debug!(%error, "recorded scores could not be published");
         }
     }
 

@@ -8,7 +8,7 @@
 //! - [`datasets`] finds or fetches the data that a run learns from.
 //! - [`run`] goes from the command line to the exit, [`resume`] takes up a run that was there, by its [`settings`];
 //!   [`conduct`] is the main loop in between.
-//! - [`threads`] starts the threads that do the work: [`train`] (nothing but gradient steps, by an [`agent`] on a
+//! - [`threads`] starts the threads that do the work: [`trainer`] and [`train`] (nothing but gradient steps, by an [`agent`] on a
 //!   [`device`]), [`keeper`] (snapshots and checkpoints to the disk), [`publisher`] (publishes snapshots) and [`hub`]
 //!   (hands out jobs, takes scores in).
 //! - [`agent`] runs one of the [`algorithms`], each a file to be read beside its paper, with an [`optimiser`] and the
@@ -51,5 +51,6 @@ pub mod scoreboard;
 pub mod settings;
 pub mod threads;
 pub mod train;
+pub mod trainer;
 pub mod verify;
 pub mod wire;

@@ -6,6 +6,7 @@
 //! current time is an argument, for tests. `job` has the rules of a lease, `refusal` why a message is not accepted.
 
 mod audit;
+mod evaluation;
 mod job;
 mod refusal;
 
@@ -17,6 +18,7 @@ use quad_protocol::{EpisodeScore, Hash, Job, JobReply, Lease, Name, Progress, Sc
 
 pub use audit::Audited;
 use audit::Audits;
+use evaluation::{Episode, EpisodeState, Evaluation};
 use job::OpenJob;
 pub use refusal::Refusal;
 use refusal::require;
@@ -76,31 +78,6 @@ pub struct OtherWeights {
     pub found: Hash,
     /// Hash of those that have scores.
     pub scored: String,
-}
-
-#[derive(Debug)]
-struct Evaluation {
-    weights: Hash,
-    episodes: Vec<Episode>,
-}
-
-#[derive(Debug)]
-struct Episode {
-    seed: u64,
-    state: EpisodeState,
-    /// How often an evaluator that had it was lost.
-    lost: u32,
-}
-
-#[derive(Debug)]
-enum EpisodeState {
-    Waiting,
-    HandedOut {
-        job: u64,
-    },
-    /// Not handed out any more. Its score is still welcome.
-    GivenUp,
-    Scored(EpisodeScore),
 }
 
 /// A report that passed every check, split into new scores and scores that are recorded already.
@@ -380,20 +357,5 @@ impl Scoreboard {
             }
         }
         given_up
-    }
-}
-
-impl Evaluation {
-    fn episode(&self, seed: u64) -> Option<&Episode> {
-        self.episodes.iter().find(|episode| episode.seed == seed)
-    }
-
-    /// The scores, if all are there.
-    fn scores(&self) -> Option<Vec<EpisodeScore>> {
-        let score = |episode: &Episode| match episode.state {
-            EpisodeState::Scored(score) => Some(score),
-            _ => None,
-        };
-        self.episodes.iter().map(score).collect()
     }
 }

@@ -4,32 +4,30 @@ use std::any::Any;
 use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
-use std::sync::mpsc::{Receiver, SyncSender, sync_channel};
+use std::sync::mpsc::{Receiver, sync_channel};
 use std::thread::{self, JoinHandle};
 use std::time::Duration;
 
-use anyhow::{Context, anyhow};
-use quad_dataset::{BatchSampler, Task, Transitions};
+use anyhow::anyhow;
+use quad_dataset::{Task, Transitions};
 use quad_protocol::Name;
-use quad_service::{Beat, Health, hinted};
+use quad_service::{Beat, Health};
 use tokio::sync::mpsc::UnboundedSender;
 use tokio::sync::oneshot;
 use tracing::warn;
 
-use crate::agent::Agent;
-use crate::algorithms::Setting;
-use crate::config::{Experiment, RunConfig};
-use crate::device::Device;
+use crate::config::RunConfig;
 use crate::hub::{self, EvaluationPlan, Hub, Logs};
 use crate::inbox::{Inbox, inbox};
 use crate::keeper::{Desk, Keeper, Provenance};
-use crate::metrics::{Metrics, TrainingMetrics};
+use crate::metrics::Metrics;
 use crate::notice::Notice;
 use crate::publisher::{self, Identity, SnapshotPublisher};
 use crate::resume::Past;
-use crate::run_dir::{Checkpoint, Log, RunDir};
+use crate::run_dir::{Log, RunDir};
 use crate::scoreboard::{Rules, Scoreboard};
-use crate::train::{Outcome, Outlets, Plan, Row, TrainError, train};
+use crate::train::Row;
+use crate::trainer::{Trainer, TrainingResult};
 
 /// Episodes in one job: two evaluators share an evaluation of ten.
 const JOB_EPISODES: usize = 5;
@@ -41,13 +39,6 @@ const STUCK: Duration = Duration::from_secs(30);
 const TRAINING_STUCK: Duration = Duration::from_secs(300);
 /// Lines of `metrics.jsonl` that may wait for the disk.
 const ROWS_WAITING: usize = 1024;
-
-const DIVERGED: &str = "the same configuration would diverge again: try a smaller agent.critic_learning_rate or \
-                        agent.actor_learning_rate, a smaller agent.gradient_clip, or look for outliers with \
-                        `learner datasets inspect`; begin anew with --fresh";
-
-/// How training ended.
-pub type TrainingResult = anyhow::Result<Outcome>;
 
 /// The running threads.
 pub struct Threads {
@@ -239,67 +230,6 @@ fn finish(name: &str, thread: Thread) -> anyhow::Result<()> {
     Ok(thread.join().map_err(|_| anyhow!("the thread `{name}` panicked"))??)
 }
 
-struct Trainer {
-    experiment: Experiment,
-    device: Device,
-    transitions: Transitions,
-    checkpoint: Option<Checkpoint>,
-    checkpoint_every: Duration,
-    seconds_before: f64,
-    metrics: TrainingMetrics,
-    rows: SyncSender<Row>,
-    desk: Desk,
-    stop: Arc<AtomicBool>,
-}
-
-impl Trainer {
-    fn run(self, beat: &Beat) -> TrainingResult {
-        let experiment = &self.experiment;
-        let setting = Setting {
-            observation_dim: self.transitions.observation_dim(),
-            action_dim: self.transitions.action_dim(),
-            batch_size: experiment.batch_size as usize,
-            total_steps: experiment.steps,
-            seed: experiment.seed,
-            precision: experiment.precision,
-            device: self.device.open()?,
-        };
-        let algorithm = experiment.hyperparameters()?.start(&setting)?;
-        let mut agent = Agent::new(experiment.definition()?, algorithm, setting.device.clone());
-        if let Some(Checkpoint { step, state }) = &self.checkpoint {
-            let advice = "begin anew with --fresh, or go on with the version of the learner that wrote it";
-            agent
-                .load(state)
-                .map_err(|error| hinted(error, advice))
-                .with_context(|| format!("cannot go on from the checkpoint of step {step}"))?;
-        }
-        let mut sampler = BatchSampler::new(self.transitions.len(), setting.batch_size, experiment.seed, agent.step());
-        let outlets = Outlets {
-            metrics: self.metrics.clone(),
-            rows: self.rows,
-            snapshot: &|policy| self.desk.snapshot(policy, &self.stop),
-            checkpoint: &|checkpoint| self.desk.checkpoint(checkpoint),
-            stop: &self.stop,
-            beat,
-        };
-        let plan = Plan {
-            steps: experiment.steps,
-            eval_interval: experiment.eval_interval,
-            checkpoint_every: self.checkpoint_every,
-            seconds_before: self.seconds_before,
-        };
-        let outcome = train(&mut agent, &self.transitions, &mut sampler, plan, &outlets).map_err(|error| {
-            let diverged = matches!(error, TrainError::Diverged { .. });
-            self.metrics.diverged.set(diverged.into());
-            if diverged { hinted(error, DIVERGED) } else { error.into() }
-        })?;
-        if outcome == Outcome::Completed {
-            self.desk.trained();
-        }
-        Ok(outcome)
-    }
-}
-
 fn write_rows(rows: &Receiver<Row>, mut log: Log) {
     let mut warned = false;
     for row in rows {
@@ -322,9 +252,11 @@ mod tests {
     fn a_thread_that_panics_fails_the_run_and_says_so_at_its_end() {
         let (notify, mut notices) = unbounded_channel();
         let thread = spawn("hub", &notify, || panic!("a test's own {}", "panic")).unwrap();
+        drop(notify);
         let Some(Notice::Failed(error)) = notices.blocking_recv() else { panic!("no notice") };
         assert!(error.to_string().contains("`hub` panicked") && error.to_string().contains("a test's own panic"));
         assert!(finish("hub", thread).is_err());
+        let (notify, _notices) = unbounded_channel();
         finish("hub", spawn("hub", &notify, || ()).unwrap()).unwrap();
     }
 }

@@ -4,7 +4,7 @@
 use std::collections::BTreeMap;
 use std::fs;
 use std::path::Path;
-use std::time::{Duration, Instant};
+use std::time::Duration;
 
 use quad_tests::system::{Learner, Scratch, Setting, free_port};
 use quad_tests::{PATIENCE, eventually};
@@ -146,19 +146,4 @@ fn weights_that_come_out_otherwise_for_a_scored_step_end_the_run() {
     assert_eq!(learner.process.wait(PATIENCE).code(), Some(1));
     assert!(learner.process.log().contains("were scored before"), "{}", learner.process.log());
     assert!(learner.process.log().contains("hint: another kind of processor"), "{}", learner.process.log());
-}
-
-#[test]
-fn a_second_signal_ends_the_learner_at_once() {
-    let scratch = Scratch::new();
-    let setting = Setting { steps: 100_000_000, ..LONG };
-    let mut learner = scratch.learner("run", setting);
-    learner.process.wait_for_log("snapshot handed to evaluation", PATIENCE);
-    // With one signal it would wait for the end of the session.
-    let start = Instant::now();
-    learner.process.signal("INT");
-    learner.process.signal("INT");
-    let status = learner.process.wait(PATIENCE);
-    assert!(start.elapsed() < Duration::from_secs(2), "{:?}", start.elapsed());
-    assert!(matches!(status.code(), Some(1 | 130)), "{status}");
 }

@@ -1,0 +1,92 @@
+//! What the files of a run say: a line of each log, and where the learner is.
+
+use quad_protocol::{EpisodeScore, Name, ScoreReport};
+use serde::{Deserialize, Serialize};
+
+use crate::scoreboard::Audited;
+
+/// Where a learner can be reached: `endpoints.json`.
+#[derive(Debug, Serialize)]
+pub struct RunEndpoints {
+    /// Zenoh endpoints that an evaluator can connect to.
+    pub zenoh: Vec<String>,
+    /// Address of `/metrics`.
+    pub metrics: String,
+}
+
+/// A line of `scores.jsonl`.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct ScoreLine {
+    /// Gradient step of the evaluated snapshot.
+    pub step: u64,
+    /// Seed of the episode.
+    pub seed: u64,
+    /// Undiscounted return.
+    #[serde(rename = "return")]
+    pub episode_return: f64,
+    /// Environment steps.
+    pub length: u32,
+    /// D4RL-normalised score.
+    pub score: f64,
+    /// BLAKE3 of the snapshot's file.
+    pub weights: String,
+    /// Arithmetic that the policy was computed in; lines from before there was a choice do not say.
+    #[serde(default)]
+    pub precision: String,
+    /// Who measured it.
+    pub evaluator: String,
+}
+
+impl ScoreLine {
+    /// The line for an episode of a report.
+    pub fn new(report: &ScoreReport, score: &EpisodeScore) -> Self {
+        Self {
+            step: report.step,
+            seed: score.seed,
+            episode_return: score.episode_return,
+            length: score.length,
+            score: score.score,
+            weights: report.weights.to_string(),
+            precision: report.precision.to_string(),
+            evaluator: report.evaluator.to_string(),
+        }
+    }
+
+    /// The episode of the line.
+    pub fn episode(&self) -> EpisodeScore {
+        let Self { seed, episode_return, length, score, .. } = *self;
+        EpisodeScore { seed, episode_return, length, score }
+    }
+}
+
+/// A line of `audits.jsonl`: an episode that two evaluators of the same precision have scored.
+#[derive(Clone, Debug, PartialEq, Serialize)]
+pub struct AuditLine {
+    /// Gradient step of the snapshot.
+    pub step: u64,
+    /// Seed of the episode.
+    pub seed: u64,
+    /// Arithmetic that the policy was computed in.
+    pub precision: String,
+    /// Who measured the score that counts, and who the other one.
+    pub evaluators: [String; 2],
+    /// Their returns.
+    pub returns: [f64; 2],
+    /// Whether both scores are the same, bit for bit.
+    pub agree: bool,
+}
+
+impl AuditLine {
+    /// The line for an episode that was scored twice.
+    pub fn new(audited: &Audited, precision: &Name) -> Self {
+        let Audited { step, first, second } = audited;
+        Self {
+            step: *step,
+            seed: first.0.seed,
+            precision: precision.to_string(),
+            evaluators: [first, second].map(|(_, evaluator)| evaluator.to_string()),
+            returns: [first, second].map(|(score, _)| score.episode_return),
+            agree: audited.agree(),
+        }
+    }
+}
