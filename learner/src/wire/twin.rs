@@ -4,7 +4,7 @@ use std::time::{Duration, Instant};
 
 use anyhow::anyhow;
 use quad_protocol::keys;
-use quad_service::Hint;
+use quad_service::hinted;
 use tracing::info;
 use zenoh::Session;
 use zenoh::pubsub::Subscriber;
@@ -64,8 +64,8 @@ pub(super) async fn watch(session: &Session, life: &Life, hub: &Inbox<hub::Event
         let together = start.elapsed() < TOGETHER && token.kind() == SampleKind::Put;
         let found = keys::incarnation_of(token.key_expr().as_str());
         let earlier = found.filter(|other| together && *other < mine.incarnation);
-        if let Some(Err(error)) = earlier.map(|other| Err::<(), _>(is_there(&mine, other)).hint(HINT)) {
-            inbox.offer_change(hub::Event::Twin(error)).ok();
+        if let Some(other) = earlier {
+            inbox.offer_change(hub::Event::Twin(hinted(is_there(&mine, other), HINT))).ok();
         }
     };
     let tokens = session.liveliness().declare_subscriber(keys::all_lives(&life.run)).history(true).callback(callback);
