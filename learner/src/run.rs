@@ -209,7 +209,8 @@ async fn conduct(
     // From here on nothing outside can be wrong any more, so a refused start leaves no folder behind.
     let (run_dir, scores, past) = take_up(path, begun, args.fresh, config)?;
     let (notify, notices) = mpsc::unbounded_channel();
-    let incarnation = now()?;
+    // A later start has a larger number; the low bits tell two apart that start in the same millisecond.
+    let incarnation = now()? << 16 | u64::from(rand::random::<u16>());
     let checkpoint_every = Duration::from_secs(args.checkpoint_seconds);
     let (name, audit) = (run.clone(), args.audit);
     let state = Run { name, incarnation, config, dir: &run_dir, scores, past, checkpoint_every, audit };
