@@ -1,19 +1,23 @@
 //! The thread that owns the scoreboard: it hands out jobs, records scores, and follows which evaluators are connected. A
-//! single thread needs no locks, and its messages are small, so none delays the next one for long. Others send its answers.
+//! single thread needs no locks, and its messages are small, so none delays the next one for long. Others send its answers and
+//! write its scores.
 
 mod announcer;
 mod evaluators;
 mod rejection;
 mod scores;
 
+use std::iter;
+use std::ops::ControlFlow;
+use std::sync::mpsc::Sender;
 use std::time::{Duration, Instant};
 
 use quad_protocol::{
-    Hash, JobReply, JobRequest, Message, Name, Progress, ScoreReport, decode, encode, episode_seeds, keys,
+    Hash, JobReply, JobRequest, Message, Name, Progress, ScoreReply, decode, encode, episode_seeds, keys,
 };
 use quad_service::{Beat, hinted};
 use tokio::sync::mpsc::UnboundedSender;
-use tracing::{debug, error, warn};
+use tracing::{debug, warn};
 use zenoh::Session;
 use zenoh::bytes::ZBytes;
 use zenoh::sample::{Sample, SampleKind};
@@ -22,14 +26,17 @@ use crate::inbox::Messages;
 use crate::metrics::Metrics;
 use crate::notice::Notice;
 use crate::replies::{Asker, Question};
-use crate::run_dir::Log;
 use crate::scoreboard::{Claim, Lost, OtherWeights, Scoreboard};
+use crate::scribe::Lines;
 
 use evaluators::Evaluators;
 use rejection::Rejection;
+use scores::Delivered;
 
 /// How often expired leases are looked for.
 const TICK: Duration = Duration::from_millis(250);
+/// Most messages that are handled before the new scores in them go to the disk.
+const MOST_TOGETHER: usize = 256;
 
 /// Messages to the thread.
 #[derive(Debug)]
@@ -55,6 +62,8 @@ pub enum Event {
     Liveliness(Sample),
     /// Another learner has the run's name: what to say of it.
     Twin(anyhow::Error),
+    /// The scores that the scribe had were written, or why not.
+    Written(Result<(), String>),
     /// End, after the messages sent before this one are handled.
     Stop,
 }
@@ -68,35 +77,27 @@ pub struct EvaluationPlan {
     pub episodes: u32,
 }
 
-/// What the thread writes.
-#[derive(Debug)]
-pub struct Logs {
-    /// `scores.jsonl`.
-    pub scores: Log,
-    /// Where episodes are written down that were scored twice, if any are to be.
-    pub audits: Option<Log>,
-}
-
 /// State of the thread.
 pub struct Hub {
     run: Name,
     plan: EvaluationPlan,
     scoreboard: Scoreboard,
-    logs: Logs,
+    scribe: Sender<Lines>,
     metrics: Metrics,
     notices: UnboundedSender<Notice>,
     evaluators: Evaluators,
     session: Option<Session>,
+    delivered: Delivered,
     training_completed: bool,
 }
 
 impl Hub {
-    /// State before the first evaluation.
+    /// State before the first evaluation. New scores go to `scribe`.
     pub fn new(
         run: Name,
         plan: EvaluationPlan,
         scoreboard: Scoreboard,
-        logs: Logs,
+        scribe: Sender<Lines>,
         metrics: Metrics,
         notices: UnboundedSender<Notice>,
     ) -> Self {
@@ -104,11 +105,12 @@ impl Hub {
             run,
             plan,
             scoreboard,
-            logs,
+            scribe,
             evaluators: Evaluators::new(metrics.evaluators.clone(), notices.clone()),
             metrics,
             notices,
             session: None,
+            delivered: Delivered::default(),
             training_completed: false,
         }
     }
@@ -118,18 +120,41 @@ impl Hub {
         let mut ticked = Instant::now();
         while let Ok(event) = messages.next(TICK) {
             beat.alive();
-            match event {
-                None => {}
-                Some(Event::Stop) => return,
-                Some(event) => self.handle(event),
+            if self.handle_together(event, messages).is_break() {
+                return self.finish(messages);
             }
             if ticked.elapsed() >= TICK {
                 ticked = Instant::now();
                 self.tick(ticked);
+                self.metrics.evaluation.episodes_missing.set(self.scoreboard.missing().len() as i64);
             }
-            let evaluation = &self.metrics.evaluation;
-            evaluation.episodes_pending.set(self.scoreboard.pending() as i64);
-            evaluation.episodes_missing.set(self.scoreboard.missing().len() as i64);
+            self.metrics.evaluation.episodes_pending.set(self.scoreboard.pending() as i64);
+        }
+    }
+
+    /// Handles a message and those that wait behind it, before the new scores in all of them go to the disk.
+    fn handle_together(&mut self, first: Option<Event>, messages: &Messages<Event>) -> ControlFlow<()> {
+        let rest = iter::from_fn(|| messages.next(Duration::ZERO).ok().flatten());
+        for event in first.into_iter().chain(rest).take(MOST_TOGETHER) {
+            if matches!(event, Event::Stop) {
+                return ControlFlow::Break(());
+            }
+            self.handle(event);
+        }
+        self.commit();
+        ControlFlow::Continue(())
+    }
+
+    /// Waits until what was delivered is on the disk.
+    fn finish(&mut self, messages: &Messages<Event>) {
+        self.commit();
+        while self.delivered.is_waiting() {
+            match messages.next(TICK) {
+                Ok(Some(Event::Written(written))) => self.written(&written),
+                Ok(_) => {}
+                Err(_) => return,
+            }
+            self.commit();
         }
     }
 
@@ -153,16 +178,10 @@ impl Hub {
                 let reply = parse(question.payload()).map(|request| self.job(request));
                 self.answer(question, keys::jobs(&self.run), reply);
             }
-            Event::Report(question) => {
-                let mut completed = None;
-                let reply = parse(question.payload())
-                    .and_then(|report: ScoreReport| Ok((self.report(&report, &mut completed)?, report.evaluator)));
-                self.answer(question, keys::scores(&self.run), reply);
-                if let Some(notice) = completed {
-                    self.notices.send(notice).ok();
-                }
-                self.settle();
-            }
+            Event::Report(question) => match parse(question.payload()) {
+                Ok(report) => self.report(question, report),
+                Err(rejection) => self.answer::<ScoreReply>(question, keys::scores(&self.run), Err(rejection)),
+            },
             Event::Progress(sample) => {
                 if let Err(rejection) = self.progress(&sample) {
                     self.reject(&rejection);
@@ -176,6 +195,7 @@ impl Hub {
             Event::Twin(error) => {
                 self.notices.send(Notice::Failed(error)).ok();
             }
+            Event::Written(written) => self.written(&written),
             Event::Stop => {}
         }
     }
@@ -184,8 +204,13 @@ impl Hub {
     fn job(&mut self, request: JobRequest) -> (JobReply, Name) {
         match request {
             JobRequest::Claim { evaluator, attempt, environments, precision } => {
-                let claim =
-                    Claim { evaluator: &evaluator, attempt, environments: &environments, precision: &precision };
+                let claim = Claim {
+                    evaluator: &evaluator,
+                    attempt,
+                    environments: &environments,
+                    precision: &precision,
+                    present: self.evaluators.count(),
+                };
                 let handed_out = self.scoreboard.handed_out();
                 let reply = self.scoreboard.claim(claim, Instant::now());
                 if let JobReply::Job(job) = &reply {
@@ -253,10 +278,7 @@ impl Hub {
     }
 
     fn reject(&self, rejection: &Rejection) {
-        match rejection {
-            Rejection::Disk(error) => error!(%error, "scores could not be saved"),
-            _ => debug!(%rejection, "a message was not accepted"),
-        }
+        debug!(%rejection, "a message was not accepted");
         self.metrics.reject(rejection.label());
     }
 

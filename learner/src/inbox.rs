@@ -6,8 +6,10 @@ use std::sync::atomic::{AtomicUsize, Ordering};
 use std::sync::mpsc::{self, Receiver, RecvTimeoutError, Sender};
 use std::time::Duration;
 
-/// Most messages from the network that may wait. With `MOST_BYTES` it bounds the memory that they can take.
-const MOST_WAITING: usize = 256;
+/// Most messages from the network that may wait, and their payloads together, bytes. There is room for a question and a
+/// progress message of every evaluator while the disk takes its time.
+const MOST_WAITING: usize = 4096;
+const MOST_BYTES_WAITING: usize = 64 << 20;
 /// The same for what Zenoh itself tells of who comes and goes, which takes little room and is not sent again.
 const MOST_CHANGES_WAITING: usize = 4096;
 /// Largest payload of a message to the learner; a score report of a job is a few hundred bytes.
@@ -23,22 +25,50 @@ pub struct Inbox<T> {
 #[derive(Debug, Default)]
 struct Waiting {
     messages: AtomicUsize,
+    bytes: AtomicUsize,
     changes: AtomicUsize,
 }
 
 #[derive(Clone, Copy, Debug)]
 enum Source {
     Process,
-    Message,
+    /// With the size of its payload, bytes.
+    Message(usize),
     Change,
 }
 
 impl Waiting {
-    fn of(&self, source: Source) -> Option<(&AtomicUsize, usize)> {
+    /// Whether there is room; if so, it is taken.
+    fn enter(&self, source: Source) -> bool {
+        let take = |count: &AtomicUsize, size: usize, most: usize| {
+            let fits = count.fetch_add(size, Ordering::Relaxed) + size <= most;
+            if !fits {
+                count.fetch_sub(size, Ordering::Relaxed);
+            }
+            fits
+        };
         match source {
-            Source::Process => None,
-            Source::Message => Some((&self.messages, MOST_WAITING)),
-            Source::Change => Some((&self.changes, MOST_CHANGES_WAITING)),
+            Source::Process => true,
+            Source::Change => take(&self.changes, 1, MOST_CHANGES_WAITING),
+            Source::Message(size) => {
+                let counted = take(&self.messages, 1, MOST_WAITING);
+                let fits = counted && take(&self.bytes, size, MOST_BYTES_WAITING);
+                if counted && !fits {
+                    self.messages.fetch_sub(1, Ordering::Relaxed);
+                }
+                fits
+            }
+        }
+    }
+
+    fn leave(&self, source: Source) {
+        match source {
+            Source::Process => {}
+            Source::Change => drop(self.changes.fetch_sub(1, Ordering::Relaxed)),
+            Source::Message(size) => {
+                self.messages.fetch_sub(1, Ordering::Relaxed);
+                self.bytes.fetch_sub(size, Ordering::Relaxed);
+            }
         }
     }
 }
@@ -76,9 +106,9 @@ impl<T> Inbox<T> {
         self.sender.send(Envelope { message, source: Source::Process }).ok();
     }
 
-    /// Sends a message from the network; gives it back if too many wait already. Never blocks.
-    pub fn offer(&self, message: T) -> Result<(), T> {
-        self.offer_from(Source::Message, message)
+    /// Sends a message from the network with a payload of `bytes`; gives it back if too many wait already. Never blocks.
+    pub fn offer(&self, message: T, bytes: usize) -> Result<(), T> {
+        self.offer_from(Source::Message(bytes), message)
     }
 
     /// The same for a change of who is connected.
@@ -87,10 +117,7 @@ impl<T> Inbox<T> {
     }
 
     fn offer_from(&self, source: Source, message: T) -> Result<(), T> {
-        if let Some((waiting, most)) = self.waiting.of(source)
-            && waiting.fetch_add(1, Ordering::Relaxed) >= most
-        {
-            waiting.fetch_sub(1, Ordering::Relaxed);
+        if !self.waiting.enter(source) {
             return Err(message);
         }
         self.sender.send(Envelope { message, source }).map_err(|unsent| unsent.0.message)
@@ -102,9 +129,7 @@ impl<T> Messages<T> {
     pub fn next(&self, timeout: Duration) -> Result<Option<T>, Disconnected> {
         match self.receiver.recv_timeout(timeout) {
             Ok(envelope) => {
-                if let Some((waiting, _)) = self.waiting.of(envelope.source) {
-                    waiting.fetch_sub(1, Ordering::Relaxed);
-                }
+                self.waiting.leave(envelope.source);
                 Ok(Some(envelope.message))
             }
             Err(RecvTimeoutError::Timeout) => Ok(None),
@@ -124,18 +149,20 @@ mod tests {
     #[test]
     fn strangers_cannot_fill_the_queue_but_the_process_gets_through() {
         let (inbox, messages) = inbox();
-        let accepted = (0..MOST_WAITING + 10).filter(|&n| inbox.offer(n).is_ok()).count();
-        assert_eq!(accepted, MOST_WAITING);
+        let offered = |bytes| (0..MOST_WAITING + 10).filter(|&n| inbox.offer(n, bytes).is_ok()).count();
+        assert_eq!(offered(100), MOST_WAITING);
         inbox.send(7777);
         let received: Vec<_> = std::iter::from_fn(|| messages.next(Duration::ZERO).unwrap()).collect();
         assert_eq!(received.len(), MOST_WAITING + 1);
         assert_eq!(received.last(), Some(&7777));
+        assert_eq!(offered(MOST_BYTES), MOST_BYTES_WAITING / MOST_BYTES, "large ones are fewer");
+        assert_eq!(std::iter::from_fn(|| messages.next(Duration::ZERO).unwrap()).count(), 256);
         let changes = (0..MOST_CHANGES_WAITING + 10).filter(|&n| inbox.offer_change(n).is_ok()).count();
         assert_eq!(changes, MOST_CHANGES_WAITING);
         assert_eq!(std::iter::from_fn(|| messages.next(Duration::ZERO).unwrap()).count(), changes);
-        assert!(inbox.offer(1).is_ok(), "there is room again");
+        assert_eq!(offered(0), MOST_WAITING, "there is room again");
         drop(inbox);
-        assert_eq!(messages.next(Duration::ZERO), Ok(Some(1)));
+        assert_eq!(std::iter::from_fn(|| messages.next(Duration::ZERO).ok().flatten()).count(), MOST_WAITING);
         assert_eq!(messages.next(Duration::ZERO), Err(Disconnected));
     }
 }

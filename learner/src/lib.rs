@@ -9,8 +9,8 @@
 //! - [`run`] goes from the command line to the exit, [`resume`] takes up a run that was there, by its [`settings`];
 //!   [`conduct`] is the main loop in between.
 //! - [`threads`] starts the threads that do the work: [`trainer`] and [`train`] (nothing but gradient steps, by an [`agent`] on a
-//!   [`device`]), [`keeper`] (snapshots and checkpoints to the disk), [`publisher`] (publishes snapshots) and [`hub`]
-//!   (hands out jobs, takes scores in).
+//!   [`device`]), [`keeper`] (snapshots and checkpoints to the disk), [`publisher`] (publishes snapshots), [`hub`]
+//!   (hands out jobs, takes scores in) and [`scribe`] (scores to the disk).
 //! - [`agent`] runs one of the [`algorithms`], each a file to be read beside its paper, with an [`optimiser`] and the
 //!   [`random`] numbers of its seed, on a thread pool that is kept awake (`pool`).
 //! - [`scoreboard`] is the hub's state without any I/O.
@@ -48,6 +48,7 @@ pub mod resume;
 pub mod run;
 pub mod run_dir;
 pub mod scoreboard;
+pub mod scribe;
 pub mod settings;
 pub mod threads;
 pub mod train;

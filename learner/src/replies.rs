@@ -30,7 +30,7 @@ const THREADS: usize = 12;
 /// last may have to wait for the peer.
 const GRACE: Duration = Duration::from_millis(50);
 /// Most answers that may wait: of all, of one of those who ask, and queries that are only dropped, which take no room.
-const MOST_WAITING: usize = 512;
+const MOST_WAITING: usize = 4096;
 const MOST_WAITING_OF_ONE: usize = 64;
 const MOST_DROPPED: usize = 256;
 
@@ -90,7 +90,10 @@ struct State {
 
 struct Shared {
     state: Mutex<State>,
-    changed: Condvar,
+    /// There is something to send, for one of the threads.
+    work: Condvar,
+    /// Everything is sent.
+    idle: Condvar,
     metrics: Metrics,
 }
 
@@ -106,15 +109,15 @@ struct CloseOnDrop(Arc<Shared>);
 impl Drop for CloseOnDrop {
     fn drop(&mut self) {
         self.0.lock().closed = true;
-        self.0.changed.notify_all();
+        self.0.work.notify_all();
     }
 }
 
 impl Replies {
     /// Starts the threads.
     pub fn start(metrics: &Metrics) -> std::io::Result<Self> {
-        let shared =
-            Arc::new(Shared { state: Mutex::new(State::default()), changed: Condvar::new(), metrics: metrics.clone() });
+        let (work, idle) = (Condvar::new(), Condvar::new());
+        let shared = Arc::new(Shared { state: Mutex::default(), work, idle, metrics: metrics.clone() });
         for _ in 0..THREADS {
             let shared = shared.clone();
             thread::Builder::new().name("reply".to_owned()).spawn(move || shared.work())?;
@@ -128,7 +131,7 @@ impl Replies {
         let mut state = self.shared.lock();
         while !(state.waiting.is_empty() && state.busy.is_empty()) {
             let Some(left) = deadline.checked_duration_since(Instant::now()) else { break };
-            let waited = self.shared.changed.wait_timeout(state, left);
+            let waited = self.shared.idle.wait_timeout(state, left);
             state = waited.unwrap_or_else(PoisonError::into_inner).0;
         }
     }
@@ -145,7 +148,7 @@ impl Replies {
         if state.waiting.len() < MOST_WAITING && of_one < most {
             state.waiting.push_back(task);
             drop(state);
-            self.shared.changed.notify_all();
+            self.shared.work.notify_one();
             return;
         }
         drop(state);
@@ -178,9 +181,12 @@ impl Shared {
                 if *closed {
                     return;
                 }
+                if waiting.is_empty() && busy.is_empty() {
+                    self.idle.notify_all();
+                }
                 state = match waiting.is_empty() {
-                    true => self.changed.wait(state).unwrap_or_else(PoisonError::into_inner),
-                    false => self.changed.wait_timeout(state, GRACE).unwrap_or_else(PoisonError::into_inner).0,
+                    true => self.work.wait(state).unwrap_or_else(PoisonError::into_inner),
+                    false => self.work.wait_timeout(state, GRACE).unwrap_or_else(PoisonError::into_inner).0,
                 };
                 continue;
             };
@@ -201,7 +207,6 @@ impl Shared {
             if let Some(place) = state.busy.iter().position(|other| *other == asker) {
                 state.busy.swap_remove(place);
             }
-            self.changed.notify_all();
         }
     }
 }

@@ -18,19 +18,18 @@ use quad_protocol::{EpisodeScore, Hash, Job, JobReply, Lease, Name, Progress, Sc
 
 pub use audit::Audited;
 use audit::Audits;
-use evaluation::{Episode, EpisodeState, Evaluation};
+use evaluation::Evaluation;
 use job::OpenJob;
 pub use refusal::Refusal;
 use refusal::require;
 
 use crate::resume::Earlier;
 
-/// After this time an evaluator asks again when there was no job for it.
-const ASK_AGAIN: Duration = Duration::from_millis(500);
+/// After this time an evaluator asks again when there was no job for it, or after this time for each evaluator that there is
+/// if that is longer, so that hundreds which have nothing to do do not keep the learner busy. A new snapshot wakes them all.
+const ASK_AGAIN: [Duration; 2] = [Duration::from_millis(500), Duration::from_millis(10)];
 /// The same for an evaluator that does not have the run's environment.
 const NOT_FOR_YOU: Duration = Duration::from_secs(10);
-/// An episode whose evaluator was lost so often is not handed out any more: it may be what they are lost of.
-const MOST_ATTEMPTS: u32 = 20;
 /// Largest relative difference between a score and the one computed from its return; it allows for rounding only.
 const SCORE_TOLERANCE: f64 = 1e-6;
 
@@ -109,7 +108,7 @@ pub struct Lost {
     pub given_up: Vec<(u64, u64)>,
 }
 
-/// Who wants a job: the fields of a claim.
+/// Who wants a job: the fields of a claim, and how many others may.
 #[derive(Clone, Copy, Debug)]
 pub struct Claim<'a> {
     /// Its name.
@@ -120,6 +119,8 @@ pub struct Claim<'a> {
     pub environments: &'a [String],
     /// The arithmetic that it computes in.
     pub precision: &'a Name,
+    /// How many evaluators there are.
+    pub present: usize,
 }
 
 impl Scoreboard {
@@ -166,11 +167,7 @@ impl Scoreboard {
             return Ok(None);
         }
         let scores = self.earlier.remove(&step).map(|earlier| earlier.episodes).unwrap_or_default();
-        let episode = |&seed| {
-            let score = scores.iter().find(|score| score.seed == seed);
-            Episode { seed, state: score.map_or(EpisodeState::Waiting, |score| EpisodeState::Scored(*score)), lost: 0 }
-        };
-        let evaluation = Evaluation { weights, episodes: seeds.iter().map(episode).collect() };
+        let evaluation = Evaluation::new(weights, seeds, &scores);
         let complete = evaluation.scores();
         self.evaluations.insert(step, evaluation);
         Ok(complete)
@@ -178,55 +175,47 @@ impl Scoreboard {
 
     /// Episodes that have no score yet, and may still get one: without those that are [`missing`](Self::missing).
     pub fn pending(&self) -> usize {
-        let open = |episode: &&Episode| matches!(episode.state, EpisodeState::Waiting | EpisodeState::HandedOut { .. });
-        self.evaluations.values().map(|evaluation| evaluation.episodes.iter().filter(open).count()).sum()
+        self.evaluations.values().map(Evaluation::pending).sum()
     }
 
     /// Step and seed of the episodes that have no score and are not handed out any more.
     pub fn missing(&self) -> Vec<(u64, u64)> {
-        let missing = |episode: &&Episode| matches!(episode.state, EpisodeState::GivenUp);
-        let of = |(&step, evaluation): (&u64, &Evaluation)| {
-            evaluation.episodes.iter().filter(missing).map(|episode| (step, episode.seed)).collect::<Vec<_>>()
+        let of = |(&step, evaluation): (&u64, &Evaluation)| -> Vec<_> {
+            evaluation.given_up().map(|seed| (step, seed)).collect()
         };
         self.evaluations.iter().flat_map(of).collect()
     }
 
-    /// Hands out a job: episodes that are to be scored again, or else waiting ones of the oldest step. An evaluator has one job at a time; asked the same
-    /// again, because the answer was lost, the answer is the same.
+    /// Hands out a job: episodes that are to be scored again, or else waiting ones of the oldest step. An evaluator has one
+    /// job at a time; asked the same again, because the answer was lost, the answer is the same.
     pub fn claim(&mut self, claim: Claim<'_>, now: Instant) -> JobReply {
         let incarnation = self.rules.incarnation;
         let wait = |time: Duration| JobReply::Wait { incarnation, milliseconds: time.as_millis() as u64 };
+        let later = wait(ASK_AGAIN[0].max(ASK_AGAIN[1] * claim.present as u32));
         if !claim.environments.contains(&self.rules.task.environment) {
             return wait(NOT_FOR_YOU);
         }
         if let Some((&id, job)) = self.jobs.iter().find(|(_, job)| job.evaluator == *claim.evaluator) {
             return match job.attempt == claim.attempt {
-                true => self.message(id, job).map_or(wait(ASK_AGAIN), JobReply::Job),
-                false => wait(ASK_AGAIN),
+                true => self.message(id, job).map_or(later, JobReply::Job),
+                false => later,
             };
         }
         let id = self.next_job;
         let most = self.rules.job_episodes;
         let audit = self.audits.hand_out(id, claim.evaluator, claim.precision, most);
-        let Some(episodes) = audit.or_else(|| self.hand_out(id, most)) else { return wait(ASK_AGAIN) };
+        let Some(episodes) = audit.or_else(|| self.hand_out(id, most)) else { return later };
         let job = OpenJob::new(claim.evaluator.clone(), claim.attempt, episodes, self.rules.lease, now);
         let message = self.message(id, &job);
         self.jobs.insert(id, job);
         self.next_job += 1;
-        message.map_or(wait(ASK_AGAIN), JobReply::Job)
+        message.map_or(later, JobReply::Job)
     }
 
     /// Waiting episodes of the oldest step that has any.
     fn hand_out(&mut self, job: u64, most: usize) -> Option<(u64, Vec<u64>)> {
         self.evaluations.iter_mut().find_map(|(&step, evaluation)| {
-            let waiting = evaluation.episodes.iter_mut().filter(|e| matches!(e.state, EpisodeState::Waiting));
-            let seeds: Vec<_> = waiting
-                .take(most)
-                .map(|episode| {
-                    episode.state = EpisodeState::HandedOut { job };
-                    episode.seed
-                })
-                .collect();
+            let seeds = evaluation.hand_out(job, most);
             (!seeds.is_empty()).then_some((step, seeds))
         })
     }
@@ -253,7 +242,7 @@ impl Scoreboard {
     pub fn hand_back(&mut self, evaluator: &Name, id: u64, lease: &Lease) -> bool {
         let has = self.jobs.get(&id).is_some_and(|job| job.evaluator == *evaluator && job.lease == *lease);
         if has && let Some(job) = self.jobs.remove(&id) {
-            self.release(id, &job, 0);
+            self.release(id, &job, false);
         }
         has
     }
@@ -276,11 +265,11 @@ impl Scoreboard {
         let mut seen = BTreeSet::new();
         for score in &report.episodes {
             require(seen.insert(score.seed), Refusal::Seed(score.seed))?;
-            let episode = evaluation.episode(score.seed).ok_or(Refusal::Seed(score.seed))?;
+            let is_scored = evaluation.is_scored(score.seed).ok_or(Refusal::Seed(score.seed))?;
             require(self.is_possible(score), Refusal::Episode(score.seed))?;
-            match episode.state {
-                EpisodeState::Scored(_) => screened.duplicates += 1,
-                _ => screened.new.push(*score),
+            match is_scored {
+                true => screened.duplicates += 1,
+                false => screened.new.push(*score),
             }
         }
         Ok(screened)
@@ -310,14 +299,10 @@ impl Scoreboard {
     /// Counts the new scores of a report that [`screen`](Self::screen) let pass.
     pub fn record(&mut self, report: &ScoreReport, new: &[EpisodeScore]) -> Recorded {
         let Some(evaluation) = self.evaluations.get_mut(&report.step) else { return Recorded::default() };
-        for score in new {
-            if let Some(episode) = evaluation.episodes.iter_mut().find(|episode| episode.seed == score.seed) {
-                episode.state = EpisodeState::Scored(*score);
-            }
-        }
+        evaluation.score(new);
         let audited = self.audits.compare(report);
         self.audits.add(report, new);
-        let done = |seed| evaluation.episode(seed).is_some_and(|e| matches!(e.state, EpisodeState::Scored(_)));
+        let done = |seed| evaluation.is_scored(seed) == Some(true);
         let (open, audits) = (self.jobs.len(), &self.audits);
         self.jobs
             .retain(|&id, job| job.step != report.step || !job.seeds.iter().copied().all(done) || audits.is_open(id));
@@ -337,25 +322,14 @@ impl Scoreboard {
 
     fn take_back(&mut self, lost: impl Fn(&OpenJob) -> bool) -> Lost {
         let jobs: Vec<(u64, OpenJob)> = self.jobs.extract_if(.., |_, job| lost(job)).collect();
-        let given_up = jobs.iter().flat_map(|(id, job)| self.release(*id, job, 1)).collect();
+        let given_up = jobs.iter().flat_map(|(id, job)| self.release(*id, job, true)).collect();
         Lost { jobs: jobs.len(), given_up }
     }
 
     /// Lets the episodes of a job that has ended wait for the next; gives those that were lost too often.
-    fn release(&mut self, id: u64, job: &OpenJob, lost: u32) -> Vec<(u64, u64)> {
+    fn release(&mut self, id: u64, job: &OpenJob, lost: bool) -> Vec<(u64, u64)> {
         self.audits.release(id);
-        let mut given_up = Vec::new();
-        let Some(evaluation) = self.evaluations.get_mut(&job.step) else { return given_up };
-        for episode in &mut evaluation.episodes {
-            if matches!(episode.state, EpisodeState::HandedOut { job } if job == id) {
-                episode.lost += lost;
-                episode.state = EpisodeState::Waiting;
-                if episode.lost >= MOST_ATTEMPTS {
-                    episode.state = EpisodeState::GivenUp;
-                    given_up.push((job.step, episode.seed));
-                }
-            }
-        }
-        given_up
+        let given_up = self.evaluations.get_mut(&job.step).map(|evaluation| evaluation.take_back(id, lost));
+        given_up.unwrap_or_default().into_iter().map(|seed| (job.step, seed)).collect()
     }
 }

@@ -4,7 +4,7 @@ use std::any::Any;
 use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
-use std::sync::mpsc::{Receiver, sync_channel};
+use std::sync::mpsc::{Receiver, channel, sync_channel};
 use std::thread::{self, JoinHandle};
 use std::time::Duration;
 
@@ -17,7 +17,7 @@ use tokio::sync::oneshot;
 use tracing::warn;
 
 use crate::config::RunConfig;
-use crate::hub::{self, EvaluationPlan, Hub, Logs};
+use crate::hub::{self, EvaluationPlan, Hub};
 use crate::inbox::{Inbox, inbox};
 use crate::keeper::{Desk, Keeper, Provenance};
 use crate::metrics::Metrics;
@@ -26,6 +26,7 @@ use crate::publisher::{self, Identity, SnapshotPublisher};
 use crate::resume::Past;
 use crate::run_dir::{Log, RunDir};
 use crate::scoreboard::{Rules, Scoreboard};
+use crate::scribe::Scribe;
 use crate::train::Row;
 use crate::trainer::{Trainer, TrainingResult};
 
@@ -56,6 +57,7 @@ pub struct Threads {
     keeper: Thread,
     publisher_thread: Thread,
     hub_thread: Thread,
+    scribe: Thread,
 }
 
 /// What a run is, and how far it is.
@@ -105,9 +107,11 @@ impl Threads {
         let mut scoreboard = Scoreboard::new(rules);
         scoreboard.remember(earlier);
         let audits = if audit > 0.0 { Some(dir.audit_log()?) } else { None };
-        let logs = Logs { scores, audits };
-        let state = Hub::new(name.clone(), plan, scoreboard, logs, metrics.clone(), notices.clone());
         let (hub, hub_messages) = inbox();
+        let (sender, lines) = channel();
+        let scribe = Scribe { scores, audits, lines, hub: hub.clone() };
+        let scribe = spawn("scribe", notices, with(health.part("scribe", STUCK), move |beat| scribe.run(beat)))?;
+        let state = Hub::new(name.clone(), plan, scoreboard, sender, metrics.clone(), notices.clone());
         let hub_thread =
             spawn("hub", notices, with(health.part("hub", STUCK), move |beat| state.run(&hub_messages, beat)))?;
 
@@ -165,7 +169,7 @@ impl Threads {
             tell.send(trainer.run(beat)).ok();
         };
         let training = spawn("training", notices, with(health.part("training", TRAINING_STUCK), work))?;
-        Ok(Self { publisher, hub, trained, desk, stop, training, rows, keeper, publisher_thread, hub_thread })
+        Ok(Self { publisher, hub, trained, desk, stop, training, rows, keeper, publisher_thread, hub_thread, scribe })
     }
 
     /// Asks training to end after its current step.
@@ -183,7 +187,8 @@ impl Threads {
         self.publisher.send(publisher::Event::Stop);
         finish("publisher", self.publisher_thread)?;
         self.hub.send(hub::Event::Stop);
-        finish("hub", self.hub_thread)
+        finish("hub", self.hub_thread)?;
+        finish("scribe", self.scribe)
     }
 }
 

@@ -74,9 +74,10 @@ impl Wire {
         let progress = session
             .declare_subscriber(keys::all_progress(run))
             .callback(move |sample: Sample| {
-                if sample.payload().len() > MOST_BYTES {
+                let bytes = sample.payload().len();
+                if bytes > MOST_BYTES {
                     counted.reject("oversized");
-                } else if inbox.offer(hub::Event::Progress(sample)).is_err() {
+                } else if inbox.offer(hub::Event::Progress(sample), bytes).is_err() {
                     counted.reject("busy");
                 }
             })
@@ -135,10 +136,11 @@ impl Server<'_> {
         let (inbox, metrics, replies) = (inbox.clone(), self.metrics.clone(), self.replies.clone());
         let callback = move |query: Query| {
             let question = replies.question(query);
-            if question.payload().is_some_and(|payload| payload.len() > MOST_BYTES) {
+            let bytes = question.payload().map_or(0, |payload| payload.len());
+            if bytes > MOST_BYTES {
                 metrics.reject("oversized");
                 question.answer(Asker::Stranger, Err("the message is too large".to_owned()));
-            } else if inbox.offer(event(question)).is_err() {
+            } else if inbox.offer(event(question), bytes).is_err() {
                 // Without an answer the evaluator asks again.
                 metrics.reject("busy");
             }

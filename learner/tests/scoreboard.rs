@@ -96,7 +96,7 @@ impl Bench {
         let now = self.at(seconds);
         let environments = ["ant".to_owned(), "hopper".to_owned()];
         self.board.claim(
-            Claim { evaluator: &name(evaluator), attempt, environments: &environments, precision: &name("f32") },
+            Claim { evaluator: &name(evaluator), attempt, environments: &environments, precision: &name("f32"), present: 0 },
             now,
         )
     }
@@ -147,7 +147,7 @@ fn an_evaluator_without_the_environment_gets_nothing() {
     let mut bench = Bench::new();
     for environments in [vec![], vec!["ant".to_owned()]] {
         let now = bench.at(0);
-        let claim = Claim { evaluator: &name("a"), attempt: 1, environments: &environments, precision: &name("f32") };
+        let claim = Claim { evaluator: &name("a"), attempt: 1, environments: &environments, precision: &name("f32"), present: 0 };
         assert!(matches!(bench.board.claim(claim, now), JobReply::Wait { .. }));
     }
 }
@@ -454,7 +454,7 @@ fn an_audited_episode_is_scored_again_by_another_evaluator_of_the_same_precision
     // Not in another arithmetic.
     let environments = ["hopper".to_owned()];
     let (evaluator, precision) = (name("c"), name("bf16"));
-    let claim = Claim { evaluator: &evaluator, attempt: 1, environments: &environments, precision: &precision };
+    let claim = Claim { evaluator: &evaluator, attempt: 1, environments: &environments, precision: &precision, present: 0 };
     let JobReply::Job(other) = bench.board.claim(claim, bench.at(1)) else { panic!("there is work") };
     assert_eq!(other.step, 2000);
 

@@ -7,6 +7,7 @@
 //! - [`process`]: start a program, signal it, wait for it, read what it said.
 //! - [`system`]: a scratch folder with a tiny dataset and preset; learners and evaluators that use them.
 //! - [`router`]: a Zenoh router in the test's own process; [`link`]: a connection that can be cut, frozen and slowed down.
+//! - [`crowd`]: hundreds of evaluators that only talk; [`pace`]: how fast a learner trains, and what slows it down.
 //! - [`http`]: fetch a page, read a metric, serve a file.
 //! - [`peers`]: programs that are not ours; where one is missing, a test is skipped or fails.
 //! - [`prometheus`]: one to start, and what to ask any; [`dashboard`]: what Grafana's panels ask it.
@@ -14,9 +15,11 @@
 //! A helper that cannot do its work panics, and so fails its test.
 #![allow(clippy::unwrap_used, clippy::expect_used, clippy::print_stderr)]
 
+pub mod crowd;
 pub mod dashboard;
 pub mod http;
 pub mod link;
+pub mod pace;
 pub mod peers;
 pub mod process;
 pub mod prometheus;

@@ -30,6 +30,11 @@ impl Evaluators {
         Self { metrics, announcer: Announcer::new(notices), present: BTreeSet::new(), last_seen: BTreeMap::new() }
     }
 
+    /// How many are connected.
+    pub fn count(&self) -> usize {
+        self.present.len()
+    }
+
     /// One connected.
     pub fn joined(&mut self, evaluator: Name) -> Result<(), Rejection> {
         if self.present.len() >= MOST_EVALUATORS && !self.present.contains(&evaluator) {

@@ -2,7 +2,6 @@
 
 use quad_protocol::CodecError;
 
-use crate::run_dir::RunDirError;
 use crate::scoreboard::Refusal;
 
 /// Why a message from the wire was not accepted.
@@ -18,8 +17,10 @@ pub(super) enum Rejection {
     Name,
     #[error("there are too many evaluators")]
     Crowd,
+    #[error("scores of the same episodes are being written, deliver these again")]
+    InWriting,
     #[error("the scores could not be saved, try again: {0}")]
-    Disk(#[from] RunDirError),
+    NotSaved(String),
 }
 
 impl Rejection {
@@ -30,7 +31,8 @@ impl Rejection {
             Self::Refused(refusal) => refusal.label(),
             Self::Name => "invalid_name",
             Self::Crowd => "too_many_evaluators",
-            Self::Disk(_) => "not_saved",
+            Self::InWriting => "in_writing",
+            Self::NotSaved(_) => "not_saved",
         }
     }
 }

@@ -1,5 +1,8 @@
 //! What becomes of a report: its scores are written down, counted, shown and published.
 
+use std::collections::BTreeSet;
+use std::mem;
+
 use anyhow::anyhow;
 use quad_protocol::{EpisodeScore, Name, RecordedScores, ScoreReply, ScoreReport, encode, keys};
 use tracing::{debug, error};
@@ -9,56 +12,121 @@ use zenoh::qos::CongestionControl;
 use super::Hub;
 use super::rejection::Rejection;
 use crate::notice::Notice;
+use crate::replies::Question;
 use crate::run_dir::{AuditLine, ScoreLine};
-use crate::scoreboard::Audited;
+use crate::scoreboard::{Audited, Screened};
+use crate::scribe::Lines;
+
+/// Reports with new scores on their way to the disk, and who waits for the thanks.
+#[derive(Default)]
+pub(super) struct Delivered {
+    /// For the next write.
+    staged: Vec<(Question, ScoreReport, Screened)>,
+    /// In the write that goes on now.
+    in_writing: Vec<(Question, ScoreReport, Screened)>,
+    /// Step and seed of the new scores of both.
+    keys: BTreeSet<(u64, u64)>,
+}
+
+impl Delivered {
+    /// Whether some have no answer yet.
+    pub fn is_waiting(&self) -> bool {
+        !self.staged.is_empty() || !self.in_writing.is_empty()
+    }
+}
 
 impl Hub {
-    /// Checks the scores, writes the new ones to disk, counts them. Only then does the caller acknowledge the report.
-    pub(super) fn report(
-        &mut self,
-        report: &ScoreReport,
-        completed: &mut Option<Notice>,
-    ) -> Result<ScoreReply, Rejection> {
-        let incarnation = self.scoreboard.incarnation();
-        let screened = match report.cannot_act {
-            Some(_) => self.scoreboard.screen_complaint(report).map(|()| None),
-            None => self.scoreboard.screen(report).map(Some),
-        };
-        let screened = match screened {
-            Ok(Some(screened)) => screened,
+    /// Checks a report. New scores wait for [`commit`](Self::commit); everything else is answered at once.
+    pub(super) fn report(&mut self, question: Question, report: ScoreReport) {
+        let reply = match self.screen(&report) {
+            Ok(Some(screened)) if screened.new.is_empty() => Ok(self.record(&report, screened, &mut None)),
+            Ok(Some(screened)) => {
+                self.delivered.keys.extend(screened.new.iter().map(|score| (report.step, score.seed)));
+                return self.delivered.staged.push((question, report, screened));
+            }
             Ok(None) => {
                 let reason = report.cannot_act.as_ref().map(|complaint| complaint.reason.as_str()).unwrap_or_default();
                 let (step, evaluator) = (report.step, &report.evaluator);
                 let broken = anyhow!("the policy of step {step} cannot act: {reason} (evaluator {evaluator})");
                 self.notices.send(Notice::Failed(broken)).ok();
-                return Ok(ScoreReply::Recorded { incarnation, new: 0, duplicates: 0 });
+                Ok(ScoreReply::Recorded { incarnation: self.scoreboard.incarnation(), new: 0, duplicates: 0 })
             }
-            Err(refusal) => {
+            Err(Rejection::Refused(refusal)) => {
                 self.reject(&Rejection::Refused(refusal));
-                return Ok(ScoreReply::Refused { incarnation, reason: refusal.to_string() });
+                Ok(ScoreReply::Refused { incarnation: self.scoreboard.incarnation(), reason: refusal.to_string() })
             }
+            Err(rejection) => Err(rejection),
         };
-        if !screened.new.is_empty() {
-            let lines: Vec<_> = screened.new.iter().map(|score| ScoreLine::new(report, score)).collect();
-            // If this fails nothing is counted, so the scores are new again when the evaluator delivers them once more.
-            self.logs.scores.append(&lines)?;
+        self.answer(question, keys::scores(&self.run), reply.map(|reply| (reply, report.evaluator)));
+    }
+
+    /// What is new in a report; nothing if it says why there are no scores.
+    fn screen(&self, report: &ScoreReport) -> Result<Option<Screened>, Rejection> {
+        if report.cannot_act.is_some() {
+            self.scoreboard.screen_complaint(report)?;
+            return Ok(None);
         }
-        let recorded = self.scoreboard.record(report, &screened.new);
+        // Whether these count is decided when the others are on the disk.
+        if report.episodes.iter().any(|score| self.delivered.keys.contains(&(report.step, score.seed))) {
+            return Err(Rejection::InWriting);
+        }
+        Ok(Some(self.scoreboard.screen(report)?))
+    }
+
+    /// Has the new scores that came meanwhile written to the disk, all together, unless others are being written now.
+    pub(super) fn commit(&mut self) {
+        let Delivered { staged, in_writing, .. } = &mut self.delivered;
+        if staged.is_empty() || !in_writing.is_empty() {
+            return;
+        }
+        *in_writing = mem::take(staged);
+        let of = |(_, report, screened): &(_, ScoreReport, Screened)| {
+            screened.new.iter().map(|score| ScoreLine::new(report, score)).collect::<Vec<_>>()
+        };
+        let lines = in_writing.iter().flat_map(of).collect();
+        // The thread that writes ends after this one.
+        self.scribe.send(Lines::Scores(lines)).ok();
+    }
+
+    /// Scores are on the disk, or could not be written: only now are they counted and acknowledged.
+    pub(super) fn written(&mut self, written: &Result<(), String>) {
+        for (question, report, screened) in mem::take(&mut self.delivered.in_writing) {
+            for score in &screened.new {
+                self.delivered.keys.remove(&(report.step, score.seed));
+            }
+            let mut completed = None;
+            let reply = match written {
+                Ok(()) => Ok(self.record(&report, screened, &mut completed)),
+                // Nothing is counted, so the scores are new again when the evaluator delivers them once more.
+                Err(error) => Err(Rejection::NotSaved(error.clone())),
+            };
+            self.answer(question, keys::scores(&self.run), reply.map(|reply| (reply, report.evaluator)));
+            if let Some(notice) = completed {
+                self.notices.send(notice).ok();
+            }
+        }
+        self.settle();
+    }
+
+    /// Counts scores that are on the disk.
+    fn record(&mut self, report: &ScoreReport, screened: Screened, completed: &mut Option<Notice>) -> ScoreReply {
+        let Screened { new, duplicates } = screened;
+        let recorded = self.scoreboard.record(report, &new);
         let evaluation = &self.metrics.evaluation;
-        evaluation.scores_recorded.inc_by(screened.new.len() as u64);
-        evaluation.scores_duplicate.inc_by(screened.duplicates.into());
+        evaluation.scores_recorded.inc_by(new.len() as u64);
+        evaluation.scores_duplicate.inc_by(duplicates.into());
         evaluation.jobs_completed.inc_by(recorded.jobs_completed as u64);
         self.audited(&recorded.audited, &report.precision);
         if let Some(scores) = recorded.evaluation_completed {
             self.show(report.step, &scores);
             *completed = Some(Notice::Evaluated { step: report.step, scores });
         }
-        let (new, duplicates) = (screened.new.len() as u32, screened.duplicates);
-        let reply = ScoreReply::Recorded { incarnation, new, duplicates };
-        if !screened.new.is_empty() {
-            self.publish(report, screened.new);
+        let incarnation = self.scoreboard.incarnation();
+        let reply = ScoreReply::Recorded { incarnation, new: new.len() as u32, duplicates };
+        if !new.is_empty() {
+            self.publish(report, new);
         }
-        Ok(reply)
+        reply
     }
 
     /// Writes down which episodes were scored twice, and says which of them differ.
@@ -73,10 +141,8 @@ impl Hub {
             }
         }
         let lines: Vec<_> = audited.iter().map(|audited| AuditLine::new(audited, precision)).collect();
-        if let Some(log) = self.logs.audits.as_mut().filter(|_| !lines.is_empty())
-            && let Err(error) = log.append(&lines)
-        {
-            error!(%error, "the audits could not be saved");
+        if !lines.is_empty() {
+            self.scribe.send(Lines::Audits(lines)).ok();
         }
     }
 
@@ -97,7 +163,7 @@ impl Hub {
         let ScoreReport { run, step, weights, evaluator, .. } = report.clone();
         let recorded = RecordedScores { run, step, weights, evaluator, episodes };
         let Ok(bytes) = encode(&recorded) else { return };
-        let put = session.put(keys::scores_at(&self.run, report.step), bytes);
+        let put = session.put(keys::scores_at(&self.run, step), bytes);
         if let Err(error) = put.congestion_control(CongestionControl::Drop).wait() {
             debug!(%error, "recorded scores could not be published");
         }

@@ -1,0 +1,58 @@
+//! The thread that writes scores to the disk. All that came while it was at the last ones go together, in one write and one
+//! synchronisation. A slow disk delays the thanks for scores, and nothing else: jobs go out meanwhile.
+
+use std::sync::mpsc::{Receiver, RecvTimeoutError};
+
+use quad_service::Beat;
+use tracing::error;
+
+use crate::hub::Event;
+use crate::inbox::Inbox;
+use crate::run_dir::{AuditLine, Log, ScoreLine};
+
+/// What is to be written.
+#[derive(Debug)]
+pub enum Lines {
+    /// New scores; [`Event::Written`] is the answer.
+    Scores(Vec<ScoreLine>),
+    /// Episodes that were scored twice. Nobody waits for them.
+    Audits(Vec<AuditLine>),
+}
+
+/// State of the thread.
+#[derive(Debug)]
+pub struct Scribe {
+    /// `scores.jsonl`.
+    pub scores: Log,
+    /// Where episodes are written down that were scored twice, if any are to be.
+    pub audits: Option<Log>,
+    /// What is to be written, in its order.
+    pub lines: Receiver<Lines>,
+    /// Who is told.
+    pub hub: Inbox<Event>,
+}
+
+impl Scribe {
+    /// The thread's work, until nobody can send lines any more.
+    pub fn run(mut self, beat: &Beat) {
+        loop {
+            beat.alive();
+            match self.lines.recv_timeout(beat.interval()) {
+                Ok(Lines::Scores(lines)) => {
+                    let written = self.scores.append(&lines);
+                    if let Err(error) = &written {
+                        error!(%error, "scores could not be saved");
+                    }
+                    self.hub.send(Event::Written(written.map_err(|error| error.to_string())));
+                }
+                Ok(Lines::Audits(lines)) => {
+                    if let Some(Err(error)) = self.audits.as_mut().map(|log| log.append(&lines)) {
+                        error!(%error, "the audits could not be saved");
+                    }
+                }
+                Err(RecvTimeoutError::Timeout) => {}
+                Err(RecvTimeoutError::Disconnected) => return,
+            }
+        }
+    }
+}

@@ -1,0 +1,208 @@
+//! Evaluators that do everything on the wire and nothing else: they claim, report progress and deliver scores that they made
+//! up. Hundreds of them fit into one test.
+
+use std::sync::atomic::{AtomicU8, Ordering::Relaxed};
+use std::sync::{Arc, Mutex};
+use std::time::{Duration, Instant};
+
+use quad_dataset::environment;
+use quad_protocol::{
+    EpisodeScore, Hash, Job, JobReply, JobRequest, Message, Name, Progress, ScoreReply, ScoreReport, decode, encode, keys,
+};
+use rand::{Rng, SeedableRng};
+use rand_chacha::ChaCha8Rng;
+use tokio::task::JoinSet;
+use tokio::time::{sleep, timeout};
+use zenoh::query::{ConsolidationMode, QueryTarget};
+use zenoh::{Config, Session};
+
+/// An evaluator's patience with its learner.
+const ANSWER: Duration = Duration::from_secs(5);
+
+/// What a crowd does.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[repr(u8)]
+pub enum Pace {
+    /// Nothing but staying connected.
+    Still,
+    /// A job takes some seconds, with progress each second, as with real episodes.
+    Real,
+    /// A job takes no time.
+    Instant,
+}
+
+/// What a crowd has measured since it was last asked.
+#[derive(Clone, Debug, Default)]
+pub struct Measured {
+    /// How long each answer to a claim took.
+    pub claims: Vec<Duration>,
+    /// How long each acknowledgement of scores took.
+    pub reports: Vec<Duration>,
+    /// Questions without an answer.
+    pub unanswered: usize,
+}
+
+/// Many light evaluators of one run.
+pub struct Crowd {
+    shared: Arc<Shared>,
+    _tasks: JoinSet<()>,
+}
+
+struct Shared {
+    run: Name,
+    pace: AtomicU8,
+    measured: Mutex<Measured>,
+}
+
+impl Crowd {
+    /// Connects `count` evaluators of `run`, each with a session of its own, to `endpoint`.
+    pub async fn connect(count: usize, run: &Name, endpoint: &str) -> Crowd {
+        let shared = Arc::new(Shared { run: run.clone(), pace: AtomicU8::new(0), measured: Mutex::default() });
+        let mut tasks = JoinSet::new();
+        for number in 0..count {
+            let member = Member::connect(number, endpoint, shared.clone()).await;
+            tasks.spawn(member.work());
+        }
+        Crowd { shared, _tasks: tasks }
+    }
+
+    /// From now on, everybody does this. A job that was begun is still done.
+    pub fn set(&self, pace: Pace) {
+        self.shared.pace.store(pace as u8, Relaxed);
+    }
+
+    /// What was measured since this was last called.
+    pub fn measured(&self) -> Measured {
+        std::mem::take(&mut *self.shared.measured.lock().expect("nobody panics with it"))
+    }
+}
+
+impl Shared {
+    fn pace(&self) -> Pace {
+        [Pace::Still, Pace::Real, Pace::Instant][self.pace.load(Relaxed) as usize]
+    }
+
+    fn note(&self, note: impl FnOnce(&mut Measured)) {
+        note(&mut self.measured.lock().expect("nobody panics with it"));
+    }
+}
+
+struct Member {
+    name: Name,
+    session: Session,
+    shared: Arc<Shared>,
+    random: ChaCha8Rng,
+}
+
+impl Member {
+    async fn connect(number: usize, endpoint: &str, shared: Arc<Shared>) -> Member {
+        let mut config = Config::default();
+        let endpoints = format!("[{endpoint:?}]");
+        for (key, value) in
+            [("mode", "\"client\""), ("connect/endpoints", &endpoints), ("scouting/multicast/enabled", "false")]
+        {
+            config.insert_json5(key, value).expect("the setting exists");
+        }
+        let session = zenoh::open(config).await.expect("somebody listens");
+        let name = Name::new(format!("light-{number}")).expect("a name");
+        Member { name, session, shared, random: ChaCha8Rng::seed_from_u64(number as u64) }
+    }
+
+    async fn work(mut self) {
+        let run = self.shared.run.clone();
+        let token = self.session.liveliness().declare_token(keys::live_evaluator(&run, &self.name)).await;
+        let _token = token.expect("the session is open");
+        let woken = Arc::new(tokio::sync::Notify::new());
+        let wake = woken.clone();
+        let snapshots = self.session.declare_subscriber(keys::weights(&run)).callback(move |_| wake.notify_one()).await;
+        let _snapshots = snapshots.expect("the session is open");
+        loop {
+            if self.shared.pace() == Pace::Still {
+                sleep(Duration::from_millis(100)).await;
+                continue;
+            }
+            match self.claim().await {
+                Some(JobReply::Job(job)) => self.score(job).await,
+                Some(JobReply::Wait { milliseconds, .. }) => {
+                    // A new snapshot wakes a real evaluator, too.
+                    timeout(Duration::from_millis(milliseconds), woken.notified()).await.ok();
+                }
+                _ => {}
+            }
+        }
+    }
+
+    async fn claim(&mut self) -> Option<JobReply> {
+        let (environments, precision) = (vec!["hopper".to_owned()], Name::new("f32").expect("a name"));
+        let (evaluator, attempt) = (self.name.clone(), self.random.random());
+        let claim = JobRequest::Claim { evaluator, attempt, environments, precision };
+        let (answer, took) = self.ask(keys::jobs(&self.shared.run), &claim).await?;
+        self.shared.note(|measured| measured.claims.push(took));
+        Some(answer)
+    }
+
+    async fn score(&mut self, job: Job) {
+        if self.shared.pace() == Pace::Real {
+            for second in 0..self.random.random_range(4..8) {
+                self.progress(&job, second).await;
+                sleep(Duration::from_millis(self.random.random_range(900..1100))).await;
+            }
+        }
+        let spec = environment::find("hopper").expect("hopper is known");
+        let episodes = job.seeds.iter().map(|&seed| {
+            let episode_return = (seed % 3000) as f64;
+            EpisodeScore { seed, episode_return, length: 300, score: spec.normalised_score(episode_return) }
+        });
+        let report = ScoreReport {
+            evaluator: self.name.clone(),
+            episodes: episodes.collect(),
+            run: job.run,
+            incarnation: job.incarnation,
+            job: job.id,
+            step: job.step,
+            weights: job.weights,
+            precision: Name::new("f32").expect("a name"),
+            cannot_act: None,
+        };
+        // What was not acknowledged is delivered again.
+        while let None = self.deliver(&report).await {}
+    }
+
+    async fn deliver(&self, report: &ScoreReport) -> Option<()> {
+        let (answer, took) = self.ask::<ScoreReply>(keys::scores(&report.run), report).await?;
+        assert!(matches!(answer, ScoreReply::Recorded { .. }), "{answer:?}");
+        self.shared.note(|measured| measured.reports.push(took));
+        Some(())
+    }
+
+    async fn progress(&self, job: &Job, steps_done: u64) {
+        let progress = Progress {
+            evaluator: self.name.clone(),
+            run: job.run.clone(),
+            incarnation: job.incarnation,
+            job: job.id,
+            step: job.step,
+            episodes_done: 0,
+            episodes_total: job.seeds.len() as u32,
+            steps_done,
+            environment_steps: steps_done,
+            episodes: 0,
+            proof: Hash::of(&[]),
+        };
+        let message = encode(&progress.signed(&job.lease)).expect("it is small");
+        self.session.put(keys::progress(&job.run, &self.name), message).await.expect("the session is open");
+    }
+
+    /// The answer and how long it took.
+    async fn ask<A: Message>(&self, key: String, question: &impl Message) -> Option<(A, Duration)> {
+        let begin = Instant::now();
+        let get = self.session.get(key).payload(encode(question).expect("it is small")).timeout(ANSWER);
+        let get = get.target(QueryTarget::All).consolidation(ConsolidationMode::None).await;
+        let reply = get.expect("the session is open").recv_async().await.ok();
+        let Some(Ok(sample)) = reply.map(|reply| reply.into_result()) else {
+            self.shared.note(|measured| measured.unanswered += 1);
+            return None;
+        };
+        Some((decode(&sample.payload().to_bytes()).expect("the learner's answer"), begin.elapsed()))
+    }
+}
