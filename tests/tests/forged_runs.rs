@@ -57,18 +57,35 @@ async fn runs_whose_learners_never_answer_leave_others_their_time() {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn more_runs_than_are_served_make_no_more_lines_and_leave_room_when_they_go() {
-    const MOST_RUNS: usize = 64;
+async fn runs_that_come_and_go_make_few_lines() {
     let scratch = Scratch::new();
     let endpoint = format!("tcp/127.0.0.1:{}", free_port());
     let session = router(&endpoint).await;
-    let mut evaluator = scratch.evaluator("popular", &endpoint);
-    let page = evaluator.metrics();
-    let sum = |metric: &str, label: &str| http::sum(&http::metrics(&page).unwrap(), metric, label);
+    let mut evaluator = scratch.evaluator("watchful", &endpoint);
     evaluator.process.wait_for_log("connected", PATIENCE);
     for number in 0..1000 {
         drop(token(&session, &format!("short-{number}")).await);
     }
+    let _last = token(&session, "last").await;
+    let page = evaluator.metrics();
+    eventually("all but the last have gone", PATIENCE, || {
+        (http::sum(&http::metrics(&page)?, "quad_evaluator_runs", "") == 1.0).then_some(())
+    });
+    let log = evaluator.process.log();
+    let lines = log.lines().count();
+    assert!(log.contains("found a run") && lines < 600, "{lines} lines in the log");
+    assert!(evaluator.process.is_running());
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn a_run_that_there_is_no_room_for_is_served_when_others_go() {
+    const MOST_RUNS: usize = 64;
+    let scratch = Scratch::new();
+    let endpoint = format!("tcp/127.0.0.1:{}", free_port());
+    let session = router(&endpoint).await;
+    let evaluator = scratch.evaluator("popular", &endpoint);
+    let page = evaluator.metrics();
+    let sum = |metric: &str, label: &str| http::sum(&http::metrics(&page).unwrap(), metric, label);
     let mut crowd = Vec::new();
     for number in 0..MOST_RUNS {
         crowd.push(token(&session, &format!("crowd-{number}")).await);
@@ -81,6 +98,4 @@ async fn more_runs_than_are_served_make_no_more_lines_and_leave_room_when_they_g
     assert!(learner.scores().is_empty());
     drop(crowd);
     eventually("the one that had to wait is served", PATIENCE, || (!learner.scores().is_empty()).then_some(()));
-    let lines = evaluator.process.log().lines().count();
-    assert!(evaluator.process.is_running() && lines < 600, "{lines} lines in the log");
 }
