@@ -9,7 +9,7 @@ use quad_dataset::environment;
 use quad_policy::{ActionNoise, Precision};
 use quad_protocol::{CodecError, JobReply, JobRequest, Name, PROTOCOL_VERSION, decode_from, encode, keys};
 use quad_service::doctor::{Findings, certificates, machine, network};
-use quad_service::{Certificates, Endpoints, Role, default_endpoint, parse_endpoint};
+use quad_service::{Endpoints, Role, default_endpoint, parse_endpoint};
 use zenoh::Session;
 
 use crate::rollout::Rollout;
@@ -46,10 +46,8 @@ pub fn examine(args: &DoctorArgs) -> anyhow::Result<Findings> {
     machine::open_files(&mut findings);
     precision(&mut findings);
     simulator(&mut findings);
-    let certificates = args.certificates.as_deref().and_then(|folder| {
-        certificates::folder(&mut findings, folder);
-        Certificates::read(folder, Role::Evaluator).ok()
-    });
+    let certificates = args.certificates.as_deref();
+    let certificates = certificates.and_then(|folder| certificates::folder(&mut findings, folder, Role::Evaluator));
     let endpoint = args.connect.clone().unwrap_or_else(|| default_endpoint(certificates.as_ref(), DEFAULT_PORT));
     let endpoints = Endpoints { connect: vec![endpoint], certificates, ..Endpoints::default() };
     let runtime = tokio::runtime::Builder::new_multi_thread().worker_threads(2).enable_all().build()?;

@@ -113,4 +113,10 @@ impl Metrics {
     pub fn rejected(&self, reason: &'static str) {
         self.rejected_messages.with_label_values(&[reason]).inc();
     }
+
+    /// How often that was the reason.
+    #[cfg(test)]
+    pub fn counted(&self, reason: &str) -> u64 {
+        self.rejected_messages.with_label_values(&[reason]).get()
+    }
 }

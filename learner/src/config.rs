@@ -1,5 +1,7 @@
 //! From a preset and flags to one validated experiment, and what a run saves of it.
 
+mod error;
+
 use std::path::PathBuf;
 
 use quad_dataset::{RewardRule, environment};
@@ -7,9 +9,12 @@ use quad_policy::Precision;
 use serde::{Deserialize, Serialize};
 use toml::{Table, Value};
 
-use crate::algorithms::{self, ALGORITHMS, AgentError, Definition, Hyperparameters};
+use crate::algorithms::{self, Definition, Hyperparameters};
 use crate::device::Device;
 use crate::presets;
+use crate::schedule::Schedule;
+
+pub use error::ConfigError;
 
 /// Most episodes in one evaluation, and most candidates per state: far above any use, low enough for evaluators' memory.
 const MOST_EPISODES: u32 = 10_000;
@@ -111,86 +116,6 @@ impl DatasetInfo {
     }
 }
 
-/// A preset that cannot be used.
-#[derive(Debug, thiserror::Error)]
-pub enum ConfigError {
-    /// The file cannot be read.
-    #[error("cannot read the preset {path}")]
-    Read {
-        /// Where it should be.
-        path: PathBuf,
-        /// What the system says.
-        source: std::io::Error,
-    },
-    /// Neither embedded nor a path.
-    #[error("there is no preset named {0}")]
-    Unknown(String),
-    /// Good for others to build on, but nothing to train.
-    #[error("preset {0} names no environment: others build on it")]
-    Base(String),
-    /// Not TOML, a field too few, or a wrong type.
-    #[error("preset {preset}: {source}")]
-    Parse {
-        /// Which preset.
-        preset: String,
-        /// What is wrong, with the line if it is not TOML.
-        source: Box<toml::de::Error>,
-    },
-    /// A key that means nothing.
-    #[error("there is nothing to set by the name {key}")]
-    Key {
-        /// The key, dotted.
-        key: String,
-        /// Keys that are most like it.
-        nearest: Vec<String>,
-    },
-    /// An algorithm that nobody knows.
-    #[error("there is no algorithm named {0:?}; there are {known}", known = ALGORITHMS.map(|known| known.name).join(", "))]
-    Algorithm(String),
-    /// A hyper-parameter that the algorithm does not have, or one outside its range.
-    #[error("algorithm {algorithm}: {source}")]
-    Agent {
-        /// Which algorithm.
-        algorithm: String,
-        /// What is wrong.
-        source: AgentError,
-    },
-    /// Candidates for a policy that samples none.
-    #[error("candidates is {0}, but the policy of this algorithm does not sample any, so it must be 1")]
-    Candidates(u32),
-    /// Another value outside its range.
-    #[error("{field} is {value}, but must be from {least} to {most}")]
-    Range {
-        /// Name of the field.
-        field: &'static str,
-        /// What it was.
-        value: u64,
-        /// Smallest allowed.
-        least: u64,
-        /// Largest allowed.
-        most: u64,
-    },
-}
-
-impl ConfigError {
-    /// What to do about it.
-    pub fn hint(&self) -> Option<String> {
-        const LIST: &str = "`learner presets` lists them all";
-        match self {
-            Self::Unknown(preset) => match presets::nearest(preset, presets::names())[..] {
-                [] => Some(LIST.to_owned()),
-                ref nearest => Some(format!("did you mean {}? {LIST}", nearest.join(", "))),
-            },
-            Self::Base(_) => Some("`learner presets` lists those that can be trained".to_owned()),
-            Self::Key { nearest, .. } if nearest.is_empty() => {
-                Some("`learner presets NAME` shows every key of a preset".to_owned())
-            }
-            Self::Key { nearest, .. } => Some(format!("did you mean {}?", nearest.join(", "))),
-            _ => None,
-        }
-    }
-}
-
 /// Reads a preset (an embedded name, or a path that ends in `.toml`), lays changes over it, checks every range.
 ///
 /// # Errors
@@ -235,16 +160,9 @@ impl Experiment {
         (self.definition()?.read)(&self.agent).map_err(described)
     }
 
-    /// Whether the policy after that gradient step is evaluated.
-    pub fn is_evaluated(&self, step: u64) -> bool {
-        self.eval_interval > 0 && (step == self.steps || step.is_multiple_of(self.eval_interval))
-    }
-
-    /// The steps whose policies are evaluated, in ascending order.
-    pub fn evaluated_steps(&self) -> impl Iterator<Item = u64> {
-        let regular = (1..=self.steps.checked_div(self.eval_interval).unwrap_or(0)).map(|n| n * self.eval_interval);
-        let last = self.eval_interval > 0 && !self.steps.is_multiple_of(self.eval_interval);
-        regular.chain(last.then_some(self.steps))
+    /// How many gradient steps there are, and which are evaluated.
+    pub fn schedule(&self) -> Schedule {
+        Schedule { steps: self.steps, eval_interval: self.eval_interval }
     }
 
     /// The figures that tell runs apart, in one line.

@@ -7,7 +7,7 @@ use std::time::Duration;
 use quad_policy::Precision;
 use quad_protocol::{Name, keys};
 use quad_service::doctor::{Findings, certificates, disk, machine, network};
-use quad_service::{Certificates, Endpoints, Role};
+use quad_service::{Endpoints, Role};
 use zenoh::Session;
 
 use crate::cli::DoctorArgs;
@@ -33,10 +33,8 @@ pub fn examine(args: &DoctorArgs) -> anyhow::Result<Findings> {
         Ok(folder) => disk::folder(&mut findings, "datasets", &folder, "another folder is chosen by D4RL_DATASET_DIR"),
         Err(error) => findings.warn("datasets", format!("{error:#}"), "name a folder in D4RL_DATASET_DIR"),
     }
-    let certificates = args.certificates.as_deref().and_then(|folder| {
-        certificates::folder(&mut findings, folder);
-        Certificates::read(folder, Role::Learner).ok()
-    });
+    let certificates = args.certificates.as_deref();
+    let certificates = certificates.and_then(|folder| certificates::folder(&mut findings, folder, Role::Learner));
     match &args.connect {
         Some(endpoint) => {
             let endpoints = Endpoints { connect: vec![endpoint.clone()], certificates, ..Endpoints::default() };

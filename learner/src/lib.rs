@@ -4,7 +4,7 @@
 //! In reading order:
 //!
 //! - [`cli`] is the command line; [`config`] the experiment that it describes, one of the [`presets`] with flags on top,
-//!   validated once.
+//!   validated once; [`schedule`] says which of its steps are evaluated.
 //! - [`datasets`] finds or fetches the data that a run learns from.
 //! - [`run`] goes from the command line to the exit, [`resume`] takes up a run that was there, by its [`settings`];
 //!   [`conduct`] is the main loop in between.
@@ -47,6 +47,7 @@ pub mod report;
 pub mod resume;
 pub mod run;
 pub mod run_dir;
+pub mod schedule;
 pub mod scoreboard;
 pub mod scribe;
 pub mod settings;

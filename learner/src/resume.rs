@@ -105,8 +105,8 @@ impl Past {
         let checkpoint = dir.newest_checkpoint()?;
         let step = checkpoint.as_ref().map_or(0, |checkpoint| checkpoint.step);
         let scores = by_step(dir.read_scores()?)?;
-        let mut snapshots = BTreeMap::new();
-        for of in dir.snapshots()?.into_iter().filter(|of| experiment.is_evaluated(*of)) {
+        let (schedule, mut snapshots) = (experiment.schedule(), BTreeMap::new());
+        for of in dir.snapshots()?.into_iter().filter(|of| schedule.is_evaluated(*of)) {
             // One that the training comes by again, and that nobody has looked at, will be made again.
             if of <= step || scores.contains_key(&of) {
                 snapshots.insert(of, Hash::of(&dir.read_snapshot(of)?));

@@ -17,6 +17,7 @@ use crate::agent::{Agent, PolicyFile};
 use crate::algorithms::{AlgorithmError, Metric};
 use crate::metrics::TrainingMetrics;
 use crate::run_dir::Checkpoint;
+use crate::schedule::Schedule;
 
 /// Gradient steps that a line of `metrics.jsonl` averages over.
 pub const STEPS_PER_ROW: u64 = 100;
@@ -26,10 +27,8 @@ const TRAINING_PER_SAVING: u32 = 100;
 /// What is to be done.
 #[derive(Clone, Copy, Debug)]
 pub struct Plan {
-    /// Gradient steps.
-    pub steps: u64,
-    /// Gradient steps between two evaluations; 0: none at all.
-    pub eval_interval: u64,
+    /// How many gradient steps, and which are evaluated.
+    pub schedule: Schedule,
     /// Least time between two checkpoints.
     pub checkpoint_every: Duration,
     /// Seconds of training in earlier lives of the run.
@@ -144,7 +143,7 @@ pub fn train(
     let mut batch = Batch::default();
     let mut mean = RowMean::new(agent.metrics());
     let mut next_checkpoint = start + plan.checkpoint_every;
-    while agent.step() < plan.steps {
+    while agent.step() < plan.schedule.steps {
         let begin = Instant::now();
         let step = agent.step() + 1;
         sampler.next(transitions, &mut batch);
@@ -155,14 +154,14 @@ pub fn train(
         outlets.metrics.observe(&values, updated - begin);
         mean.add(&values);
 
-        let last = step == plan.steps;
+        let last = step == plan.schedule.steps;
         let stopped = !last && outlets.stop.load(Ordering::Relaxed);
         if step.is_multiple_of(STEPS_PER_ROW) || last || stopped {
             // A full queue means that the disk is slow; the row is for people, training is not to wait for it.
             let seconds = plan.seconds_before + start.elapsed().as_secs_f64();
             outlets.rows.try_send(mean.take(step, seconds)).ok();
         }
-        let evaluate = plan.eval_interval > 0 && (last || step.is_multiple_of(plan.eval_interval));
+        let evaluate = plan.schedule.is_evaluated(step);
         if evaluate || last {
             debug!(step, "snapshot");
             let policy = agent.policy().map_err(|source| TrainError::at(step, source))?;

@@ -71,8 +71,7 @@ impl Trainer {
             beat,
         };
         let plan = Plan {
-            steps: experiment.steps,
-            eval_interval: experiment.eval_interval,
+            schedule: experiment.schedule(),
             checkpoint_every: self.checkpoint_every,
             seconds_before: self.seconds_before,
         };

@@ -54,6 +54,7 @@ pub fn verify(path: &Path) -> Result<Findings, RunDirError> {
     let (dir, config) = RunDir::open(path)?;
     let experiment = &config.experiment;
     let mut planned: BTreeMap<u64, BTreeSet<u64>> = experiment
+        .schedule()
         .evaluated_steps()
         .map(|step| (step, BTreeSet::from_iter(episode_seeds(experiment.seed, step, experiment.episodes))))
         .collect();

@@ -13,6 +13,7 @@ use quad_learner::algorithms::{Setting, named};
 use quad_learner::config::resolve;
 use quad_learner::metrics::Metrics;
 use quad_learner::run_dir::Checkpoint;
+use quad_learner::schedule::Schedule;
 use quad_learner::train::{self, Outcome, Outlets, Plan, TrainError, train};
 use quad_policy::Precision;
 use quad_protocol::Name;
@@ -59,7 +60,7 @@ fn small(preset: &str) -> toml::Table {
 
 /// Evaluations at an interval, checkpoints after every step.
 fn plan(steps: u64, eval_interval: u64) -> Plan {
-    Plan { steps, eval_interval, checkpoint_every: Duration::ZERO, seconds_before: 0.0 }
+    Plan { schedule: Schedule { steps, eval_interval }, checkpoint_every: Duration::ZERO, seconds_before: 0.0 }
 }
 
 fn run(plan: Plan, algorithm: &str, table: &toml::Table, stop: bool) -> Result {
@@ -72,7 +73,7 @@ fn run_from(from: Option<&Checkpoint>, plan: Plan, algorithm: &str, table: &toml
         observation_dim: 11,
         action_dim: 3,
         batch_size: 4,
-        total_steps: plan.steps,
+        total_steps: plan.schedule.steps,
         seed: 0,
         precision: Precision::F32,
         device: Device::Cpu,
@@ -84,7 +85,7 @@ fn run_from(from: Option<&Checkpoint>, plan: Plan, algorithm: &str, table: &toml
         agent.load(&checkpoint.state).unwrap();
     }
     let mut sampler = BatchSampler::new(transitions.len(), setting.batch_size, 0, agent.step());
-    let (metrics, _) = Metrics::new(&Name::new("run").unwrap(), plan.steps, definition.metrics).unwrap();
+    let (metrics, _) = Metrics::new(&Name::new("run").unwrap(), plan.schedule.steps, definition.metrics).unwrap();
     // Nobody takes the rows, as with a disk that hangs: training must end all the same.
     let (sender, rows) = sync_channel(2);
     let (snapshots, checkpoints) = (RefCell::new(Vec::new()), RefCell::new(Vec::new()));

@@ -9,12 +9,13 @@ use x509_parser::certificate::X509Certificate;
 use x509_parser::pem::Pem;
 use x509_parser::time::ASN1Time;
 
-const AUTHORITY: &str = "ca.pem";
-const CERTIFICATE: &str = "cert.pem";
-const KEY: &str = "key.pem";
+/// Names of the three files.
+pub(crate) const AUTHORITY: &str = "ca.pem";
+pub(crate) const CERTIFICATE: &str = "cert.pem";
+pub(crate) const KEY: &str = "key.pem";
 
-/// A certificate that is valid for less than this is worth a warning, seconds.
-const EXPIRES_SOON: i64 = 14 * 24 * 60 * 60;
+/// A certificate that is valid for less than this is worth a warning, seconds: renewing takes people time.
+pub(crate) const EXPIRES_SOON: i64 = 14 * 24 * 60 * 60;
 
 /// What a certificate entitles to. Access control tells roles apart by the certificate's common name.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]

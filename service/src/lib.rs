@@ -4,7 +4,7 @@
 //!
 //! In reading order, which is the order of a process's life:
 //!
-//! - `logging`: where log lines go.
+//! - `logging`: where log lines go; `throttle`: how many of a kind.
 //! - `session`: the connection between learner and evaluators, over Zenoh; `certificates`: who a program is there;
 //!   `access`: what others may do.
 //! - `health`: whether the parts of a process still do their work.
@@ -22,6 +22,7 @@ mod logging;
 mod metrics_server;
 mod session;
 mod shutdown;
+mod throttle;
 
 pub use certificates::{Certificates, CertificatesError, Role};
 pub use exit::{Hint, hinted, run_main};

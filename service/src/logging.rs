@@ -1,8 +1,10 @@
-//! Where log lines go.
+//! Where log lines go, and how many of a kind.
 
 use std::io::IsTerminal;
 
 use tracing_subscriber::EnvFilter;
+
+use crate::throttle::Throttled;
 
 /// Without RUST_LOG: our own progress, and Zenoh's complaints (`zenoh` is the prefix of all of its crates), but for its
 /// warning that scouting by gossip is off, which it is on purpose.
@@ -18,6 +20,7 @@ pub fn init_logging() {
         .with_target(false)
         .with_writer(std::io::stderr)
         .with_ansi(std::io::stderr().is_terminal())
+        .map_event_format(Throttled::new)
         .try_init()
         .ok();
 }

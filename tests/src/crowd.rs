@@ -7,7 +7,8 @@ use std::time::{Duration, Instant};
 
 use quad_dataset::environment;
 use quad_protocol::{
-    EpisodeScore, Hash, Job, JobReply, JobRequest, Message, Name, Progress, ScoreReply, ScoreReport, decode, encode, keys,
+    EpisodeScore, Hash, Job, JobReply, JobRequest, Message, Name, Progress, ScoreReply, ScoreReport, decode, encode,
+    keys,
 };
 use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;

@@ -156,13 +156,13 @@ struct Certificates {
 }
 
 impl Certificates {
-    fn make(days: i32) -> Option<Self> {
+    fn make(role: &str, days: i32) -> Option<Self> {
         let folder = tempfile::tempdir().unwrap();
         std::fs::write(folder.path().join("extensions"), "basicConstraints = CA:FALSE").unwrap();
         let request = "req -newkey ec -pkeyopt ec_paramgen_curve:prime256v1 -nodes";
         for line in [
             format!("{request} -x509 -keyout ca.key -out ca.pem -days 3650 -subj /CN=authority"),
-            format!("{request} -keyout key.pem -out request.pem -subj /CN=evaluator"),
+            format!("{request} -keyout key.pem -out request.pem -subj /CN=quad-{role}"),
             format!(
                 "x509 -req -in request.pem -CA ca.pem -CAkey ca.key -CAcreateserial -extfile extensions -out cert.pem -days {days}"
             ),
@@ -190,22 +190,24 @@ impl Certificates {
 
 #[test]
 fn good_certificates() {
-    let Some(good) = Certificates::make(365) else { return };
+    let Some(good) = Certificates::make("learner", 365) else { return };
     let (text, well) = good.examine();
     assert!(well, "{text}");
-    assert!(line(&text, "ok", "certificate").contains("CN=evaluator: good until "));
+    assert!(line(&text, "ok", "certificate").contains("CN=quad-learner: good until "));
     for check in ["authority", "private key", "signature"] {
         line(&text, "ok", check);
     }
+    let (text, well) = Certificates::make("evaluator", 365).unwrap().examine();
+    assert!(!well && line(&text, "FAIL", "role").contains("for quad-evaluator, not for quad-learner"), "{text}");
 }
 
 #[test]
 fn certificates_that_are_over_or_nearly_so() {
-    let Some(nearly) = Certificates::make(10) else { return };
+    let Some(nearly) = Certificates::make("learner", 10) else { return };
     let (text, well) = nearly.examine();
     assert!(well && line(&text, "warn", "certificate").contains(" days"), "{text}");
 
-    let expired = Certificates::make(0).unwrap();
+    let expired = Certificates::make("learner", 0).unwrap();
     std::thread::sleep(std::time::Duration::from_millis(1100));
     let (text, well) = expired.examine();
     assert!(!well && line(&text, "FAIL", "certificate").contains("expired on "), "{text}");
@@ -213,11 +215,11 @@ fn certificates_that_are_over_or_nearly_so() {
 
 #[test]
 fn certificates_that_do_not_belong_together() {
-    let Some(other) = Certificates::make(365) else { return };
+    let Some(other) = Certificates::make("learner", 365) else { return };
     for (file, check, words) in
         [("ca.pem", "signature", "does not pass with ca.pem"), ("key.pem", "private key", "is not the key of cert.pem")]
     {
-        let broken = Certificates::make(365).unwrap();
+        let broken = Certificates::make("learner", 365).unwrap();
         std::fs::copy(other.path().join(file), broken.path().join(file)).unwrap();
         let (text, well) = broken.examine();
         assert!(!well && line(&text, "FAIL", check).contains(words), "{text}");

@@ -135,6 +135,8 @@ async fn nonsense_on_every_key_is_counted_and_survived() {
         (learner.scores().len() > count + 2 * endless.episodes as usize).then_some(())
     });
     assert!(learner.process.is_running() && evaluator.process.is_running());
+    let said = evaluator.process.log().matches("ignored what was published as weights").count();
+    assert_eq!(said, 1, "bad weights are logged once");
     for (name, log) in [("learner", learner.process.log()), ("evaluator", evaluator.process.log())] {
         assert!(!log.contains("panicked"), "a thread of the {name} panicked:\n{log}");
     }

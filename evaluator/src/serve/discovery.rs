@@ -2,6 +2,9 @@
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::convert::Infallible;
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering::Relaxed};
+use std::time::Duration;
 
 use anyhow::Context;
 use quad_protocol::{Name, keys};
@@ -10,6 +13,7 @@ use tokio::sync::watch;
 use tokio::task::JoinSet;
 use tracing::{debug, info, warn};
 use zenoh::Session;
+use zenoh::query::Reply;
 use zenoh::sample::{Sample, SampleKind};
 
 use crate::metrics::Metrics;
@@ -17,6 +21,10 @@ use crate::metrics::Metrics;
 /// Most runs that are served at a time, and most learners of one run that are told apart: for floods of made-up ones.
 const MOST_RUNS: usize = 64;
 const MOST_LIVES: usize = 8;
+/// A run that there was no room for is looked for again after this long.
+const LOOK_AGAIN: Duration = Duration::from_secs(10);
+/// The label of a key that names no learner.
+const INVALID: &str = "invalid_name";
 
 /// A run as one endpoint shows it: the endpoint's place on the command line, and the run's name.
 ///
@@ -83,47 +91,81 @@ async fn watch_endpoint(
     let endpoints = Endpoints { connect: vec![endpoint.clone()], certificates, ..Endpoints::default() };
     let session = open_session(&endpoints).await?;
     info!(endpoint, "connected");
-    let tokens = session
-        .liveliness()
-        .declare_subscriber(keys::ALL_LEARNERS)
-        .history(true)
-        .await
-        .map_err(|error| anyhow::anyhow!(error))
-        .with_context(|| format!("cannot look for learners at {endpoint}"))?;
-    let mut warned = false;
+    let failed = || format!("cannot look for learners at {endpoint}");
+    let watch = Arc::new(Watch {
+        index,
+        session: session.clone(),
+        found,
+        metrics,
+        no_room: false.into(),
+        warned: false.into(),
+    });
+    let told = watch.clone();
+    let subscriber = session.liveliness().declare_subscriber(keys::ALL_LEARNERS).history(true);
+    let subscriber = subscriber.callback(move |token| told.take_in(&token));
+    let _subscriber = subscriber.await.map_err(|error| anyhow::anyhow!(error)).with_context(failed)?;
     loop {
-        let token =
-            tokens.recv_async().await.map_err(|error| anyhow::anyhow!(error)).context("the Zenoh session closed")?;
+        tokio::time::sleep(LOOK_AGAIN).await;
+        anyhow::ensure!(!session.is_closed(), "the Zenoh session closed");
+        if watch.no_room.swap(false, Relaxed) {
+            let told = watch.clone();
+            let answer = move |reply: Reply| {
+                if let Ok(token) = reply.result() {
+                    told.take_in(token);
+                }
+            };
+            let looked = session.liveliness().get(keys::ALL_LEARNERS).callback(answer).await;
+            looked.map_err(|error| anyhow::anyhow!(error)).with_context(failed)?;
+        }
+    }
+}
+
+/// What is done with the tokens of one endpoint.
+struct Watch {
+    index: usize,
+    session: Session,
+    found: watch::Sender<Runs>,
+    metrics: Metrics,
+    /// Somebody was turned away who could be served if another one went.
+    no_room: AtomicBool,
+    /// One line in the log for those who are turned away; all are counted.
+    warned: AtomicBool,
+}
+
+impl Watch {
+    fn take_in(&self, token: &Sample) {
+        let (kind, key) = (token.kind(), token.key_expr().as_str());
         let mut problem = None;
-        found.send_if_modified(|runs| match follow(runs, index, &session, &token) {
-            Ok(changed) => changed,
-            Err(label) => {
+        self.found.send_if_modified(|runs| {
+            let followed = follow(runs, self.index, &self.session, kind, key);
+            followed.unwrap_or_else(|label| {
                 problem = Some(label);
                 false
-            }
+            })
         });
-        let Some(label) = problem else { continue };
-        metrics.rejected(label);
-        match std::mem::replace(&mut warned, true) {
-            false => warn!(endpoint, key = %token.key_expr(), label, "a learner is not served; more are only counted"),
-            true => debug!(endpoint, key = %token.key_expr(), label, "a learner is not served"),
+        let Some(label) = problem else { return };
+        self.metrics.rejected(label);
+        self.no_room.fetch_or(label != INVALID, Relaxed);
+        match self.warned.swap(true, Relaxed) {
+            false => warn!(key, label, "a learner is not served; more are only counted"),
+            true => debug!(key, label, "a learner is not served"),
         }
     }
 }
 
 /// Takes in a token; says whether the runs have changed, or why it is not taken in.
-fn follow(runs: &mut Runs, index: usize, session: &Session, token: &Sample) -> Result<bool, &'static str> {
-    let key = token.key_expr().as_str();
-    let (run, incarnation) = keys::run_of(key).zip(keys::incarnation_of(key)).ok_or("invalid_name")?;
+fn follow(runs: &mut Runs, index: usize, session: &Session, kind: SampleKind, key: &str) -> Result<bool, &'static str> {
+    let (run, incarnation) = keys::run_of(key).zip(keys::incarnation_of(key)).ok_or(INVALID)?;
     let place = (index, run.clone());
     let count = runs.len();
-    match (token.kind(), runs.get_mut(&place)) {
+    match (kind, runs.get_mut(&place)) {
         (SampleKind::Put, None) if count >= MOST_RUNS => Err("too_many_runs"),
         (SampleKind::Put, None) => {
             info!(%run, incarnation, "found a run");
             runs.insert(place, Found { session: session.clone(), lives: BTreeSet::from([incarnation]) });
             Ok(true)
         }
+        (SampleKind::Put, Some(found)) if found.lives.contains(&incarnation) => Ok(false),
         (SampleKind::Put, Some(found)) if found.lives.len() >= MOST_LIVES => Err("too_many_learners"),
         (SampleKind::Put, Some(found)) => Ok(found.lives.insert(incarnation)),
         (SampleKind::Delete, None) => Ok(false),
@@ -135,5 +177,35 @@ fn follow(runs: &mut Runs, index: usize, session: &Session, token: &Sample) -> R
             }
             Ok(changed)
         }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[tokio::test(flavor = "multi_thread")]
+    async fn so_many_runs_and_lives_are_followed_and_no_more() {
+        let endpoints = Endpoints { listen: vec!["tcp/127.0.0.1:0".to_owned()], ..Endpoints::default() };
+        let session = open_session(&endpoints).await.unwrap();
+        let mut runs = Runs::new();
+        let mut tell = |kind, run: usize, life: usize| {
+            let result = follow(&mut runs, 0, &session, kind, &format!("quad/run-{run}/live/learner/{life}"));
+            (result, runs.len())
+        };
+        for run in 0..MOST_RUNS {
+            assert_eq!(tell(SampleKind::Put, run, 1), (Ok(true), run + 1));
+        }
+        assert_eq!(tell(SampleKind::Put, MOST_RUNS, 1), (Err("too_many_runs"), MOST_RUNS));
+        for life in 2..=MOST_LIVES {
+            assert_eq!(tell(SampleKind::Put, 0, life), (Ok(true), MOST_RUNS));
+        }
+        assert_eq!(tell(SampleKind::Put, 0, 99), (Err("too_many_learners"), MOST_RUNS));
+        assert_eq!(tell(SampleKind::Put, 0, 1).0, Ok(false), "it is known");
+        for life in 1..=MOST_LIVES {
+            assert_eq!(tell(SampleKind::Delete, 0, life).0, Ok(true));
+        }
+        assert_eq!(tell(SampleKind::Delete, MOST_RUNS, 1), (Ok(false), MOST_RUNS - 1));
+        assert_eq!(tell(SampleKind::Put, MOST_RUNS, 1), (Ok(true), MOST_RUNS), "there is room again");
     }
 }

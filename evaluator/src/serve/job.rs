@@ -113,7 +113,7 @@ impl Running {
         let thread = tokio::task::spawn_blocking({
             let (shared, metrics, job) = (shared.clone(), metrics.clone(), job.clone());
             // On a thread of the pool: else each parallel part of each step would wake one up and wait for it.
-            move || rayon::scope(|_| roll_out(spec, &job, policy.as_ref(), &shared, &metrics))
+            move || rayon::scope(|_| roll_out(spec, &job, policy.as_ref(), &shared, &metrics, Job::LONGEST))
         });
         Running { shared, metrics, started: Instant::now(), thread: Some(thread) }
     }
@@ -154,13 +154,15 @@ impl Drop for Running {
     }
 }
 
-/// Runs all episodes to their end, or gives `None` when cancelled. Fails if the policy cannot act.
+/// Runs all episodes to their end, or gives `None` when cancelled. Fails if the policy cannot act, or it takes longer than
+/// `longest`.
 fn roll_out(
     spec: &'static EnvironmentSpec,
     job: &Job,
     policy: &dyn Policy,
     shared: &Shared,
     metrics: &Metrics,
+    longest: Duration,
 ) -> anyhow::Result<Option<Vec<EpisodeOutcome>>> {
     let started = Instant::now();
     let mut rollout = Rollout::new(spec, job.instance, &job.seeds, ActionNoise::new)?;
@@ -169,7 +171,7 @@ fn roll_out(
         if shared.cancelled.load(Relaxed) {
             return Ok(None);
         }
-        if started.elapsed() > Job::LONGEST {
+        if started.elapsed() > longest {
             metrics.rejected(JobError::TooLong.label());
             return Err(JobError::TooLong.into());
         }
@@ -241,6 +243,16 @@ mod tests {
         for (episodes, candidates) in [(0, 1), (1, 0), (1, u32::MAX), (256, 257), (257, 1), (65_536, 1)] {
             assert_eq!(label(episodes, candidates), Some("job_size"), "{episodes} × {candidates}");
         }
+    }
+
+    #[test]
+    fn a_job_has_a_longest_time() {
+        let (job, policy, metrics) = (job(2, 1), policy(8, 2, 2), Metrics::new().unwrap());
+        let spec = check(&job, &job.run).unwrap();
+        let run = |longest| roll_out(spec, &job, policy.as_ref(), &Shared::default(), &metrics, longest);
+        assert_eq!(run(Job::LONGEST).unwrap().unwrap().len(), 2);
+        let error = run(Duration::ZERO).unwrap_err();
+        assert!(matches!(error.downcast_ref(), Some(JobError::TooLong)), "{error}");
     }
 
     /// A file of some megabytes asks for 17 GB: a value of each of 65,535 tiny critics for each of 65,536 candidates.

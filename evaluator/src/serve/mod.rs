@@ -5,7 +5,7 @@
 //! In reading order:
 //!
 //! - `discovery`: finds the runs, by their learners' liveliness tokens.
-//! - `worker`: the main loop, which serves the runs in turn.
+//! - `worker`: the main loop, which serves the runs in turn; `turns`: whose turn it is.
 //! - `run`: everything that is exchanged with the learner of one run; `query`: a query to a learner; `hand_back`: a job that
 //!   is not done goes back.
 //! - `snapshots`: keeps the newest snapshot of a run, within a `budget`; `loading`: makes a policy of one.
@@ -22,6 +22,7 @@ mod loading;
 mod query;
 mod run;
 mod snapshots;
+mod turns;
 mod worker;
 
 use std::net::SocketAddr;

@@ -19,14 +19,13 @@ use super::discovery::Found;
 use super::hand_back::HandBack;
 use super::query::ask;
 use super::snapshots::SnapshotReceiver;
+use super::turns::Standing;
 use crate::metrics::{JobOutcome, Metrics};
 
 /// A learner answers in milliseconds; one that takes this long hangs, and other runs wait behind it.
 const ANSWER_TIMEOUT: Duration = Duration::from_secs(5);
 /// The same for a snapshot, which has megabytes to carry over whatever network there is.
 const WEIGHTS_TIMEOUT: Duration = Duration::from_secs(30);
-/// First and longest pause after a learner did not answer though it is connected, or its job came to nothing.
-const BACK_OFF: [Duration; 2] = [Duration::from_millis(250), Duration::from_secs(5)];
 /// Bounds of the pause that a learner without work may ask for: one too short would be a flood of questions, one too
 /// long would lose the evaluator.
 const WAIT: [Duration; 2] = [Duration::from_millis(20), Duration::from_secs(5)];
@@ -53,10 +52,8 @@ pub struct RunClient {
     attempt: Option<u64>,
     /// Scores that the learner has not acknowledged. While there are some, nothing new is asked for.
     undelivered: Option<ScoreReport>,
-    ready_at: Instant,
-    back_off: Duration,
-    /// Time that was spent on this run.
-    used: Duration,
+    /// Its claim to this evaluator's time.
+    pub standing: Standing,
     /// What was last complained about, so that it is not said again and again.
     complaint: String,
     _token: LivelinessToken,
@@ -92,9 +89,7 @@ impl RunClient {
             incarnation: 0,
             attempt: None,
             undelivered: None,
-            ready_at: Instant::now(),
-            back_off: BACK_OFF[0],
-            used: Duration::ZERO,
+            standing: Standing::new(Instant::now()),
             complaint: String::new(),
             _token: token,
         };
@@ -125,34 +120,13 @@ impl RunClient {
         self.incarnation = incarnation;
         self.attempt = None;
         self.snapshots.follow(incarnation);
-        self.wake();
-    }
-
-    /// When the learner may be asked again.
-    pub fn ready_at(&self) -> Instant {
-        self.ready_at
-    }
-
-    /// Time that was spent on this run, compared with others.
-    pub fn used(&self) -> Duration {
-        self.used
-    }
-
-    /// Counts time that was spent on it.
-    pub fn spend(&mut self, time: Duration) {
-        self.used += time;
-    }
-
-    /// Lets the learner be asked again at once, because it is there again.
-    pub fn wake(&mut self) {
-        self.ready_at = Instant::now();
-        self.back_off = BACK_OFF[0];
+        self.standing.wake(Instant::now());
     }
 
     /// Lets the learner be asked at once if it has published a snapshot, unless something went wrong with it before.
     pub fn wake_for_snapshot(&mut self) {
-        if self.snapshots.take_news() && self.back_off == BACK_OFF[0] {
-            self.ready_at = Instant::now();
+        if self.snapshots.take_news() {
+            self.standing.nudge(Instant::now());
         }
     }
 
@@ -164,14 +138,7 @@ impl RunClient {
             true => debug!(run = %self.run, "{complaint}"),
         }
         self.complaint = complaint;
-        self.ready_at = Instant::now() + self.back_off;
-        self.back_off = (2 * self.back_off).min(BACK_OFF[1]);
-    }
-
-    /// Something worked again.
-    fn is_well(&mut self) {
-        self.back_off = BACK_OFF[0];
-        self.complaint.clear();
+        self.standing.failed(Instant::now());
     }
 
     /// Whether scores wait for an acknowledgement.
@@ -198,9 +165,9 @@ impl RunClient {
         match answer {
             JobReply::Job(job) => Ok(Some(job)),
             JobReply::Wait { milliseconds, .. } => {
-                self.is_well();
+                self.complaint.clear();
                 let wait = Duration::from_millis(milliseconds).clamp(WAIT[0], WAIT[1]);
-                self.ready_at = Instant::now() + wait;
+                self.standing.rest_until(Instant::now() + wait);
                 Ok(None)
             }
             JobReply::HandedBack { .. } => Ok(None),
@@ -271,6 +238,7 @@ impl RunClient {
         let key = keys::scores(&self.run);
         let answer = ask(&self.session, key, encode(report)?, ANSWER_TIMEOUT, &self.metrics, fitting).await?;
         let (run, step) = (&self.run, report.step);
+        let accepted = matches!(answer, ScoreReply::Recorded { .. }) && report.cannot_act.is_none();
         match answer {
             ScoreReply::Recorded { .. } if report.cannot_act.is_some() => {}
             ScoreReply::Recorded { new, duplicates, .. } => {
@@ -286,7 +254,8 @@ impl RunClient {
             }
         }
         self.undelivered = None;
-        self.is_well();
+        self.complaint.clear();
+        self.standing.delivered(accepted);
         Ok(())
     }
 

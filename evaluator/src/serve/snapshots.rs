@@ -126,3 +126,72 @@ async fn decode_all(shared: Arc<Shared>, run: Name, metrics: Metrics, arrived: A
 fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
     mutex.lock().unwrap_or_else(PoisonError::into_inner)
 }
+
+#[cfg(test)]
+mod tests {
+    use std::time::Duration;
+
+    use quad_protocol::{Hash, Schema, encode};
+    use quad_service::{Endpoints, open_session};
+
+    use super::*;
+
+    const BYTES: usize = 100_000;
+
+    fn snapshot(run: &Name, step: u64) -> Vec<u8> {
+        let schema = Schema {
+            environment: "hopper".to_owned(),
+            observation_dim: 11,
+            action_dim: 3,
+            policy: "diffusion".to_owned(),
+        };
+        let tensors = vec![step as u8; BYTES];
+        encode(&Snapshot { run: run.clone(), incarnation: 1, step, schema, hash: Hash::of(&tensors), tensors }).unwrap()
+    }
+
+    async fn eventually(what: &str, held: impl Fn() -> bool) {
+        let wait = async {
+            while !held() {
+                tokio::time::sleep(Duration::from_millis(5)).await;
+            }
+        };
+        tokio::time::timeout(Duration::from_secs(20), wait).await.unwrap_or_else(|_| panic!("{what}"));
+    }
+
+    #[tokio::test(flavor = "multi_thread")]
+    async fn runs_share_the_memory_for_what_they_publish() {
+        let endpoints = Endpoints { listen: vec!["tcp/127.0.0.1:0".to_owned()], ..Endpoints::default() };
+        let session = open_session(&endpoints).await.unwrap();
+        let (metrics, arrived) = (Metrics::new().unwrap(), Arc::new(Notify::new()));
+        let [one, other] = ["one", "other"].map(|name| Name::new(name).unwrap());
+        // A snapshot that is kept, and the next one of the same run.
+        let budget = Budget::new(2 * 2 * (BYTES + 1000));
+        let listen = |run: &Name| {
+            SnapshotReceiver::listen(&session, run.clone(), metrics.clone(), arrived.clone(), budget.clone())
+        };
+        let (first, second) = (listen(&one).await.unwrap(), listen(&other).await.unwrap());
+        let step_of = |receiver: &SnapshotReceiver| {
+            let newest = lock(&receiver.shared.newest);
+            newest.as_ref().map(|(snapshot, _)| snapshot.step)
+        };
+        first.follow(1);
+        second.follow(1);
+        for step in 1..5 {
+            session.put(keys::weights(&one), snapshot(&one, step)).await.unwrap();
+            eventually("the newest takes the place of the one before", || step_of(&first) == Some(step)).await;
+        }
+        let large = vec![0; 2 * BYTES];
+        session.put(keys::weights(&other), large.clone()).await.unwrap();
+        let no_room = || metrics.counted("no_room");
+        eventually("there is no room for two more", || no_room() == 1).await;
+        session.put(keys::weights(&other), snapshot(&other, 7)).await.unwrap();
+        eventually("there is for one", || step_of(&second) == Some(7)).await;
+        session.put(keys::weights(&one), snapshot(&one, 5)).await.unwrap();
+        eventually("and then for no more", || no_room() == 2).await;
+        assert_eq!(step_of(&first), Some(4), "it is kept");
+        drop(second);
+        eventually("who goes gives back what was taken", || budget.take(2 * (BYTES + 1000)).is_some()).await;
+        session.put(keys::weights(&one), snapshot(&one, 6)).await.unwrap();
+        eventually("there is room again", || step_of(&first) == Some(6)).await;
+    }
+}

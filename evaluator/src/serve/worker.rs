@@ -18,6 +18,7 @@ use super::hand_back::HandBack;
 use super::job::{self, Running};
 use super::loading::policy_for;
 use super::run::{Identity, RunClient};
+use super::turns::Turns;
 use crate::environment;
 use crate::metrics::{JobOutcome, Metrics};
 
@@ -33,13 +34,14 @@ const HAND_BACK: Duration = Duration::from_secs(1);
 /// The job that is being done, for whoever has to hand it back when the worker is to end.
 pub type Held = Arc<Mutex<Option<HandBack>>>;
 
-/// Serves every run that is found, one job at a time; next is always the run that it has spent the least time on.
+/// Serves every run that is found, one job at a time.
 pub struct Worker {
     identity: Identity,
     precision: Precision,
     metrics: Metrics,
     found: watch::Receiver<Runs>,
     runs: BTreeMap<RunKey, RunClient>,
+    turns: Turns,
     /// Runs whose learner is gone but whose scores are kept, and since when.
     gone: BTreeMap<RunKey, Instant>,
     snapshot_arrived: Arc<Notify>,
@@ -70,6 +72,7 @@ impl Worker {
             metrics,
             found,
             runs: BTreeMap::new(),
+            turns: Turns::new(Instant::now()),
             gone: BTreeMap::new(),
             snapshot_arrived: Arc::new(Notify::new()),
             budget: Budget::new(SNAPSHOTS),
@@ -89,9 +92,8 @@ impl Worker {
         loop {
             self.beat.alive();
             self.follow_discovery().await;
-            let now = Instant::now();
-            let due = self.runs.iter().filter(|(key, run)| self.is_there(key) && run.ready_at() <= now);
-            match due.min_by_key(|(_, run)| run.used()).map(|(key, _)| key.clone()) {
+            let there = self.runs.iter().filter(|(key, _)| self.is_there(key)).map(|(key, run)| (key, &run.standing));
+            match self.turns.next(there, Instant::now()).cloned() {
                 Some(key) => self.turn(key).await,
                 None => {
                     if let Err(error) = self.wait().await {
@@ -114,7 +116,7 @@ impl Worker {
             if let Some(run) = self.runs.get_mut(key) {
                 run.follow(&learner.lives);
                 if was_gone {
-                    run.wake();
+                    run.standing.wake(Instant::now());
                 }
                 continue;
             }
@@ -122,8 +124,8 @@ impl Worker {
             let memory = (self.snapshot_arrived.clone(), self.budget.clone());
             match RunClient::attach(key.1.clone(), learner, identity, metrics, memory).await {
                 Ok(mut run) => {
-                    // A new run has no claim to the time that others had before it came.
-                    run.spend(self.runs.values().map(RunClient::used).min().unwrap_or_default());
+                    run.standing
+                        .start_from(self.runs.values().map(|run| run.standing.used()).min().unwrap_or_default());
                     self.runs.insert(key.clone(), run);
                 }
                 Err(error) => warn!("{error:#}"),
@@ -146,7 +148,7 @@ impl Worker {
 
     /// Waits until a run is due, runs come or go, or a new snapshot promises work.
     async fn wait(&mut self) -> anyhow::Result<()> {
-        let there = self.runs.iter().filter(|(key, _)| self.is_there(key)).map(|(_, run)| run.ready_at());
+        let there = self.runs.iter().filter(|(key, _)| self.is_there(key)).map(|(_, run)| run.standing.ready_at());
         let forget = self.gone.values().map(|since| *since + KEEP_SCORES);
         let until = there.chain(forget).min();
         let timer = async {
@@ -174,7 +176,7 @@ impl Worker {
                 run.follow_next(&learner.lives);
             }
         }
-        run.spend(started.elapsed());
+        self.turns.over(&mut run.standing, started, Instant::now());
         self.runs.insert(key, run);
     }
 

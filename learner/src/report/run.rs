@@ -109,7 +109,8 @@ impl RunReport {
             .collect();
         let scored = |step| evaluations.iter().find(|e| e.step == step).map_or(0, |e| e.episodes);
         let missing = |step| Missing { step, episodes: (experiment.episodes as usize).saturating_sub(scored(step)) };
-        let missing = experiment.evaluated_steps().map(missing).filter(|missing| missing.episodes > 0).collect();
+        let missing =
+            experiment.schedule().evaluated_steps().map(missing).filter(|missing| missing.episodes > 0).collect();
         let complete: Vec<_> = evaluations.iter().filter(|e| e.complete).map(|e| (e.step, e.score.mean)).collect();
         let mean = |evaluations: &[(u64, f64)]| {
             let scores: Vec<_> = evaluations.iter().map(|(_, score)| *score).collect();

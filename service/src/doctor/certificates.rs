@@ -1,10 +1,10 @@
-//! Whether the certificates of a folder are good, and until when.
+//! Whether the certificates of a folder are good, for whom, and until when.
 //!
 //! The folder has `ca.pem`, which others' certificates must be signed by, and one's own `cert.pem` with its `key.pem`.
 
 use std::path::Path;
 use std::sync::Arc;
-use std::time::{Duration, SystemTime, UNIX_EPOCH};
+use std::time::{SystemTime, UNIX_EPOCH};
 
 use rustls::crypto::ring;
 use rustls::pki_types::pem::PemObject;
@@ -15,16 +15,31 @@ use rustls::{InconsistentKeys, RootCertStore};
 use x509_parser::prelude::{FromDer, X509Certificate};
 
 use super::Findings;
+use crate::certificates::{AUTHORITY, CERTIFICATE, EXPIRES_SOON, KEY};
+use crate::{Certificates, CertificatesError, Role};
 
-/// Renewing takes people time.
-const SOON: Duration = Duration::from_secs(30 * 24 * 3600);
-const DAY: u64 = 24 * 3600;
+const DAY: i64 = 24 * 3600;
 
 const MAKE: &str = "make new ones, or copy all three files from where they were made";
 
-/// Checks the certificates in `folder`, with the time that it is now.
-pub fn folder(findings: &mut Findings, folder: &Path) {
-    let [ca, own, key] = ["ca.pem", "cert.pem", "key.pem"].map(|name| folder.join(name));
+/// Checks the certificates in `folder`, which are to be those of `role`, with the time that it is now. Gives them if a
+/// connection can be tried with them.
+pub fn folder(findings: &mut Findings, folder: &Path, role: Role) -> Option<Certificates> {
+    by_themselves(findings, folder);
+    match Certificates::read(folder, role) {
+        Ok(certificates) => Some(certificates),
+        Err(error) => {
+            // Whatever else is wrong was found above.
+            if matches!(error, CertificatesError::OtherRole { .. }) {
+                findings.fail("role", error.to_string(), error.hint());
+            }
+            None
+        }
+    }
+}
+
+fn by_themselves(findings: &mut Findings, folder: &Path) {
+    let [ca, own, key] = [AUTHORITY, CERTIFICATE, KEY].map(|name| folder.join(name));
     let ca = read(findings, &ca, CertificateDer::from_pem_file(&ca));
     let own_chain = CertificateDer::pem_file_iter(&own).and_then(Iterator::collect::<Result<Vec<_>, _>>);
     let own_chain = own_chain.and_then(|chain| match chain.is_empty() {
@@ -75,8 +90,8 @@ fn validity(findings: &mut Findings, check: &str, certificate: &CertificateDer<'
         findings.fail(check, what, "is this machine's clock right? `date -u` shows it");
     } else if left < 0 {
         findings.fail(check, format!("{subject}: expired on {until}"), MAKE);
-    } else if left.unsigned_abs() < SOON.as_secs() {
-        let what = format!("{subject}: good until {until}, which is {} days", left.unsigned_abs() / DAY);
+    } else if left < EXPIRES_SOON {
+        let what = format!("{subject}: good until {until}, which is {} days", left / DAY);
         findings.warn(check, what, "make a new one before then: without it nobody can connect");
     } else {
         findings.ok(check, format!("{subject}: good until {until}"));

@@ -1,0 +1,52 @@
+//! What made-up evaluators send.
+
+use quad_protocol::{EpisodeScore, Hash, Job, Name, Progress, ScoreReport};
+
+pub fn name(text: &str) -> Name {
+    Name::new(text).unwrap()
+}
+
+/// An episode of Hopper.
+pub fn score(seed: u64, episode_return: f64) -> EpisodeScore {
+    let hopper = quad_dataset::environment::find("hopper").unwrap();
+    EpisodeScore { seed, episode_return, length: 100, score: hopper.normalised_score(episode_return) }
+}
+
+/// Some of a job's scores.
+pub fn report(job: &Job, evaluator: &str, episodes: Vec<EpisodeScore>) -> ScoreReport {
+    let Job { run, incarnation, step, weights, .. } = job.clone();
+    ScoreReport {
+        evaluator: name(evaluator),
+        run,
+        incarnation,
+        job: job.id,
+        step,
+        weights,
+        precision: name("f32"),
+        episodes,
+        cannot_act: None,
+    }
+}
+
+/// All of them.
+pub fn full_report(job: &Job, evaluator: &str) -> ScoreReport {
+    report(job, evaluator, job.seeds.iter().map(|&seed| score(seed, 500.0)).collect())
+}
+
+/// Of so many environment steps, with its proof.
+pub fn progress(job: &Job, evaluator: &str, steps_done: u64) -> Progress {
+    Progress {
+        evaluator: name(evaluator),
+        run: job.run.clone(),
+        incarnation: job.incarnation,
+        job: job.id,
+        step: job.step,
+        episodes_done: 0,
+        episodes_total: job.seeds.len() as u32,
+        steps_done,
+        environment_steps: 10,
+        episodes: 1,
+        proof: Hash::of(b"none"),
+    }
+    .signed(&job.lease)
+}

@@ -1,0 +1,62 @@
+//! A peer that reads nothing.
+
+use std::time::{Duration, Instant};
+
+use quad_protocol::{Snapshot, WeightsRequest, encode, keys};
+use quad_service::{Endpoints, open_session};
+
+use crate::bench::{Bench, PATIENCE, ask, claim};
+use crate::common::name;
+
+/// Asks for weights again and again, and then reads nothing: the process stops itself.
+async fn reads_nothing(endpoint: String) {
+    let endpoints = Endpoints { connect: vec![endpoint], ..Endpoints::default() };
+    let session = open_session(&endpoints).await.unwrap();
+    for _ in 0..150 {
+        let key = keys::weights_at(&name("bench"), 10);
+        session.get(key).timeout(PATIENCE).callback(drop).await.unwrap();
+    }
+    let stop = format!("kill -STOP {}", std::process::id());
+    std::process::Command::new("sh").args(["-c", &stop]).status().unwrap();
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn a_peer_that_reads_nothing_holds_up_neither_jobs_nor_snapshots() {
+    const STRANGER: &str = "QUAD_TEST_STRANGER";
+    if let Ok(endpoint) = std::env::var(STRANGER) {
+        return reads_nothing(endpoint).await;
+    }
+    let mut bench = Bench::start().await;
+    let client = bench.client().await;
+    bench.snapshot(10).await;
+    let mut command = std::process::Command::new(std::env::current_exe().unwrap());
+    command
+        .args(["--exact", "slow_peer::a_peer_that_reads_nothing_holds_up_neither_jobs_nor_snapshots"])
+        .env(STRANGER, &bench.endpoint);
+    let mut stranger = command.stdout(std::process::Stdio::null()).spawn().unwrap();
+    let state = || std::fs::read_to_string(format!("/proc/{}/stat", stranger.id())).unwrap();
+    let start = Instant::now();
+    while !state().contains(") T ") {
+        assert!(start.elapsed() < PATIENCE, "{}", state());
+        tokio::time::sleep(Duration::from_millis(5)).await;
+    }
+
+    let request = encode(&WeightsRequest { evaluator: name("a") }).unwrap();
+    // As long as Zenoh has not noticed. To close the connection, it lets all others wait for whoever still sends.
+    let (start, mut slowest, mut step) = (Instant::now(), Duration::ZERO, 10);
+    while start.elapsed() < Duration::from_secs(3) {
+        let asked = Instant::now();
+        claim(&client, &bench.run, "a").await.expect("always the same job");
+        step += 10;
+        bench.snapshot(step).await;
+        let snapshot: Snapshot =
+            ask(&client, keys::weights_at(&bench.run, step), Some(request.clone())).await.unwrap().unwrap();
+        assert_eq!(snapshot.step, step);
+        slowest = slowest.max(asked.elapsed());
+        tokio::time::sleep(Duration::from_millis(100)).await;
+    }
+    stranger.kill().unwrap();
+    stranger.wait().unwrap();
+    // A snapshot is published with some patience for each subscriber, and there are other tests beside this one.
+    assert!(slowest < Duration::from_secs(2), "{slowest:?}");
+}

@@ -1,0 +1,120 @@
+//! Which episodes are handed out, to whom, how often.
+
+use quad_learner::resume::Earlier;
+use quad_learner::scoreboard::{Claim, Lost};
+use quad_protocol::{JobReply, Lease};
+
+use crate::bench::{Bench, INCARNATION, hash};
+use crate::common::{full_report, name, report, score};
+
+#[test]
+fn jobs_go_out_oldest_step_first_and_no_episode_twice() {
+    let mut bench = Bench::new();
+    let jobs = ["a", "b", "c", "d"].map(|evaluator| bench.job(evaluator, 0));
+    let handed_out: Vec<_> = jobs.iter().map(|job| (job.step, job.seeds.clone())).collect();
+    let expected =
+        [(1000, vec![1, 2, 3, 4, 5]), (1000, vec![6, 7]), (2000, vec![11, 12, 13, 14, 15]), (2000, vec![16, 17])];
+    assert_eq!(handed_out, expected);
+    assert_eq!((jobs[0].weights, jobs[2].weights), (hash(1000), hash(2000)));
+    assert_eq!((jobs[0].incarnation, jobs[0].candidates, jobs[0].lease_milliseconds), (INCARNATION, 10, 10_000));
+    assert!(jobs[1..].iter().all(|job| job.lease != jobs[0].lease), "each lease is another");
+    assert!(matches!(bench.claim("e", 0, 0), JobReply::Wait { milliseconds: 1.., incarnation: INCARNATION }));
+    assert_eq!((bench.board.pending(), bench.board.handed_out()), (14, 4));
+}
+
+#[test]
+fn an_evaluator_without_the_environment_gets_nothing() {
+    let mut bench = Bench::new();
+    for environments in [vec![], vec!["ant".to_owned()]] {
+        let now = bench.at(0);
+        let claim = Claim {
+            evaluator: &name("a"),
+            attempt: 1,
+            environments: &environments,
+            precision: &name("f32"),
+            present: 0,
+        };
+        assert!(matches!(bench.board.claim(claim, now), JobReply::Wait { .. }));
+    }
+}
+
+#[test]
+fn a_claim_that_is_repeated_gets_the_same_job_and_another_one_waits() {
+    let mut bench = Bench::new();
+    let first = bench.job("a", 0);
+    assert_eq!(bench.claim("a", 0, 3), JobReply::Job(first.clone()), "the answer was lost");
+    assert!(matches!(bench.claim("a", 1, 3), JobReply::Wait { .. }), "one job at a time");
+    assert_eq!((bench.board.handed_out(), bench.job("b", 3).seeds), (1, vec![6, 7]));
+    assert_eq!(bench.expire(10), 1, "to ask again does not extend the lease");
+    assert_eq!(bench.job("a", 10).seeds, first.seeds);
+}
+
+#[test]
+fn an_evaluator_that_goes_loses_its_job_and_nobody_elses() {
+    let mut bench = Bench::new();
+    let (first, other) = (bench.job("a", 0), bench.job("b", 0));
+    assert_eq!(bench.board.evaluator_gone(&name("a")), Lost { jobs: 1, given_up: vec![] });
+    assert_eq!(bench.board.evaluator_gone(&name("a")), Lost::default());
+    assert_eq!(bench.job("c", 0).seeds, first.seeds);
+    assert_eq!(bench.deliver(&full_report(&other, "b")).unwrap().1.jobs_completed, 1);
+}
+
+#[test]
+fn only_whoever_has_the_lease_hands_a_job_back() {
+    let mut bench = Bench::new();
+    let job = bench.job("a", 0);
+    assert!(!bench.board.hand_back(&name("a"), job.id, &Lease::random()), "guessed");
+    assert!(!bench.board.hand_back(&name("b"), job.id, &job.lease));
+    assert!(!bench.board.hand_back(&name("a"), job.id + 1, &job.lease));
+    assert_eq!(bench.job("b", 0).seeds, [6, 7]);
+    assert!(bench.board.hand_back(&name("a"), job.id, &job.lease));
+    assert!(!bench.board.hand_back(&name("a"), job.id, &job.lease), "only once");
+    assert_eq!(bench.job("c", 0).seeds, job.seeds);
+}
+
+#[test]
+fn episodes_that_take_every_evaluator_with_them_are_given_up() {
+    let mut bench = Bench::new();
+    for _ in 0..100 {
+        let job = bench.job("a", 0);
+        assert!(bench.board.hand_back(&name("a"), job.id, &job.lease), "this does not count");
+    }
+    let mut given_up = Vec::new();
+    for attempt in 1..=20 {
+        assert_eq!((bench.job("a", 0).seeds, given_up.len()), (Vec::from_iter(1..=5), 0), "attempt {attempt}");
+        given_up = bench.board.evaluator_gone(&name("a")).given_up;
+    }
+    let expected = Vec::from_iter((1..=5).map(|seed| (1000, seed)));
+    assert_eq!((&given_up, &bench.board.missing()), (&expected, &expected));
+    assert_eq!(bench.board.pending(), 9, "the run does not wait for them");
+    let next = bench.job("a", 0);
+    assert_eq!(next.seeds, [6, 7]);
+    let late = report(&next, "b", vec![score(1, 0.0)]);
+    assert_eq!(bench.deliver(&late).unwrap().0.new.len(), 1, "but is glad of them");
+    assert_eq!(bench.board.missing(), expected[1..]);
+}
+
+#[test]
+fn an_evaluation_asked_for_twice_is_one() {
+    let mut bench = Bench::new();
+    let job = bench.job("a", 0);
+    bench.board.add_evaluation(1000, hash(1000), &Vec::from_iter(1..=7)).unwrap();
+    assert_eq!((bench.board.pending(), bench.job("b", 0).seeds), (14, vec![6, 7]));
+    assert_eq!(job.seeds.len(), 5);
+}
+
+#[test]
+fn scores_of_an_earlier_life_count_and_other_weights_are_found_out() {
+    let mut bench = Bench::new();
+    let earlier = Earlier { weights: hash(3000).to_string(), episodes: vec![score(22, 400.0)] };
+    let whole = Earlier { weights: hash(4000).to_string(), episodes: vec![score(32, 1.0), score(31, 2.0)] };
+    bench.board.remember([(3000, earlier), (4000, whole)].into());
+    let pending = bench.board.pending();
+    assert_eq!(bench.board.add_evaluation(3000, hash(3000), &[21, 22, 23]), Ok(None));
+    assert_eq!(bench.board.pending(), pending + 2);
+    let complete = bench.board.add_evaluation(4000, hash(4000), &[31, 32]).unwrap().unwrap();
+    assert_eq!(complete, [score(31, 2.0), score(32, 1.0)]);
+    assert_eq!(bench.board.add_evaluation(4000, hash(4000), &[31, 32]), Ok(None), "asked for again");
+    let error = bench.board.add_evaluation(3000, hash(1), &[21, 22, 23]).unwrap_err();
+    assert_eq!((error.step, error.found, error.scored), (3000, hash(1), hash(3000).to_string()));
+}
