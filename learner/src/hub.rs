@@ -15,7 +15,7 @@ use std::time::{Duration, Instant};
 use quad_protocol::{
     Hash, JobReply, JobRequest, Message, Name, Progress, ScoreReply, decode, encode, episode_seeds, keys,
 };
-use quad_service::{Beat, hinted};
+use quad_service::{Beat, hinted, stay_in_background};
 use tokio::sync::mpsc::UnboundedSender;
 use tracing::{debug, warn};
 use zenoh::Session;
@@ -117,6 +117,7 @@ impl Hub {
 
     /// The thread's work, until it is told to stop.
     pub fn run(mut self, messages: &Messages<Event>, beat: &Beat) {
+        stay_in_background();
         let mut ticked = Instant::now();
         while let Ok(event) = messages.next(TICK) {
             beat.alive();

@@ -16,6 +16,7 @@ use std::thread;
 use std::time::{Duration, Instant};
 
 use quad_protocol::Name;
+use quad_service::stay_in_background;
 use tracing::debug;
 use zenoh::Wait;
 use zenoh::bytes::ZBytes;
@@ -168,6 +169,7 @@ impl Shared {
     }
 
     fn work(&self) {
+        stay_in_background();
         let mut state = self.lock();
         loop {
             let now = Instant::now();

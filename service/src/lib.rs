@@ -14,6 +14,7 @@
 //! - [`doctor`]: checks a machine before a run is trusted to it.
 
 mod access;
+mod background;
 mod certificates;
 pub mod doctor;
 mod exit;
@@ -24,6 +25,7 @@ mod session;
 mod shutdown;
 mod throttle;
 
+pub use background::stay_in_background;
 pub use certificates::{Certificates, CertificatesError, Role};
 pub use exit::{Hint, hinted, run_main};
 pub use health::{Beat, Health};

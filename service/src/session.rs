@@ -11,6 +11,7 @@ use zenoh::config::EndPoint;
 use zenoh::{Config, Session, Wait};
 
 use crate::access;
+use crate::background::stay_in_background;
 use crate::certificates::Certificates;
 
 /// A process that is frozen or disconnected counts as gone after this time. (One that ends or is killed is noticed at
@@ -163,7 +164,11 @@ pub async fn open_session(endpoints: &Endpoints) -> Result<Session, SessionError
     // Zenoh's future blocks its thread until there is a connection, so it gets one of its own, which is never
     // joined: dropping this future gives up waiting, and does not keep the process from ending.
     let (sender, mut opened) = oneshot::channel();
-    let open = move || drop(sender.send(zenoh::open(config).wait()));
+    let open = move || {
+        // Zenoh's own threads are started by this one, and are like it.
+        stay_in_background();
+        drop(sender.send(zenoh::open(config).wait()));
+    };
     thread::Builder::new().name("zenoh-open".to_owned()).spawn(open).map_err(|error| wrong(error.into()))?;
     let opened = match timeout(PATIENCE, &mut opened).await {
         Ok(opened) => opened,

@@ -42,3 +42,8 @@ pub fn eventually<T>(what: &str, patience: Duration, mut condition: impl FnMut()
         std::thread::sleep(Duration::from_millis(20));
     }
 }
+
+/// What an environment variable says about the size of a test.
+pub fn number(variable: &str, default: u64) -> u64 {
+    std::env::var(variable).map_or(default, |text| text.parse().expect("a number"))
+}

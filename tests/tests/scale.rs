@@ -1,5 +1,5 @@
-//! Many evaluators at one learner. They are light: all that they say on the wire is real, but they simulate nothing, so that
-//! hundreds fit beside the learner on one machine.
+//! Many evaluators at one learner, behind a router. They are light: all that they say on the wire is real, but they simulate
+//! nothing, so that hundreds fit beside the learner on one machine.
 //!
 //! With all tests there are a few. What docs/reliability.md says of five hundred comes from
 //! `QUAD_EVALUATORS=500 cargo test --release --workspace --test scale -- --nocapture`, which prints what it measures.
@@ -11,16 +11,13 @@ use std::time::{Duration, Instant};
 use quad_protocol::Name;
 use quad_tests::crowd::{Crowd, Measured, Pace};
 use quad_tests::pace::{compare, on_core};
-use quad_tests::system::{Learner, Scratch, Setting};
-use quad_tests::{PATIENCE, eventually, http};
+use quad_tests::router::router;
+use quad_tests::system::{Learner, Scratch, Setting, free_port};
+use quad_tests::{PATIENCE, eventually, http, number};
 
 /// More episodes than any crowd can score meanwhile.
 const ENDLESS: Setting =
     Setting { steps: 100_000_000, eval_interval: 30_000, episodes: 10_000, candidates: 1, hidden: 64, seed: 3 };
-
-fn number(variable: &str, default: u64) -> u64 {
-    std::env::var(variable).map_or(default, |text| text.parse().expect("a number"))
-}
 
 fn percentile(times: &[Duration], share: f64) -> Duration {
     let mut times = times.to_vec();
@@ -47,11 +44,13 @@ fn assert_each_once(learner: &Learner) -> usize {
 fn many_evaluators_are_served_and_training_does_not_notice() {
     let (count, seconds) = (number("QUAD_EVALUATORS", 50) as usize, number("QUAD_SECONDS", 2));
     let (phase, rounds) = (Duration::from_secs(seconds), number("QUAD_ROUNDS", 2) as usize);
-    let scratch = Scratch::new();
-    let learner = on_core(0, || scratch.learner("run", ENDLESS));
-    let (endpoint, run) = (learner.endpoint(), Name::new("run").unwrap());
+    let (scratch, run) = (Scratch::new(), Name::new("run").unwrap());
+    let endpoint = format!("tcp/127.0.0.1:{}", free_port());
+    let learner = on_core(0, || scratch.learner_with("run", ENDLESS, &["--connect", &endpoint]));
     on_core(1, || {
         let runtime = tokio::runtime::Runtime::new().unwrap();
+        let _router = runtime.block_on(router(&endpoint));
+        learner.metrics();
         let alone = learner.process.peak_memory();
         let crowd = runtime.block_on(Crowd::connect(count, &run, &endpoint));
         eventually("all are there", PATIENCE, || {

@@ -9,6 +9,7 @@ use quad_policy::Precision;
 use quad_protocol::Name;
 use quad_service::{
     Certificates, CertificatesError, Endpoints, Health, Hint, Role, SessionError, default_endpoint, hinted,
+    stay_in_background,
 };
 use tokio::sync::mpsc;
 use tracing::{debug, info, warn};
@@ -65,7 +66,8 @@ pub fn train(args: &TrainArgs) -> anyhow::Result<()> {
     debug!("{config:?}");
 
     // Zenoh and the training thread have threads of their own; this runtime serves the metrics and the main loop.
-    let runtime = tokio::runtime::Builder::new_multi_thread().worker_threads(2).enable_all().build()?;
+    let mut runtime = tokio::runtime::Builder::new_multi_thread();
+    let runtime = runtime.worker_threads(2).on_thread_start(stay_in_background).enable_all().build()?;
     let (run_dir, ending) = runtime.block_on(conduct(args, endpoints, &path, begun, name, &config, transitions))?;
     conclude(&run_dir, &config, ending)
 }

@@ -1,0 +1,237 @@
+//! What strangers can do to a learner that listens: whatever they try, evaluators are served, memory is bounded, and
+//! training goes on.
+//!
+//! With all tests each attack lasts a second. What docs/reliability.md says of training's speed meanwhile comes from
+//! `QUAD_SECONDS=5 QUAD_ROUNDS=5 cargo test --release --workspace --test hostile -- --nocapture`.
+#![allow(clippy::unwrap_used, clippy::expect_used, clippy::print_stderr)]
+
+use std::net::TcpStream;
+use std::process::{Child, Command, Stdio};
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering::Relaxed};
+use std::time::Duration;
+
+use quad_protocol::{EpisodeScore, Hash, JobRequest, Name, Progress, ScoreReport, WeightsRequest, encode, keys};
+use quad_service::{Endpoints, open_session};
+use quad_tests::crowd::{Crowd, Pace};
+use quad_tests::pace::{compare, on_core};
+use quad_tests::system::{Scratch, Setting};
+use quad_tests::{PATIENCE, eventually, http, number};
+use tokio::runtime::Runtime;
+use zenoh::Session;
+
+const SETTING: Setting =
+    Setting { steps: 100_000_000, eval_interval: 30_000, episodes: 10_000, candidates: 1, hidden: 64, seed: 3 };
+/// Of the evaluators that are served meanwhile.
+const HONEST: usize = 5;
+/// Tells this program that it is the stranger who reads nothing, and where to.
+const STRANGER: &str = "QUAD_TEST_STRANGER";
+
+#[derive(Clone, Copy, Debug)]
+enum Attack {
+    Progress,
+    Claims,
+    LyingReports,
+    Garbage,
+    Tokens,
+    Connections,
+    ReadsNothing,
+}
+
+const ATTACKS: [Attack; 7] = [
+    Attack::Progress,
+    Attack::Claims,
+    Attack::LyingReports,
+    Attack::Garbage,
+    Attack::Tokens,
+    Attack::Connections,
+    Attack::ReadsNothing,
+];
+
+fn name(text: &str) -> Name {
+    Name::new(text).unwrap()
+}
+
+fn run() -> Name {
+    name("run")
+}
+
+fn progress() -> Vec<u8> {
+    let message = Progress {
+        evaluator: name("flood"),
+        run: run(),
+        incarnation: 1,
+        job: 1,
+        step: 10,
+        episodes_done: 0,
+        episodes_total: 5,
+        steps_done: 1,
+        environment_steps: 1,
+        episodes: 0,
+        proof: Hash::of(b"guessed"),
+    };
+    encode(&message).unwrap()
+}
+
+fn claim() -> Vec<u8> {
+    let (evaluator, precision) = (name("flood"), name("f32"));
+    encode(&JobRequest::Claim { evaluator, attempt: 1, environments: vec!["moon".to_owned()], precision }).unwrap()
+}
+
+fn lie() -> Vec<u8> {
+    let report = ScoreReport {
+        evaluator: name("liar"),
+        run: run(),
+        incarnation: 1,
+        job: 1,
+        step: SETTING.eval_interval,
+        weights: Hash::of(b"guessed"),
+        precision: name("f32"),
+        episodes: vec![EpisodeScore { seed: 1, episode_return: f64::NAN, length: 0, score: f64::NAN }],
+        cannot_act: None,
+    };
+    encode(&report).unwrap()
+}
+
+/// Somebody who attacks while he is told to.
+struct Stranger {
+    on: Arc<AtomicBool>,
+    process: Option<Child>,
+}
+
+impl Stranger {
+    fn start(attack: Attack, runtime: &Runtime, endpoint: &str) -> Stranger {
+        let on = Arc::new(AtomicBool::new(true));
+        let mut process = None;
+        match attack {
+            Attack::ReadsNothing => {
+                let mut command = Command::new(std::env::current_exe().unwrap());
+                command.args(["--exact", "whatever_strangers_do_the_work_goes_on"]).env(STRANGER, endpoint);
+                process = Some(command.stdout(Stdio::null()).spawn().unwrap());
+            }
+            Attack::Connections => {
+                let (on, address) = (on.clone(), endpoint.trim_start_matches("tcp/").to_owned());
+                std::thread::spawn(move || knock(&address, &on));
+            }
+            attack => {
+                let (on, endpoint) = (on.clone(), endpoint.to_owned());
+                runtime.spawn(async move { flood(attack, &endpoint, &on).await });
+            }
+        }
+        Stranger { on, process }
+    }
+}
+
+impl Drop for Stranger {
+    fn drop(&mut self) {
+        self.on.store(false, Relaxed);
+        if let Some(mut process) = self.process.take() {
+            process.kill().ok();
+            process.wait().ok();
+        }
+    }
+}
+
+/// Opens connections, says nothing, and leaves the newest hundred open.
+fn knock(address: &str, on: &AtomicBool) {
+    let mut open = std::collections::VecDeque::new();
+    while on.load(Relaxed) {
+        open.extend(TcpStream::connect(address));
+        if open.len() > 100 {
+            open.pop_front();
+        }
+    }
+}
+
+async fn open(endpoint: &str) -> Session {
+    open_session(&Endpoints { connect: vec![endpoint.to_owned()], ..Endpoints::default() }).await.unwrap()
+}
+
+/// Sends as fast as the connection takes it.
+async fn flood(attack: Attack, endpoint: &str, on: &AtomicBool) {
+    let session = open(endpoint).await;
+    let run = run();
+    let ask = async |key: String, question: Vec<u8>| {
+        session.get(key).payload(question).timeout(Duration::from_secs(1)).callback(drop).await.unwrap();
+    };
+    let (progress, claim, lie) = (progress(), claim(), lie());
+    let mut noise: Vec<u8> = (0..1000u32).map(|i| (i.wrapping_mul(2_654_435_761) >> 24) as u8).collect();
+    let mut newer = claim.clone();
+    newer[4] ^= 0xff;
+    let mut tokens = Vec::new();
+    while on.load(Relaxed) {
+        match attack {
+            Attack::Progress => session.put(keys::progress(&run, &name("flood")), progress.clone()).await.unwrap(),
+            Attack::Claims => ask(keys::jobs(&run), claim.clone()).await,
+            Attack::LyingReports => ask(keys::scores(&run), lie.clone()).await,
+            Attack::Garbage => {
+                noise.rotate_left(1);
+                session.put(keys::progress(&run, &name("noise")), noise.clone()).await.unwrap();
+                session.put("quad/run/anything", noise.clone()).await.unwrap();
+                ask(keys::jobs(&run), newer.clone()).await;
+                ask(keys::weights_at(&run, 1), noise.clone()).await;
+            }
+            Attack::Tokens => {
+                let key = keys::live_evaluator(&run, &name(&format!("flood-{}", tokens.len())));
+                tokens.push(session.liveliness().declare_token(key).await.unwrap());
+                if tokens.len() > 1000 {
+                    tokens.clear();
+                }
+            }
+            Attack::Connections | Attack::ReadsNothing => unreachable!("they need no session"),
+        }
+        tokio::task::yield_now().await;
+    }
+}
+
+/// Asks for weights again and again, and then reads nothing: the process stops itself.
+async fn read_nothing(endpoint: String) {
+    let session = open(&endpoint).await;
+    let question = encode(&WeightsRequest { evaluator: name("silent") }).unwrap();
+    for _ in 0..300 {
+        let get = session.get(keys::weights_at(&run(), SETTING.eval_interval)).payload(question.clone());
+        get.timeout(PATIENCE).callback(drop).await.unwrap();
+    }
+    let stop = format!("kill -STOP {}", std::process::id());
+    Command::new("sh").args(["-c", &stop]).status().unwrap();
+}
+
+#[test]
+fn whatever_strangers_do_the_work_goes_on() {
+    if let Ok(endpoint) = std::env::var(STRANGER) {
+        return Runtime::new().unwrap().block_on(read_nothing(endpoint));
+    }
+    let (phase, rounds) = (Duration::from_secs(number("QUAD_SECONDS", 1)), number("QUAD_ROUNDS", 1) as usize);
+    let scratch = Scratch::new();
+    let mut learner = on_core(0, || scratch.learner("run", SETTING));
+    on_core(1, || {
+        let endpoint = learner.endpoint();
+        let runtime = Runtime::new().unwrap();
+        learner.process.wait_for_log("snapshot handed to evaluation", PATIENCE);
+        let crowd = runtime.block_on(Crowd::connect(HONEST, &run(), &endpoint));
+        crowd.set(Pace::Real);
+        let quiet_memory = learner.process.peak_memory();
+        for attack in ATTACKS {
+            let mut stranger = None;
+            crowd.measured();
+            let [quiet, loud] = compare(&learner, rounds, phase, |loud| {
+                stranger = loud.then(|| Stranger::start(attack, &runtime, &endpoint));
+            });
+            // Nobody is served less than before: whoever has waited gets an answer.
+            let claims = eventually("claims are answered", PATIENCE, || {
+                let claims = crowd.measured().claims;
+                (!claims.is_empty()).then_some(claims)
+            });
+            let slowest = claims.iter().max().unwrap();
+            let (share, threads) = (loud.steps_per_second / quiet.steps_per_second, loud.other_threads);
+            eprintln!("{attack:?}: training at {share:.3}, {threads:.2} s/s besides, slowest claim {slowest:.1?}");
+            assert!(share > 0.1, "{attack:?} leaves {share} of the training");
+        }
+        let growth = learner.process.peak_memory().saturating_sub(quiet_memory) >> 20;
+        let page = http::metrics(&learner.metrics()).unwrap();
+        let rejected = page.lines().filter(|line| line.starts_with("quad_learner_rejected"));
+        eprintln!("memory: at most {growth} MiB more\n{}", rejected.collect::<Vec<_>>().join("\n"));
+        assert!(growth < 400, "the attacks took {growth} MiB");
+        assert!(learner.process.is_running());
+    });
+}
