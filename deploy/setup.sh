@@ -40,6 +40,11 @@ install_packages() {
     python3 -c 'import ensurepip, venv' >/dev/null 2>&1 || missing+=(python3-venv)
     have shellcheck || missing+=(shellcheck)
     have openssl || missing+=(openssl)
+    # Hosts on one machine, which only root can make.
+    if [ "$(id -u)" -eq 0 ]; then
+      have tc || missing+=(iproute2)
+      have nft || missing+=(nftables)
+    fi
   fi
   [ ${#missing[@]} -gt 0 ] || return 0
 

@@ -6,7 +6,9 @@
 //!
 //! - [`process`]: start a program, signal it, wait for it, read what it said.
 //! - [`system`]: a scratch folder with a tiny dataset and preset; learners and evaluators that use them.
-//! - [`router`]: a Zenoh router in the test's own process; [`link`]: a connection that can be cut, frozen and slowed down.
+//! - [`router`]: a Zenoh router in the test's own process.
+//! - [`line`](mod@line): a connection on which things go wrong: a [`link`] of TCP, or a cable to a host of its own, in [`hosts`].
+//! - [`power`]: what a disk holds after a power cut.
 //! - [`crowd`]: hundreds of evaluators that only talk; [`pace`]: how fast a learner trains, and what slows it down.
 //! - [`http`]: fetch a page, read a metric, serve a file.
 //! - [`peers`]: programs that are not ours; where one is missing, a test is skipped or fails.
@@ -17,10 +19,13 @@
 
 pub mod crowd;
 pub mod dashboard;
+pub mod hosts;
 pub mod http;
+pub mod line;
 pub mod link;
 pub mod pace;
 pub mod peers;
+pub mod power;
 pub mod process;
 pub mod prometheus;
 pub mod router;

@@ -1,4 +1,5 @@
 //! A network connection that a test can cut, freeze and slow down: whoever connects to it is led on to somebody else.
+//! Works on any machine, for any user.
 
 use std::io::{ErrorKind, Read, Write};
 use std::net::{Shutdown, TcpListener, TcpStream};
@@ -7,19 +8,20 @@ use std::sync::{Arc, Mutex};
 use std::thread;
 use std::time::Duration;
 
+use crate::line::{Line, Trouble};
+
 /// How often a connection without traffic looks whether it still is one.
 const GLANCE: Duration = Duration::from_millis(20);
 
 /// Leads every connection to its address on to a port of this machine.
-#[derive(Clone)]
 pub struct Link {
-    /// Where to connect to, as `tcp/host:port`.
-    pub endpoint: String,
+    endpoint: String,
     state: Arc<State>,
 }
 
 #[derive(Default)]
 struct State {
+    cut: AtomicBool,
     frozen: AtomicBool,
     delay_milliseconds: AtomicU64,
     streams: Mutex<Vec<TcpStream>>,
@@ -34,6 +36,9 @@ impl Link {
         let shared = state.clone();
         thread::spawn(move || {
             for near in listener.incoming().flatten() {
+                if shared.cut.load(Relaxed) {
+                    continue;
+                }
                 // With nobody there, the connection ends at once.
                 let Ok(far) = TcpStream::connect(("127.0.0.1", port)) else { continue };
                 let streams = || Some([near.try_clone().ok()?, far.try_clone().ok()?]);
@@ -50,22 +55,36 @@ impl Link {
         });
         Link { endpoint, state }
     }
+}
 
-    /// Ends all connections; new ones are welcome.
-    pub fn cut(&self) {
-        for stream in self.state.streams.lock().expect("nobody panics with it").drain(..) {
-            stream.shutdown(Shutdown::Both).ok();
+impl Line for Link {
+    const TROUBLES: &'static [Trouble] = &[Trouble::Cut, Trouble::Silent, Trouble::Slow];
+
+    fn endpoint(&self) -> String {
+        self.endpoint.clone()
+    }
+
+    fn launcher(&self) -> Vec<String> {
+        Vec::new()
+    }
+
+    fn suffer(&self, trouble: Trouble, percent: u32, a_while: Duration) {
+        let state = &self.state;
+        match trouble {
+            Trouble::Cut => {
+                state.cut.store(true, Relaxed);
+                for stream in state.streams.lock().expect("nobody panics with it").drain(..) {
+                    stream.shutdown(Shutdown::Both).ok();
+                }
+            }
+            Trouble::Silent => state.frozen.store(true, Relaxed),
+            Trouble::Slow => state.delay_milliseconds.store(u64::from(percent) * 7 / 2, Relaxed),
+            other => unreachable!("{other:?} is not among the troubles of links"),
         }
-    }
-
-    /// From now on nothing goes through, and nobody is told, or everything goes through again.
-    pub fn freeze(&self, frozen: bool) {
-        self.state.frozen.store(frozen, Relaxed);
-    }
-
-    /// Holds up each packet for so long.
-    pub fn delay(&self, delay: Duration) {
-        self.state.delay_milliseconds.store(delay.as_millis() as u64, Relaxed);
+        thread::sleep(a_while);
+        state.cut.store(false, Relaxed);
+        state.frozen.store(false, Relaxed);
+        state.delay_milliseconds.store(0, Relaxed);
     }
 }
 

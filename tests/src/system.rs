@@ -126,14 +126,22 @@ impl Scratch {
 
     /// Starts a learner with further arguments, among them where it listens or connects.
     pub fn learner_with(&self, run: &str, setting: Setting, arguments: &[&str]) -> Learner {
-        let preset = self.preset(run, setting);
+        self.learner_through(&[], run, setting, arguments)
+    }
+
+    /// Starts a learner by a command line of which its own is the end, as `ip netns exec` and `env` have it. `run` may be a
+    /// path below this folder.
+    pub fn learner_through(&self, launcher: &[String], run: &str, setting: Setting, arguments: &[&str]) -> Learner {
         let run_dir = self.path().join(run);
+        let name = run_dir.file_name().and_then(|name| name.to_str()).expect("a run has a name");
+        let preset = self.preset(name, setting);
         // An earlier learner's in the same folder.
         fs::remove_file(run_dir.join("endpoints.json")).ok();
-        let mut command = Command::new(binary("learner"));
+        let mut command = through(launcher, "learner");
         command.arg("train").arg("--preset").arg(preset).arg("--dataset").arg(self.dataset());
         command.arg("--run-dir").arg(&run_dir).args(["--metrics", "127.0.0.1:0"]).args(arguments);
-        Learner { process: Process::start(run, self.path(), command), run_dir }
+        let process = Process::start(name, self.path(), command);
+        Learner { process, run_dir }
     }
 
     /// Starts an evaluator that is called `name`.
@@ -143,7 +151,12 @@ impl Scratch {
 
     /// Starts an evaluator that is called `name`, with further arguments.
     pub fn evaluator_with(&self, name: &str, arguments: &[&str]) -> Evaluator {
-        let mut command = Command::new(binary("evaluator"));
+        self.evaluator_through(&[], name, arguments)
+    }
+
+    /// Starts an evaluator by a command line of which its own is the end.
+    pub fn evaluator_through(&self, launcher: &[String], name: &str, arguments: &[&str]) -> Evaluator {
+        let mut command = through(launcher, "evaluator");
         command.args(["serve", "--name", name]).args(arguments);
         Evaluator { process: Process::start(name, self.path(), command) }
     }
@@ -153,6 +166,13 @@ impl Default for Scratch {
     fn default() -> Scratch {
         Scratch::new()
     }
+}
+
+fn through(launcher: &[String], program: &str) -> Command {
+    let Some((first, rest)) = launcher.split_first() else { return Command::new(binary(program)) };
+    let mut command = Command::new(first);
+    command.args(rest).arg(binary(program));
+    command
 }
 
 /// A learner and the folder of its run.

@@ -1,6 +1,7 @@
 //! Fault upon fault at random moments, and at the end a run that is, bit for bit, the one that nothing happened to.
 //!
-//! A short round runs with all tests. A long one, whose result is in docs/reliability.md:
+//! Once with the connections of one machine, once with a host for each program, on a network whose packets go astray.
+//! Short rounds run with all tests. Long ones, whose results are in docs/reliability.md:
 //! `QUAD_FAULTS=200 cargo test --release --workspace --test chaos -- --nocapture`; QUAD_FAULTS_SEED chooses other faults.
 #![allow(clippy::unwrap_used, clippy::expect_used, clippy::print_stderr)]
 
@@ -12,6 +13,8 @@ use std::thread::sleep;
 use std::time::{Duration, Instant};
 
 use quad_protocol::{EpisodeScore, Hash, Name, ScoreReply, ScoreReport, decode, encode, keys};
+use quad_tests::hosts::{Host, Network};
+use quad_tests::line::{Line, Trouble};
 use quad_tests::link::Link;
 use quad_tests::process::binary;
 use quad_tests::router::router;
@@ -26,95 +29,93 @@ use zenoh::{Session, Wait};
 
 const EVALUATORS: usize = 3;
 /// Gradient steps for each fault, so that training goes on until the last of them.
-const STEPS_PER_FAULT: u64 = 6000;
+const STEPS_PER_FAULT: u64 = 8000;
 
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
 enum Fault {
     KillEvaluator,
     FreezeEvaluator,
     StopEvaluator,
-    CutEvaluator,
-    FreezeEvaluatorsLink,
-    DelayEvaluatorsLink,
+    EvaluatorsLine(Trouble),
     RestartRouter,
     KillLearner,
     StopLearner,
     FreezeLearner,
-    CutLearner,
-    FreezeLearnersLink,
+    LearnersLine(Trouble),
     FillDisk,
     DeliverAgain,
 }
 
-const FAULTS: [Fault; 14] = [
+/// What happens to programs and their disk.
+const FAULTS: [Fault; 9] = [
     Fault::KillEvaluator,
     Fault::FreezeEvaluator,
     Fault::StopEvaluator,
-    Fault::CutEvaluator,
-    Fault::FreezeEvaluatorsLink,
-    Fault::DelayEvaluatorsLink,
     Fault::RestartRouter,
     Fault::KillLearner,
     Fault::StopLearner,
     Fault::FreezeLearner,
-    Fault::CutLearner,
-    Fault::FreezeLearnersLink,
     Fault::FillDisk,
     Fault::DeliverAgain,
 ];
 
-/// A router, a learner and some evaluators, each behind a link of its own.
-struct System {
+/// What happens on the way between them.
+fn faults_on<L: Line>() -> Vec<Fault> {
+    L::TROUBLES.iter().flat_map(|&trouble| [Fault::EvaluatorsLine(trouble), Fault::LearnersLine(trouble)]).collect()
+}
+
+/// A router, a learner and some evaluators, each at the end of a line of its own.
+struct System<L> {
     scratch: Scratch,
     setting: Setting,
     runtime: Runtime,
-    port: u16,
+    endpoint: String,
     router: Option<Session>,
     learner: Learner,
-    learners_link: Link,
-    evaluators: Vec<(Evaluator, Link)>,
+    learners_line: L,
+    evaluators: Vec<(Evaluator, L)>,
     started: usize,
     /// The run's folder is a disk of its own, which can be filled.
     disk: bool,
     faults: BTreeMap<Fault, usize>,
 }
 
-impl System {
-    fn start(setting: Setting) -> System {
+impl<L: Line> System<L> {
+    /// With a router that listens at `endpoint`, where all lines lead to: the learner's and each evaluator's.
+    fn start(setting: Setting, endpoint: &str, mut lines: Vec<L>) -> System<L> {
         let scratch = Scratch::new();
         let run = scratch.path().join("run");
         fs::create_dir(&run).unwrap();
         let disk = Command::new("mount").args(["-t", "tmpfs", "-o", "size=64m", "tmpfs"]).arg(&run).status();
         let disk = disk.is_ok_and(|status| status.success());
         let runtime = Runtime::new().unwrap();
-        let port = free_port();
-        let session = runtime.block_on(router(&format!("tcp/127.0.0.1:{port}")));
-        let learners_link = Link::to(port);
-        let learner = learner(&scratch, setting, &learners_link);
+        let session = runtime.block_on(router(endpoint));
+        let learners_line = lines.pop().expect("there are lines");
+        let learner = learner(&scratch, setting, &learners_line);
         let mut system = System {
             scratch,
             setting,
             runtime,
-            port,
+            endpoint: endpoint.to_owned(),
             router: Some(session),
             learner,
-            learners_link,
+            learners_line,
             evaluators: Vec::new(),
             started: 0,
             disk,
             faults: BTreeMap::new(),
         };
-        for _ in 0..EVALUATORS {
-            let link = Link::to(port);
-            let evaluator = system.evaluator(&link);
-            system.evaluators.push((evaluator, link));
+        for line in lines {
+            let evaluator = system.evaluator(&line);
+            system.evaluators.push((evaluator, line));
         }
         system
     }
 
-    fn evaluator(&mut self, link: &Link) -> Evaluator {
+    fn evaluator(&mut self, line: &L) -> Evaluator {
         self.started += 1;
-        self.scratch.evaluator_with(&format!("evaluator-{}", self.started), &["--connect", &link.endpoint])
+        let name = format!("evaluator-{}", self.started);
+        self.scratch.evaluator_through(&line.launcher(), &name, &["--connect", &line.endpoint()])
     }
 
     /// Whether the learner has reached its end. If it has ended in any other way, that is a bug.
@@ -128,8 +129,9 @@ impl System {
     }
 
     fn inject(&mut self, fault: Fault, random: &mut ChaCha8Rng) {
-        // Zenoh gives up a silent connection after 5 s: some are shorter, some are longer.
-        let a_while = Duration::from_millis(random.random_range(100..7000));
+        // Zenoh gives up a silent connection after 5 s: most are shorter, some are longer.
+        let a_while = Duration::from_secs_f64(0.1 + 6.9 * random.random::<f64>().powi(2));
+        let percent = random.random_range(1..=100);
         let victim = random.random_range(0..EVALUATORS);
         match fault {
             Fault::KillEvaluator => {
@@ -147,20 +149,12 @@ impl System {
                 assert!(duration < Duration::from_secs(10), "an evaluator took {duration:?} to leave");
                 self.replace(victim);
             }
-            Fault::CutEvaluator => self.evaluators[victim].1.cut(),
-            Fault::FreezeEvaluatorsLink => freeze(&self.evaluators[victim].1, a_while),
-            Fault::DelayEvaluatorsLink => {
-                let link = &self.evaluators[victim].1;
-                link.delay(a_while / 20);
-                sleep(a_while / 2);
-                link.delay(Duration::ZERO);
-            }
+            Fault::EvaluatorsLine(trouble) => self.evaluators[victim].1.suffer(trouble, percent, a_while),
             Fault::RestartRouter => {
                 let session = self.router.take().expect("it is there");
                 session.close().wait().ok();
                 sleep(a_while / 4);
-                let endpoint = format!("tcp/127.0.0.1:{}", self.port);
-                self.router = Some(self.runtime.block_on(router(&endpoint)));
+                self.router = Some(self.runtime.block_on(router(&self.endpoint)));
             }
             Fault::KillLearner => {
                 self.learner.process.kill();
@@ -176,8 +170,7 @@ impl System {
                 sleep(a_while);
                 self.learner.process.signal("CONT");
             }
-            Fault::CutLearner => self.learners_link.cut(),
-            Fault::FreezeLearnersLink => freeze(&self.learners_link, a_while),
+            Fault::LearnersLine(trouble) => self.learners_line.suffer(trouble, percent, a_while),
             Fault::FillDisk if self.disk => {
                 let filler = self.learner.run_dir.join("filler");
                 let mut file = fs::File::create(&filler).unwrap();
@@ -192,12 +185,13 @@ impl System {
     }
 
     fn replace(&mut self, index: usize) {
-        let link = self.evaluators[index].1.clone();
-        self.evaluators[index].0 = self.evaluator(&link);
+        let (_, line) = self.evaluators.remove(index);
+        let evaluator = self.evaluator(&line);
+        self.evaluators.insert(index, (evaluator, line));
     }
 
     fn restart_learner(&mut self) {
-        self.learner = learner(&self.scratch, self.setting, &self.learners_link);
+        self.learner = learner(&self.scratch, self.setting, &self.learners_line);
     }
 
     /// Delivers what is recorded once more, by somebody else.
@@ -236,7 +230,7 @@ impl System {
     }
 }
 
-impl Drop for System {
+impl<L> Drop for System<L> {
     fn drop(&mut self) {
         if self.disk {
             Command::new("umount").arg("--lazy").arg(&self.learner.run_dir).status().ok();
@@ -244,14 +238,9 @@ impl Drop for System {
     }
 }
 
-fn learner(scratch: &Scratch, setting: Setting, link: &Link) -> Learner {
-    scratch.learner_with("run", setting, &["--connect", &link.endpoint, "--checkpoint-seconds", "1"])
-}
-
-fn freeze(link: &Link, a_while: Duration) {
-    link.freeze(true);
-    sleep(a_while);
-    link.freeze(false);
+fn learner(scratch: &Scratch, setting: Setting, line: &impl Line) -> Learner {
+    let arguments = ["--connect", &line.endpoint(), "--checkpoint-seconds", "1"];
+    scratch.learner_through(&line.launcher(), "run", setting, &arguments)
 }
 
 fn verify(run: &Path, other: &Path) -> (bool, String) {
@@ -263,9 +252,9 @@ fn number(variable: &str, default: u64) -> u64 {
     std::env::var(variable).map_or(default, |text| text.parse().expect("a number"))
 }
 
-#[test]
-fn whatever_happens_the_run_ends_as_if_nothing_had() {
-    let (count, seed) = (number("QUAD_FAULTS", FAULTS.len() as u64), number("QUAD_FAULTS_SEED", 1));
+/// Lets faults of those kinds happen, so many of them unless a long round is asked for.
+fn endure(faults: &[Fault], short: usize, endpoint: &str, lines: Vec<impl Line>) {
+    let (count, seed) = (number("QUAD_FAULTS", short as u64), number("QUAD_FAULTS_SEED", 1));
     let setting = Setting {
         steps: STEPS_PER_FAULT * count,
         eval_interval: STEPS_PER_FAULT / 2,
@@ -279,14 +268,14 @@ fn whatever_happens_the_run_ends_as_if_nothing_had() {
     let mut calm = scratch.learner("calm", setting);
     let _evaluator = scratch.evaluator("calm-evaluator", &calm.endpoint());
 
-    let mut system = System::start(setting);
+    let mut system = System::start(setting, endpoint, lines);
     let mut random = ChaCha8Rng::seed_from_u64(seed);
     let (mut injected, mut round) = (0, Vec::new());
     while injected < count && !system.is_over() {
         sleep(Duration::from_millis(random.random_range(0..1500)));
         // Each kind once a round, in another order each time.
         if round.is_empty() {
-            round = FAULTS.to_vec();
+            round = faults.to_vec();
             round.shuffle(&mut random);
         }
         system.inject(round.pop().expect("it was filled"), &mut random);
@@ -306,4 +295,26 @@ fn whatever_happens_the_run_ends_as_if_nothing_had() {
     assert!(fs::read(last(&system.learner)).unwrap() == fs::read(last(&calm)).unwrap(), "the last checkpoints differ");
     eprintln!("{injected} faults in {:.0?}: {:?}\n{found}", begin.elapsed(), system.faults);
     assert!(injected >= count / 2, "the run was over after {injected} of {count} faults");
+}
+
+#[test]
+fn whatever_happens_the_run_ends_as_if_nothing_had() {
+    let port = free_port();
+    let faults = [&FAULTS[..], &faults_on::<Link>()].concat();
+    let lines = (0..=EVALUATORS).map(|_| Link::to(port)).collect();
+    endure(&faults, faults.len(), &format!("tcp/127.0.0.1:{port}"), lines);
+}
+
+#[test]
+fn so_does_a_run_whose_learner_and_evaluators_are_hosts_on_a_bad_network() {
+    let port = free_port();
+    let network = match Network::new() {
+        Ok(network) => network,
+        Err(reason) => return eprintln!("skipped, because there can be no network of hosts here: {reason}"),
+    };
+    let lines = (1..=EVALUATORS as u32 + 1).map(|number| network.host(number, port).unwrap()).collect();
+    // The other test lets programs die, too; here they do so in a long round only.
+    let programs: &[Fault] = if std::env::var_os("QUAD_FAULTS").is_some() { &FAULTS } else { &[] };
+    let faults = [programs, &faults_on::<Host>()].concat();
+    endure(&faults, Host::TROUBLES.len(), &format!("tcp/{}:{port}", network.address), lines);
 }

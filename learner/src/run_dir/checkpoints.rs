@@ -35,7 +35,7 @@ impl Checkpoints {
 
     /// Saves one; only then are older ones removed.
     pub fn save(&self, checkpoint: &Checkpoint) -> Result<(), RunDirError> {
-        fs::create_dir_all(&self.folder).map_err(io_error("create", &self.folder))?;
+        durable::create_folder(&self.folder).map_err(io_error("create", &self.folder))?;
         let target = self.folder.join(file_name(checkpoint));
         durable::replace(&target, &checkpoint.state)?;
         for older in self.files()?.into_iter().skip(KEPT) {

@@ -33,6 +33,18 @@ fn write_synchronised(path: &Path, bytes: &[u8]) -> io::Result<()> {
     file.sync_all()
 }
 
+/// Makes a folder and those above it that are missing, so that a power cut does not take what will be in them.
+pub(super) fn create_folder(path: &Path) -> io::Result<()> {
+    if path.is_dir() {
+        return Ok(());
+    }
+    if let Some(parent) = path.parent().filter(|parent| !parent.as_os_str().is_empty()) {
+        create_folder(parent)?;
+    }
+    fs::create_dir(path)?;
+    synchronise_folder(path)
+}
+
 /// Makes the names in the folder that `path` lies in durable.
 pub(super) fn synchronise_folder(path: &Path) -> io::Result<()> {
     let folder = path.parent().filter(|folder| !folder.as_os_str().is_empty()).unwrap_or(Path::new("."));

@@ -40,7 +40,9 @@ impl Log {
         }
         let whole = whole_lines(&mut file).map_err(io_error("read", &path))?;
         let mut log = Self { path, file, length: whole, torn: true, synchronise };
-        log.mend().and_then(|()| synchronise_folder(&log.path)).map_err(io_error("open", &log.path))?;
+        // Lines that a killed process did not synchronise count from now on.
+        let durable = log.mend().and_then(|()| log.synchronise()).and_then(|()| synchronise_folder(&log.path));
+        durable.map_err(io_error("open", &log.path))?;
         Ok(log)
     }
 
@@ -57,10 +59,7 @@ impl Log {
     fn write(&mut self, text: &[u8]) -> io::Result<()> {
         self.mend()?;
         self.torn = true;
-        let written = self.file.write_all(text).and_then(|()| match self.synchronise {
-            true => self.file.sync_data(),
-            false => Ok(()),
-        });
+        let written = self.file.write_all(text).and_then(|()| self.synchronise());
         match written {
             Ok(()) => {
                 self.torn = false;
@@ -70,6 +69,13 @@ impl Log {
             Err(_) => drop(self.mend()),
         }
         written
+    }
+
+    fn synchronise(&self) -> io::Result<()> {
+        match self.synchronise {
+            true => self.file.sync_data(),
+            false => Ok(()),
+        }
     }
 
     /// Cuts off what a failed write left: half a line would make the next one unreadable.

@@ -84,7 +84,7 @@ impl RunDir {
         }
         let run = Self { path: path.to_owned() };
         let snapshots = path.join("snapshots");
-        fs::create_dir_all(&snapshots).map_err(io_error("create", &snapshots))?;
+        durable::create_folder(&snapshots).map_err(io_error("create", &snapshots))?;
         let target = path.join("config.toml");
         let text = toml::to_string(config).map_err(|error| content(&target, None, &error))?;
         replace(&target, text.as_bytes())?;

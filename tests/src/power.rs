@@ -1,0 +1,116 @@
+//! What a disk holds after a power cut, at worst: nothing but what was synchronised.
+//!
+//! A file has the contents of its last fsync, a folder the entries of its own last fsync, and an entry that was never
+//! synchronised itself is empty. examples/power_cut.rs, preloaded into a program, keeps such a [`Disk`] up to date.
+
+use std::fs::{self, File};
+use std::io;
+use std::os::unix::fs::MetadataExt;
+use std::path::{Path, PathBuf};
+use std::time::UNIX_EPOCH;
+
+/// The variables that tell the preloaded library of the two folders.
+const FOLDER: &str = "QUAD_TESTS_DISK";
+const KEPT: &str = "QUAD_TESTS_DISK_KEPT";
+
+/// A folder, and beside it what would be left of it.
+pub struct Disk {
+    folder: PathBuf,
+    /// A file for each file and each folder, called by its identity: the contents, or a line for each entry.
+    kept: PathBuf,
+}
+
+impl Disk {
+    /// An empty folder `disk` in `scratch`.
+    pub fn new(scratch: &Path) -> Disk {
+        let disk = Disk { folder: scratch.join("disk"), kept: scratch.join("disk.kept") };
+        fs::create_dir(&disk.folder).unwrap();
+        disk.keep_all();
+        disk
+    }
+
+    /// The one that this program was started for by [`Disk::launcher`].
+    pub fn of_environment() -> Disk {
+        let folder = |variable: &str| PathBuf::from(std::env::var_os(variable).expect("the launcher sets it"));
+        Disk { folder: folder(FOLDER), kept: folder(KEPT) }
+    }
+
+    /// The words that start a program whose synchronising is watched.
+    pub fn launcher(&self) -> Vec<String> {
+        let test = std::env::current_exe().expect("a test knows its own executable");
+        // target/release/deps/test-123 → target/release/examples/libpower_cut.so
+        let release = test.parent().and_then(Path::parent).expect("a test lies two folders below target/");
+        let library = release.join("examples/libpower_cut.so");
+        assert!(library.exists(), "{} is missing; cargo build --release --examples makes it", library.display());
+        let set = |variable: &str, path: &Path| format!("{variable}={}", path.display());
+        vec!["env".to_owned(), set("LD_PRELOAD", &library), set(FOLDER, &self.folder), set(KEPT, &self.kept)]
+    }
+
+    /// Keeps a file or folder as it is now, if it is on this disk. Whole or not at all, whenever the program dies.
+    pub fn keep(&self, path: &Path) -> io::Result<()> {
+        if !path.starts_with(&self.folder) {
+            return Ok(());
+        }
+        let partial = self.kept.join("partial");
+        if path.is_dir() {
+            let entries = fs::read_dir(path)?.map(|entry| entry_line(&entry?));
+            fs::write(&partial, entries.collect::<io::Result<String>>()?)?;
+        } else {
+            fs::copy(path, &partial)?;
+        }
+        fs::rename(partial, self.kept.join(identity(path)?))
+    }
+
+    /// Leaves in the folder what a power cut would leave. All of that is durable from then on.
+    pub fn cut_power(&self) {
+        let restored = self.folder.with_extension("restored");
+        self.restore(&identity(&self.folder).unwrap(), &restored).unwrap();
+        fs::remove_dir_all(&self.folder).unwrap();
+        fs::rename(&restored, &self.folder).unwrap();
+        fs::remove_dir_all(&self.kept).unwrap();
+        self.keep_all();
+    }
+
+    fn keep_all(&self) {
+        fs::create_dir(&self.kept).unwrap();
+        let mut folders = vec![self.folder.clone()];
+        while let Some(folder) = folders.pop() {
+            self.keep(&folder).unwrap();
+            for path in fs::read_dir(folder).unwrap().map(|entry| entry.unwrap().path()) {
+                match path.is_dir() {
+                    true => folders.push(path),
+                    false => self.keep(&path).unwrap(),
+                }
+            }
+        }
+    }
+
+    fn restore(&self, folder: &str, target: &Path) -> io::Result<()> {
+        fs::create_dir(target)?;
+        // One that was never synchronised has no entries.
+        for line in fs::read_to_string(self.kept.join(folder)).unwrap_or_default().lines() {
+            let mut words = line.splitn(3, ' ');
+            let mut word = || words.next().expect("a line has three words");
+            let (kind, identity, path) = (word(), word(), target.join(word()));
+            let kept = self.kept.join(identity);
+            match kind {
+                "folder" => self.restore(identity, &path)?,
+                _ if kept.exists() => drop(fs::copy(kept, path)?),
+                _ => drop(File::create(path)?),
+            }
+        }
+        Ok(())
+    }
+}
+
+fn entry_line(entry: &fs::DirEntry) -> io::Result<String> {
+    let kind = if entry.file_type()?.is_dir() { "folder" } else { "file" };
+    Ok(format!("{kind} {} {}\n", identity(&entry.path())?, entry.file_name().to_string_lossy()))
+}
+
+/// What stays the same when a file is renamed, and is another for another file. A number alone is given again.
+fn identity(path: &Path) -> io::Result<String> {
+    let metadata = fs::symlink_metadata(path)?;
+    let born = metadata.created()?.duration_since(UNIX_EPOCH).map_err(io::Error::other)?;
+    Ok(format!("{}-{}", metadata.ino(), born.as_nanos()))
+}
