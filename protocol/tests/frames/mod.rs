@@ -1,0 +1,70 @@
+//! Messages to be mutated, by a test beside this folder and by the fuzzer in protocol/fuzz.
+
+use quad_protocol::*;
+
+fn name() -> Name {
+    Name::new("some-name").unwrap()
+}
+
+/// One of each kind and variant, with all of its fields filled.
+pub fn frames() -> Vec<Vec<u8>> {
+    let text = || "hopper".to_owned();
+    let tensors: Vec<u8> = (0..100).collect();
+    let weights = Hash::of(&tensors);
+    let schema = Schema { environment: text(), observation_dim: 11, action_dim: 3, policy: "diffusion".to_owned() };
+    let episodes = vec![EpisodeScore { seed: 1, episode_return: 2.0, length: 3, score: 4.0 }; 3];
+    let lease = Lease::random();
+    let job = Job {
+        id: 1,
+        lease: lease.clone(),
+        run: name(),
+        incarnation: 2,
+        step: 3,
+        weights,
+        environment: text(),
+        instance: 4,
+        seeds: vec![1, 2, 3],
+        candidates: 10,
+        lease_milliseconds: 1000,
+    };
+    let progress = Progress {
+        evaluator: name(),
+        run: name(),
+        incarnation: 2,
+        job: 1,
+        step: 3,
+        episodes_done: 1,
+        episodes_total: 3,
+        steps_done: 100,
+        environment_steps: 200,
+        episodes: 7,
+        proof: weights,
+    };
+    let environments = vec![text(), "walker2d".to_owned()];
+    let cannot_act = Some(CannotAct::signed("NaN".to_owned(), weights, &lease));
+    vec![
+        encode(&Snapshot { run: name(), incarnation: 1, step: 2, schema, hash: weights, tensors }).unwrap(),
+        encode(&JobRequest::Claim { evaluator: name(), attempt: 9, environments, precision: name() }).unwrap(),
+        encode(&JobRequest::HandBack { evaluator: name(), job: 1, lease: lease.clone() }).unwrap(),
+        encode(&JobReply::Job(job)).unwrap(),
+        encode(&JobReply::Wait { incarnation: 2, milliseconds: 10 }).unwrap(),
+        encode(&JobReply::HandedBack { incarnation: 2, accepted: true }).unwrap(),
+        encode(&ScoreReport {
+            evaluator: name(),
+            run: name(),
+            incarnation: 1,
+            job: 2,
+            step: 3,
+            weights,
+            precision: name(),
+            episodes: episodes.clone(),
+            cannot_act,
+        })
+        .unwrap(),
+        encode(&ScoreReply::Recorded { incarnation: 1, new: 2, duplicates: 3 }).unwrap(),
+        encode(&ScoreReply::Refused { incarnation: 1, reason: text() }).unwrap(),
+        encode(&WeightsRequest { evaluator: name() }).unwrap(),
+        encode(&RecordedScores { run: name(), step: 1, weights, evaluator: name(), episodes }).unwrap(),
+        encode(&progress.signed(&lease)).unwrap(),
+    ]
+}
