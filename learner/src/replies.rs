@@ -1,13 +1,13 @@
-//! The threads that answer queries. To send an answer may take until the peer reads, or up to five seconds, after which Zenoh
+//! The threads that answer queries. To send an answer may take until the peer reads, or up to two seconds, after which Zenoh
 //! closes the connection; even to drop a query says "no more answers" to the peer. So neither happens on the threads that own
 //! the state, nor on Zenoh's own: they only put their answers into this bounded queue.
 //!
 //! It is shared fairly among those who ask, as far as they can be told apart: by the names that they give. Whoever gives none
-//! shares a place with all others who do not. (One who gives many names can take all places, for five seconds with each
+//! shares a place with all others who do not. (One who gives many names can take all places, for two seconds with each
 //! connection; against that only access control helps.)
 //!
 //! What is left is Zenoh's own: when it closes the connection of a peer that is still being sent to, its one sending thread
-//! waits for that sender, so the peers of this session hear nothing for up to five seconds. They connect again by themselves.
+//! waits for that sender, so the peers of this session hear nothing for up to two seconds. They connect again by themselves.
 
 use std::collections::VecDeque;
 use std::mem;

@@ -32,6 +32,10 @@ const RETRY: [Duration; 2] = [Duration::from_millis(250), Duration::from_secs(2)
 /// How long a large message that may be dropped waits for a receiver that does not keep up. Zenoh's 50 ms are not
 /// enough for a snapshot when training has taken all cores; a receiver that hangs must not hold up the others for long.
 const DROP_AFTER: Duration = Duration::from_millis(500);
+/// How long a message that may not be dropped waits for a receiver that does not read, before its connection is closed.
+/// While Zenoh closes it, others may have to wait as long; of Zenoh's five seconds they would notice. (A network of 256 kbit/s
+/// still takes one packet of 64 KiB in this time.)
+const CLOSE_AFTER: Duration = Duration::from_secs(2);
 /// A client that has no connection after this time says so.
 const PATIENCE: Duration = Duration::from_secs(10);
 /// A session asks itself what it listens at, so there is no network in between.
@@ -203,6 +207,10 @@ fn config(endpoints: &Endpoints) -> zenoh::Result<Config> {
         (
             "transport/link/tx/queue/congestion_control/drop/max_wait_before_drop_fragments",
             json!(DROP_AFTER.as_micros() as u64),
+        ),
+        (
+            "transport/link/tx/queue/congestion_control/block/wait_before_close",
+            json!(CLOSE_AFTER.as_micros() as u64),
         ),
         ("transport/link/rx/max_message_size", json!(if listens { MAX_REQUEST_SIZE } else { MAX_SNAPSHOT_SIZE })),
         ("transport/unicast/max_sessions", json!(MAX_SESSIONS)),

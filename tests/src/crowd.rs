@@ -166,7 +166,7 @@ impl Member {
             cannot_act: None,
         };
         // What was not acknowledged is delivered again.
-        while let None = self.deliver(&report).await {}
+        while self.deliver(&report).await.is_none() {}
     }
 
     async fn deliver(&self, report: &ScoreReport) -> Option<()> {

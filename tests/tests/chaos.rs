@@ -19,7 +19,7 @@ use quad_tests::link::Link;
 use quad_tests::process::binary;
 use quad_tests::router::router;
 use quad_tests::system::{Evaluator, Learner, Score, Scratch, Setting, free_port};
-use quad_tests::{PATIENCE, eventually};
+use quad_tests::{PATIENCE, eventually, number};
 use rand::seq::SliceRandom;
 use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
@@ -246,10 +246,6 @@ fn learner(scratch: &Scratch, setting: Setting, line: &impl Line) -> Learner {
 fn verify(run: &Path, other: &Path) -> (bool, String) {
     let output = Command::new(binary("learner")).arg("verify").arg(run).arg("--same-as").arg(other).output().unwrap();
     (output.status.success(), String::from_utf8_lossy(&output.stdout).into_owned())
-}
-
-fn number(variable: &str, default: u64) -> u64 {
-    std::env::var(variable).map_or(default, |text| text.parse().expect("a number"))
 }
 
 /// Lets faults of those kinds happen, so many of them unless a long round is asked for.

@@ -42,9 +42,9 @@ async fn a_peer_that_reads_nothing_holds_up_neither_jobs_nor_snapshots() {
     }
 
     let request = encode(&WeightsRequest { evaluator: name("a") }).unwrap();
-    // As long as Zenoh has not noticed. To close the connection, it lets all others wait for whoever still sends.
+    // Until Zenoh has noticed, and closed the connection; meanwhile all others wait for whoever still sends.
     let (start, mut slowest, mut step) = (Instant::now(), Duration::ZERO, 10);
-    while start.elapsed() < Duration::from_secs(3) {
+    while start.elapsed() < Duration::from_secs(8) {
         let asked = Instant::now();
         claim(&client, &bench.run, "a").await.expect("always the same job");
         step += 10;
@@ -58,5 +58,5 @@ async fn a_peer_that_reads_nothing_holds_up_neither_jobs_nor_snapshots() {
     stranger.kill().unwrap();
     stranger.wait().unwrap();
     // A snapshot is published with some patience for each subscriber, and there are other tests beside this one.
-    assert!(slowest < Duration::from_secs(2), "{slowest:?}");
+    assert!(slowest < Duration::from_secs(4), "{slowest:?}");
 }
