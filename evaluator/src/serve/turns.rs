@@ -99,6 +99,8 @@ impl Turns {
     pub fn over(&mut self, run: &mut Standing, began: Instant, now: Instant) {
         let took = now - began;
         run.used += took;
+        // Behind those that have waited meanwhile.
+        run.ready_at = run.ready_at.max(now);
         if !run.proven {
             self.proven_first_until = now + took;
         }
@@ -118,6 +120,8 @@ mod tests {
         Wastes(u64),
         /// It works for a second, but every hundredth time it does not answer.
         Stumbles,
+        /// So many seconds go into a job whose scores it does not take.
+        Refuses(u64),
         /// It says at once that there is nothing to do.
         Idles,
     }
@@ -144,6 +148,10 @@ mod tests {
                 Nature::Wastes(seconds) => {
                     now += Duration::from_secs(seconds);
                     standing.failed(now);
+                }
+                Nature::Refuses(seconds) => {
+                    now += Duration::from_secs(seconds);
+                    standing.delivered(false);
                 }
                 Nature::Stumbles if *count % 100 == 0 => {
                     now += Duration::from_secs(5);
@@ -198,6 +206,12 @@ mod tests {
         let shares = hour(&natures);
         assert!(shares[63].1.unwrap() <= 2 * 5 * 64, "{:?}", shares[63]);
         assert!(shares[63].0 > 0.15, "{:?}", shares[63]);
+    }
+
+    #[test]
+    fn whoever_refuses_what_it_asked_for_does_not_keep_out_a_newcomer() {
+        let shares = hour(&[Nature::Refuses(5), Nature::Wastes(5), Nature::Works(1)]);
+        assert!(shares[1].1.is_some() && shares[2].0 > 0.45, "{shares:?}");
     }
 
     #[test]
