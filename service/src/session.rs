@@ -208,10 +208,7 @@ fn config(endpoints: &Endpoints) -> zenoh::Result<Config> {
             "transport/link/tx/queue/congestion_control/drop/max_wait_before_drop_fragments",
             json!(DROP_AFTER.as_micros() as u64),
         ),
-        (
-            "transport/link/tx/queue/congestion_control/block/wait_before_close",
-            json!(CLOSE_AFTER.as_micros() as u64),
-        ),
+        ("transport/link/tx/queue/congestion_control/block/wait_before_close", json!(CLOSE_AFTER.as_micros() as u64)),
         ("transport/link/rx/max_message_size", json!(if listens { MAX_REQUEST_SIZE } else { MAX_SNAPSHOT_SIZE })),
         ("transport/unicast/max_sessions", json!(MAX_SESSIONS)),
         // The only stable way to learn a port that the system chose. Others could read the configuration there, so it
