@@ -1,18 +1,20 @@
 //! A system of containers, and what can be done to one of them.
 
-use std::path::{Path, PathBuf};
 use std::process::{Command, Stdio};
 use std::sync::{Mutex, MutexGuard, PoisonError};
+use std::thread::sleep;
 use std::time::Duration;
 
 use quad_tests::eventually;
 
-use crate::images;
+use crate::images::{are_there, repository};
 
 /// How long anything but training is waited for.
 pub const PATIENCE: Duration = Duration::from_secs(240);
 /// How long a run may take.
 pub const TRAINING: Duration = Duration::from_secs(1800);
+/// Between two questions to Docker, each of which is a program of its own.
+const PAUSE: Duration = Duration::from_millis(300);
 
 /// What makes a gradient step and an episode so light that a run of many evaluations takes seconds.
 pub const LIGHT: &str = "--set agent.hidden=64 --set agent.critics=2 --set agent.diffusion_steps=2 --set batch_size=16 \
@@ -42,7 +44,7 @@ impl Compose {
         ];
         let variables = variables.map(|(variable, value)| (variable, value.to_owned())).to_vec();
         let project = format!("quad-{name}-{}", std::process::id());
-        images::are_there().then_some(Compose { project, variables, _alone: alone })
+        are_there().then_some(Compose { project, variables, _alone: alone })
     }
 
     /// Sets one of the variables of docs/deployment.md.
@@ -85,6 +87,7 @@ impl Compose {
     pub fn assert_run_is_complete(&self, name: &str, same_as: Option<&str>) -> String {
         let learner = self.container("learner");
         eventually("the learner ended", TRAINING, || {
+            sleep(PAUSE);
             (inspect(&learner, "{{.State.Status}}") == "exited").then_some(())
         });
         assert_eq!(inspect(&learner, "{{.State.ExitCode}}"), "0", "the learner's exit code");
@@ -105,6 +108,11 @@ impl Drop for Compose {
         }
         self.command(&["down", "--volumes", "--timeout", "5"]).status().ok();
     }
+}
+
+/// Whether `docker …` succeeds.
+pub fn succeeds(arguments: &[&str]) -> bool {
+    Command::new("docker").args(arguments).stdout(Stdio::null()).status().expect("docker was found before").success()
 }
 
 /// `docker …`, which must succeed; gives what it prints.
@@ -128,6 +136,7 @@ pub fn logs(container: &str) -> String {
 /// Waits until a container has printed `text` so often.
 pub fn wait_for_log(container: &str, text: &str, times: usize) {
     eventually(&format!("{text:?} {times} times in the log"), PATIENCE, || {
+        sleep(PAUSE);
         (logs(container).matches(text).count() >= times).then_some(())
     });
 }
@@ -151,8 +160,4 @@ fn output(mut command: Command) -> String {
     let output = command.output().expect("docker was found before");
     assert!(output.status.success(), "{command:?} ended with {}", output.status);
     String::from_utf8_lossy(&output.stdout).into_owned()
-}
-
-pub fn repository() -> PathBuf {
-    Path::new(env!("CARGO_MANIFEST_DIR")).join("..")
 }

@@ -6,15 +6,16 @@ use std::collections::BTreeMap;
 use std::thread::sleep;
 use std::time::{Duration, Instant};
 
+use quad_tests::eventually;
 use rand::seq::SliceRandom;
 use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 
-use crate::compose::{Compose, LIGHT, crash, docker, inspect};
+use crate::compose::{Compose, LIGHT, PATIENCE, crash, docker, inspect, succeeds};
 
 const EVALUATORS: usize = 3;
 /// Gradient steps for each fault, so that training goes on until the last of them.
-const STEPS_PER_FAULT: u64 = 20_000;
+const STEPS_PER_FAULT: u64 = 15_000;
 
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
 enum Fault {
@@ -88,7 +89,8 @@ impl System {
 }
 
 fn pause(container: &str, a_while: Duration) {
-    docker(&["pause", container]);
+    // Where a process of the container cannot be stopped just then, the engine gives up.
+    eventually("the container is paused", PATIENCE, || succeeds(&["pause", container]).then_some(()));
     sleep(a_while);
     docker(&["unpause", container]);
 }

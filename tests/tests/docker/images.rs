@@ -1,10 +1,8 @@
 //! The images, made once for all tests.
 
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 use std::process::{Command, Stdio};
 use std::sync::LazyLock;
-
-use crate::compose::repository;
 
 /// Makes sure that there are images of what is in this folder now. If there cannot be any, says why, and is false.
 pub fn are_there() -> bool {
@@ -56,4 +54,9 @@ fn base_images() -> Result<(), String> {
 
 fn succeeds(command: &mut Command) -> bool {
     command.stdout(Stdio::null()).status().is_ok_and(|status| status.success())
+}
+
+/// The folder that everything is in.
+pub fn repository() -> PathBuf {
+    Path::new(env!("CARGO_MANIFEST_DIR")).join("..")
 }

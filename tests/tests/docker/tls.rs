@@ -44,18 +44,16 @@ fn compose_with_certificates_works_and_lets_in_nobody_else() {
     wait_for_log(&learner, "snapshot handed to evaluation", 1);
 
     // There is work, and at first only strangers to do it.
-    let stranger = |endpoint: &str, folder: Option<&Path>| {
-        let mounted = folder.map(|folder| format!("{}:/certificates:ro", folder.join("evaluator").display()));
-        let mut arguments = vec!["run".to_owned(), "--detach".to_owned(), format!("--network={}", compose.network())];
-        if let Some(mounted) = mounted {
-            arguments.extend(["--volume", &mounted, "--env", "QUAD_CERTIFICATES=/certificates"].map(str::to_owned));
-        }
-        arguments.extend(["quad/evaluator", "serve", "--name", "stranger", "--connect", endpoint].map(str::to_owned));
-        Stranger(docker(&arguments.iter().map(String::as_str).collect::<Vec<_>>()).trim().to_owned())
+    let network = compose.network();
+    let stranger = |endpoint: &str, options: &[&str]| {
+        let evaluator = ["quad/evaluator", "serve", "--name", "stranger", "--connect", endpoint];
+        let arguments = [&["run", "--detach", "--network", &network], options, &evaluator].concat();
+        Stranger(docker(&arguments).trim().to_owned())
     };
-    let plain = stranger("tcp/router:7447", None);
-    let foreign = stranger("tls/router:7447", Some(theirs.path()));
-    let naked = stranger("tls/router:7447", None);
+    let folder = format!("{}:/certificates:ro", theirs.path().join("evaluator").display());
+    let plain = stranger("tcp/router:7447", &[]);
+    let naked = stranger("tls/router:7447", &[]);
+    let foreign = stranger("tls/router:7447", &["--volume", &folder, "--env", "QUAD_CERTIFICATES=/certificates"]);
     for tries in [&plain, &foreign] {
         wait_for_log(&tries.0, "no connection to", 1);
     }
