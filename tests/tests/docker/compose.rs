@@ -88,7 +88,7 @@ impl Compose {
         let learner = self.container("learner");
         eventually("the learner ended", TRAINING, || {
             sleep(PAUSE);
-            (inspect(&learner, "{{.State.Status}}") == "exited").then_some(())
+            has_ended(&learner).then_some(())
         });
         assert_eq!(inspect(&learner, "{{.State.ExitCode}}"), "0", "the learner's exit code");
         let other = same_as.map(|other| format!("--same-as /runs/{other}"));
@@ -110,7 +110,7 @@ impl Drop for Compose {
     }
 }
 
-/// Whether `docker …` succeeds.
+/// `docker …`; whether it succeeded.
 pub fn succeeds(arguments: &[&str]) -> bool {
     Command::new("docker").args(arguments).stdout(Stdio::null()).status().expect("docker was found before").success()
 }
@@ -127,6 +127,11 @@ pub fn inspect(container: &str, format: &str) -> String {
     docker(&["inspect", "--format", format, container]).trim().to_owned()
 }
 
+/// Whether a container has ended for good. (One that crashed and is to be started again has not.)
+pub fn has_ended(container: &str) -> bool {
+    inspect(container, "{{.State.Status}}") == "exited"
+}
+
 /// What a container has printed in all its lives.
 pub fn logs(container: &str) -> String {
     let output = Command::new("docker").args(["logs", container]).output().expect("docker was found before");
@@ -141,19 +146,22 @@ pub fn wait_for_log(container: &str, text: &str, times: usize) {
     });
 }
 
-/// Kills a container's process and waits until it is there again by itself.
+/// Kills a container's process and waits until it is there again by itself. If it had ended before, does nothing, and is
+/// false.
 ///
 /// `docker kill` would be an order, after which the engine starts nothing again, and from inside, a container's first
 /// process cannot be killed: it takes a process that sees them all.
-pub fn crash(container: &str) {
+pub fn crash(container: &str) -> bool {
     let (process, start) = (inspect(container, "{{.State.Pid}}"), inspect(container, "{{.State.StartedAt}}"));
     let kill = format!("kill -KILL {process}");
     let outside = ["run", "--rm", "--pid", "host", "--network", "none", "--user", "0", "--entrypoint", "bash"];
-    docker(&[&outside[..], &["quad/evaluator", "-c", &kill]].concat());
-    eventually("the container is started again", PATIENCE, || {
-        let state = inspect(container, "{{.State.Status}} {{.State.StartedAt}}");
-        state.strip_prefix("running ").filter(|again| *again != start).map(|_| ())
-    });
+    let killed = process != "0" && succeeds(&[&outside[..], &["quad/evaluator", "-c", &kill]].concat());
+    killed && {
+        eventually("the container is started again", PATIENCE, || {
+            let state = inspect(container, "{{.State.Status}} {{.State.StartedAt}}");
+            state.strip_prefix("running ").filter(|again| *again != start).map(|_| true)
+        })
+    }
 }
 
 fn output(mut command: Command) -> String {

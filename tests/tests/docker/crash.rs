@@ -18,7 +18,7 @@ fn compose_goes_on_with_a_run_after_a_crash() {
     up();
     let learner = compose.container("learner");
     wait_for_log(&learner, WORK, 3);
-    crash(&learner);
+    assert!(crash(&learner));
     assert_eq!(inspect(&learner, "{{.RestartCount}}"), "1");
     wait_for_log(&learner, WORK, 6);
     compose.run(&["kill"]);

@@ -11,11 +11,11 @@ use rand::seq::SliceRandom;
 use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 
-use crate::compose::{Compose, LIGHT, PATIENCE, crash, docker, inspect, succeeds};
+use crate::compose::{Compose, LIGHT, PATIENCE, crash, has_ended, succeeds};
 
 const EVALUATORS: usize = 3;
 /// Gradient steps for each fault, so that training goes on until the last of them.
-const STEPS_PER_FAULT: u64 = 15_000;
+const STEPS_PER_FAULT: u64 = 20_000;
 
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
 enum Fault {
@@ -53,46 +53,50 @@ struct System {
 }
 
 impl System {
-    /// Whether the learner has ended. (One that crashed and is to be started again has not.)
-    fn is_over(&self) -> bool {
-        inspect(&self.learner, "{{.State.Status}}") == "exited"
-    }
-
     fn inject(&self, fault: Fault, random: &mut ChaCha8Rng) {
         // Zenoh gives up a silent connection after 5 s: some are shorter, some are longer.
         let a_while = Duration::from_millis(random.random_range(100..7000));
         let evaluator = &self.evaluators[random.random_range(0..EVALUATORS)];
-        match fault {
+        let injected = match fault {
             Fault::CrashEvaluator => crash(evaluator),
             Fault::PauseEvaluator => pause(evaluator, a_while),
             Fault::CutOffEvaluator => self.cut_off("evaluator", evaluator, a_while),
-            Fault::RestartRouter => drop(self.compose.run(&["restart", "--timeout", "2", "router"])),
+            Fault::RestartRouter => succeeds(&["restart", "--time", "2", &self.router]),
             Fault::PauseRouter => pause(&self.router, a_while),
             Fault::CutOffRouter => self.cut_off("router", &self.router, a_while),
             Fault::CrashLearner => crash(&self.learner),
             Fault::KillLearner => {
-                self.compose.run(&["kill", "learner"]);
+                let killed = succeeds(&["kill", &self.learner]);
                 self.compose.run(&["up", "--detach", "--no-recreate", "learner"]);
+                killed
             }
             Fault::PauseLearner => pause(&self.learner, a_while),
             Fault::CutOffLearner => self.cut_off("learner", &self.learner, a_while),
-        }
+        };
+        // The learner may have reached its end just before.
+        assert!(injected || has_ended(&self.learner), "{fault:?} failed");
     }
 
     /// Takes a container off the network for a while. It comes back with its service's name, and perhaps another address.
-    fn cut_off(&self, service: &str, container: &str, a_while: Duration) {
+    fn cut_off(&self, service: &str, container: &str, a_while: Duration) -> bool {
         let network = self.compose.network();
-        docker(&["network", "disconnect", &network, container]);
-        sleep(a_while);
-        docker(&["network", "connect", "--alias", service, &network, container]);
+        succeeds(&["network", "disconnect", &network, container]) && {
+            sleep(a_while);
+            succeeds(&["network", "connect", "--alias", service, &network, container])
+        }
     }
 }
 
-fn pause(container: &str, a_while: Duration) {
+fn pause(container: &str, a_while: Duration) -> bool {
     // Where a process of the container cannot be stopped just then, the engine gives up.
-    eventually("the container is paused", PATIENCE, || succeeds(&["pause", container]).then_some(()));
-    sleep(a_while);
-    docker(&["unpause", container]);
+    let paused = eventually("the container is paused", PATIENCE, || {
+        let paused = succeeds(&["pause", container]);
+        (paused || has_ended(container)).then_some(paused)
+    });
+    paused && {
+        sleep(a_while);
+        succeeds(&["unpause", container])
+    }
 }
 
 fn number(variable: &str, default: u64) -> u64 {
@@ -123,7 +127,7 @@ fn whatever_happens_to_containers_the_run_ends_as_if_nothing_had() {
     assert_eq!(system.evaluators.len(), EVALUATORS);
     let mut random = ChaCha8Rng::seed_from_u64(seed);
     let (mut injected, mut faults, mut round) = (0, BTreeMap::new(), Vec::new());
-    while injected < count && !system.is_over() {
+    while injected < count && !has_ended(&system.learner) {
         // Each kind once a round, in another order each time.
         if round.is_empty() {
             round = FAULTS.to_vec();
