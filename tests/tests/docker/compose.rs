@@ -166,6 +166,7 @@ pub fn crash(container: &str) -> bool {
 
 fn output(mut command: Command) -> String {
     let output = command.output().expect("docker was found before");
-    assert!(output.status.success(), "{command:?} ended with {}", output.status);
-    String::from_utf8_lossy(&output.stdout).into_owned()
+    let printed = String::from_utf8_lossy(&output.stdout).into_owned();
+    assert!(output.status.success(), "{command:?} ended with {}:\n{printed}", output.status);
+    printed
 }
