@@ -26,7 +26,8 @@ async fn ask<A: Message>(session: &Session, key: String, question: Vec<u8>) -> A
 #[tokio::test(flavor = "multi_thread")]
 async fn scores_that_were_made_up_are_found_out_by_the_next_evaluator() {
     let scratch = Scratch::new();
-    let setting = Setting { episodes: 4, ..Setting::default() };
+    // The run ends with its last score, and does not wait for audits: some of twenty evaluations come before.
+    let setting = Setting { steps: 400, episodes: 4, ..Setting::default() };
     let endpoint = format!("tcp/127.0.0.1:{}", free_port());
     let session = router(&endpoint).await;
     let mut learner = scratch.learner_with("run", setting, &["--connect", &endpoint, "--audit", "1"]);

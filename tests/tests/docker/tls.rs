@@ -1,0 +1,90 @@
+//! Compose with docker-compose.tls.yml on top: a run is complete, and who has no certificate has no part in it.
+
+use std::os::unix::fs::chown;
+use std::path::Path;
+use std::process::{Command, Stdio};
+use std::time::Instant;
+
+use quad_tests::peers;
+use tempfile::tempdir;
+
+use crate::compose::{Compose, LIGHT, docker, inspect, logs, wait_for_log};
+
+/// The containers' user.
+const USER: u32 = 10001;
+
+/// What the first lines of docker-compose.tls.yml tell to do; false if the test is to be skipped.
+fn certificates(folder: &Path) -> bool {
+    let roles: [&[&str]; 3] = [&["router", "router", "router"], &["learner", "learner"], &["evaluator", "evaluator"]];
+    roles.iter().all(|role| {
+        peers::certificates(folder, role) && {
+            let folder = folder.join(role[1]);
+            let mut files = ["", "ca.pem", "cert.pem", "key.pem"].iter().map(|file| folder.join(file));
+            let given = files.try_for_each(|file| chown(file, Some(USER), None));
+            given.inspect_err(|error| eprintln!("skipped, because of chown: {error}")).is_ok()
+        }
+    })
+}
+
+#[test]
+#[ignore = "builds the images: cargo test --release --workspace --test docker -- --ignored"]
+fn compose_with_certificates_works_and_lets_in_nobody_else() {
+    let (ours, theirs) = (tempdir().unwrap(), tempdir().unwrap());
+    if !(certificates(ours.path()) && certificates(theirs.path())) {
+        return;
+    }
+    let Some(mut compose) = Compose::project("tls", &format!("{LIGHT} --steps 8000 --eval-interval 1000")) else {
+        return;
+    };
+    let begin = Instant::now();
+    compose.set("COMPOSE_FILE", "docker-compose.yml:docker-compose.tls.yml");
+    compose.set("QUAD_CERTIFICATES", ours.path().to_str().unwrap());
+    compose.run(&["up", "--detach", "learner"]);
+    let (learner, router) = (compose.container("learner"), compose.container("router"));
+    wait_for_log(&learner, "snapshot handed to evaluation", 1);
+
+    // There is work, and at first only strangers to do it.
+    let network = compose.network();
+    let stranger = |endpoint: &str, options: &[&str]| {
+        let evaluator = ["quad/evaluator", "serve", "--name", "stranger", "--connect", endpoint];
+        let arguments = [&["run", "--detach", "--network", &network], options, &evaluator].concat();
+        Stranger(docker(&arguments).trim().to_owned())
+    };
+    let folder = format!("{}:/certificates:ro", theirs.path().join("evaluator").display());
+    let plain = stranger("tcp/router:7447", &[]);
+    let naked = stranger("tls/router:7447", &[]);
+    let foreign = stranger("tls/router:7447", &["--volume", &folder, "--env", "QUAD_CERTIFICATES=/certificates"]);
+    for tries in [&plain, &foreign] {
+        wait_for_log(&tries.0, "no connection to", 1);
+    }
+    wait_for_log(&naked.0, "needs certificates", 1);
+    // One that would not mind having none.
+    let port = compose.run(&["port", "router", "7447"]);
+    let mut client = Command::new("openssl");
+    client.args(["s_client", "-connect", port.trim(), "-CAfile"]).arg(ours.path().join("evaluator/ca.pem"));
+    let mut client = client.stdin(Stdio::piped()).stdout(Stdio::null()).stderr(Stdio::null()).spawn().unwrap();
+    wait_for_log(&router, "peer sent no certificates", 1);
+    client.kill().unwrap();
+    client.wait().unwrap();
+    assert_eq!(compose.learner("cat /runs/tls/scores.jsonl"), "", "strangers have scored");
+
+    compose.run(&["up", "--detach", "--no-recreate", "evaluator"]);
+    let verdict = compose.assert_run_is_complete("tls", None);
+    assert!(verdict.contains("32 of 32 episodes are scored"), "{verdict}");
+    let scores = compose.learner("cat /runs/tls/scores.jsonl");
+    assert!(!scores.contains("stranger"), "{scores}");
+    for tries in [&plain, &foreign] {
+        assert_eq!(inspect(&tries.0, "{{.State.Status}}"), "running");
+        assert!(!logs(&tries.0).contains("connected"), "{}", logs(&tries.0));
+    }
+    eprintln!("{verdict} ({:.0?})", begin.elapsed());
+}
+
+/// A container that is not of the project.
+struct Stranger(String);
+
+impl Drop for Stranger {
+    fn drop(&mut self) {
+        Command::new("docker").args(["rm", "--force", &self.0]).stdout(Stdio::null()).status().ok();
+    }
+}
