@@ -166,7 +166,9 @@ impl Member {
             cannot_act: None,
         };
         // What was not acknowledged is delivered again.
-        while self.deliver(&report).await.is_none() {}
+        while self.deliver(&report).await.is_none() {
+            sleep(Duration::from_millis(250)).await;
+        }
     }
 
     async fn deliver(&self, report: &ScoreReport) -> Option<()> {
