@@ -14,7 +14,7 @@ use std::time::Duration;
 use quad_protocol::{EpisodeScore, Hash, JobRequest, Name, Progress, ScoreReport, WeightsRequest, encode, keys};
 use quad_service::{Endpoints, open_session};
 use quad_tests::crowd::{Crowd, Pace};
-use quad_tests::pace::{compare, on_core};
+use quad_tests::pace::{compare, median, on_core};
 use quad_tests::system::{Scratch, Setting};
 use quad_tests::{PATIENCE, eventually, http, number};
 use tokio::runtime::Runtime;
@@ -201,7 +201,7 @@ fn whatever_strangers_do_the_work_goes_on() {
     if let Ok(endpoint) = std::env::var(STRANGER) {
         return Runtime::new().unwrap().block_on(read_nothing(endpoint));
     }
-    let (phase, rounds) = (Duration::from_secs(number("QUAD_SECONDS", 1)), number("QUAD_ROUNDS", 1) as usize);
+    let (phase, rounds) = (Duration::from_secs(number("QUAD_SECONDS", 1)), number("QUAD_ROUNDS", 2) as usize);
     let scratch = Scratch::new();
     let mut learner = on_core(0, || scratch.learner("run", SETTING));
     on_core(1, || {
@@ -211,6 +211,7 @@ fn whatever_strangers_do_the_work_goes_on() {
         let crowd = runtime.block_on(Crowd::connect(HONEST, &run(), &endpoint));
         crowd.set(Pace::Real);
         let quiet_memory = learner.process.peak_memory();
+        let mut shares = Vec::new();
         for attack in ATTACKS {
             let mut stranger = None;
             crowd.measured();
@@ -225,8 +226,13 @@ fn whatever_strangers_do_the_work_goes_on() {
             let slowest = claims.iter().max().unwrap();
             let (share, threads) = (loud.steps_per_second / quiet.steps_per_second, loud.other_threads);
             eprintln!("{attack:?}: training at {share:.3}, {threads:.2} s/s besides, slowest claim {slowest:.1?}");
-            assert!(share > 0.1, "{attack:?} leaves {share} of the training");
+            shares.push(share);
         }
+        // Of most attacks, training hardly notices anything, although it has to share its core.
+        assert!(
+            median(shares.iter().copied()) > 0.5,
+            "the shares of training's speed that the attacks leave: {shares:.2?}"
+        );
         let growth = learner.process.peak_memory().saturating_sub(quiet_memory) >> 20;
         let page = http::metrics(&learner.metrics()).unwrap();
         let rejected = page.lines().filter(|line| line.starts_with("quad_learner_rejected"));

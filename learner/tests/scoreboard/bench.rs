@@ -12,6 +12,8 @@ pub const INCARNATION: u64 = 77;
 
 pub struct Bench {
     pub board: Scoreboard,
+    /// How many evaluators there are.
+    pub present: usize,
     start: Instant,
 }
 
@@ -39,7 +41,7 @@ impl Bench {
         let mut board = Scoreboard::new(rules);
         board.add_evaluation(2000, hash(2000), &Vec::from_iter(11..=17)).unwrap();
         board.add_evaluation(1000, hash(1000), &Vec::from_iter(1..=7)).unwrap();
-        Self { board, start: Instant::now() }
+        Self { board, present: 0, start: Instant::now() }
     }
 
     pub fn at(&self, seconds: u64) -> Instant {
@@ -55,7 +57,7 @@ impl Bench {
                 attempt,
                 environments: &environments,
                 precision: &name("f32"),
-                present: 0,
+                present: self.present,
             },
             now,
         )

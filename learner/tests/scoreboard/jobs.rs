@@ -50,6 +50,22 @@ fn a_claim_that_is_repeated_gets_the_same_job_and_another_one_waits() {
 }
 
 #[test]
+fn the_more_have_nothing_to_do_the_less_often_each_asks() {
+    let mut bench = Bench::new();
+    for evaluator in ["a", "b", "c", "d"] {
+        bench.job(evaluator, 0);
+    }
+    for (present, expected) in [(0, 500), (50, 500), (200, 2000), (500, 5000)] {
+        bench.present = present;
+        let reply = bench.claim("e", 0, 0);
+        assert!(
+            matches!(reply, JobReply::Wait { milliseconds, .. } if milliseconds == expected),
+            "{present}: {reply:?}"
+        );
+    }
+}
+
+#[test]
 fn an_evaluator_that_goes_loses_its_job_and_nobody_elses() {
     let mut bench = Bench::new();
     let (first, other) = (bench.job("a", 0), bench.job("b", 0));
