@@ -7,7 +7,7 @@
 //! connection; against that only access control helps.)
 //!
 //! What is left is Zenoh's own: when it closes the connection of a peer that is still being sent to, its one sending thread
-//! waits for that sender, so the peers of this session hear nothing for up to two seconds. They connect again by themselves.
+//! waits for that sender, so the peers of this session hear nothing for two seconds, or four. They connect again by themselves.
 
 use std::collections::VecDeque;
 use std::mem;

@@ -57,6 +57,6 @@ async fn a_peer_that_reads_nothing_holds_up_neither_jobs_nor_snapshots() {
     }
     stranger.kill().unwrap();
     stranger.wait().unwrap();
-    // A snapshot is published with some patience for each subscriber, and there are other tests beside this one.
-    assert!(slowest < Duration::from_secs(4), "{slowest:?}");
+    // Two answers to the stranger may be under way, each of which waits for two seconds before Zenoh gives up.
+    assert!(slowest < Duration::from_millis(4700), "{slowest:?}");
 }
