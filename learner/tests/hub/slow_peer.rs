@@ -57,6 +57,7 @@ async fn a_peer_that_reads_nothing_holds_up_neither_jobs_nor_snapshots() {
     }
     stranger.kill().unwrap();
     stranger.wait().unwrap();
-    // Two answers to the stranger may be under way, each of which waits for two seconds before Zenoh gives up.
-    assert!(slowest < Duration::from_millis(4700), "{slowest:?}");
+    // Two answers to the stranger may be under way, and each waits for two seconds before Zenoh gives up; of Zenoh's own five
+    // it would be ten.
+    assert!(slowest < Duration::from_secs(7), "{slowest:?}");
 }
