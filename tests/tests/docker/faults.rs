@@ -6,7 +6,7 @@ use std::collections::BTreeMap;
 use std::thread::sleep;
 use std::time::{Duration, Instant};
 
-use quad_tests::eventually;
+use quad_tests::{eventually, number};
 use rand::seq::SliceRandom;
 use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
@@ -97,10 +97,6 @@ fn pause(container: &str, a_while: Duration) -> bool {
         sleep(a_while);
         succeeds(&["unpause", container])
     }
-}
-
-fn number(variable: &str, default: u64) -> u64 {
-    std::env::var(variable).map_or(default, |text| text.parse().expect("a number"))
 }
 
 #[test]
