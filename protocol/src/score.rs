@@ -1,7 +1,7 @@
 //! Scores: an evaluator delivers them, the learner acknowledges them and publishes what it has recorded.
 
 use crate::codec::{Decode, Encode};
-use crate::{Hash, Lease, Name};
+use crate::{Hash, Job, Lease, Name};
 
 /// The result of one episode.
 #[derive(Clone, Copy, Debug, PartialEq, Encode, Decode)]
@@ -38,6 +38,14 @@ pub struct ScoreReport {
     pub episodes: Vec<EpisodeScore>,
     /// Why there are none.
     pub cannot_act: Option<CannotAct>,
+}
+
+impl ScoreReport {
+    /// What `evaluator` has measured in `job`.
+    pub fn of(job: &Job, evaluator: Name, precision: Name, episodes: Vec<EpisodeScore>) -> Self {
+        let Job { run, incarnation, id, step, weights, .. } = job.clone();
+        Self { evaluator, run, incarnation, job: id, step, weights, precision, episodes, cannot_act: None }
+    }
 }
 
 /// The policy cannot act, because something on the way to an action is not a number. No other evaluator would fare better,

@@ -154,17 +154,8 @@ impl Member {
             let episode_return = (seed % 3000) as f64;
             EpisodeScore { seed, episode_return, length: 300, score: spec.normalised_score(episode_return) }
         });
-        let report = ScoreReport {
-            evaluator: self.name.clone(),
-            episodes: episodes.collect(),
-            run: job.run,
-            incarnation: job.incarnation,
-            job: job.id,
-            step: job.step,
-            weights: job.weights,
-            precision: Name::new("f32").expect("a name"),
-            cannot_act: None,
-        };
+        let precision = Name::new("f32").expect("a name");
+        let report = ScoreReport::of(&job, self.name.clone(), precision, episodes.collect());
         // What was not acknowledged is delivered again.
         while self.deliver(&report).await.is_none() {
             sleep(Duration::from_millis(250)).await;

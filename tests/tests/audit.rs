@@ -46,17 +46,7 @@ async fn scores_that_were_made_up_are_found_out_by_the_next_evaluator() {
     let hopper = environment::find("hopper").unwrap();
     let score =
         |&seed: &u64| EpisodeScore { seed, episode_return: 5.0, length: 10, score: hopper.normalised_score(5.0) };
-    let report = ScoreReport {
-        evaluator: liar,
-        run: run.clone(),
-        incarnation: job.incarnation,
-        job: job.id,
-        step: job.step,
-        weights: job.weights,
-        precision,
-        episodes: job.seeds.iter().map(score).collect(),
-        cannot_act: None,
-    };
+    let report = ScoreReport::of(&job, liar, precision, job.seeds.iter().map(score).collect());
     let reply: ScoreReply = ask(&session, keys::scores(&run), encode(&report).unwrap()).await;
     assert!(matches!(reply, ScoreReply::Recorded { new: 4, .. }), "{reply:?}");
 

@@ -205,19 +205,8 @@ impl Worker {
                 (Vec::new(), Some(CannotAct::signed(reason, job.weights, &job.lease)))
             }
         };
-        let Job { id, run: of, incarnation, step, weights, .. } = job;
         let Identity { evaluator, precision } = self.identity.clone();
-        run.keep(ScoreReport {
-            evaluator,
-            run: of,
-            incarnation,
-            job: id,
-            step,
-            weights,
-            precision,
-            episodes,
-            cannot_act,
-        });
+        run.keep(ScoreReport { cannot_act, ..ScoreReport::of(&job, evaluator, precision, episodes) });
         run.deliver().await
     }
 

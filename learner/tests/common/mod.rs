@@ -14,18 +14,7 @@ pub fn score(seed: u64, episode_return: f64) -> EpisodeScore {
 
 /// Some of a job's scores.
 pub fn report(job: &Job, evaluator: &str, episodes: Vec<EpisodeScore>) -> ScoreReport {
-    let Job { run, incarnation, step, weights, .. } = job.clone();
-    ScoreReport {
-        evaluator: name(evaluator),
-        run,
-        incarnation,
-        job: job.id,
-        step,
-        weights,
-        precision: name("f32"),
-        episodes,
-        cannot_act: None,
-    }
+    ScoreReport::of(job, name(evaluator), name("f32"), episodes)
 }
 
 /// All of them.
