@@ -30,6 +30,8 @@ pub struct Metrics {
     pub disk: DiskMetrics,
     /// Messages from the wire that were not accepted.
     pub rejected: IntCounterVec,
+    /// For how long connections that send too much were not read.
+    pub held_back_seconds: Counter,
 }
 
 /// Gradient steps and what they measured.
@@ -193,7 +195,11 @@ impl Metrics {
         };
         let reasons = Opts::new(full("rejected_messages_total"), "Messages that were not accepted, by reason");
         let rejected = make.add(IntCounterVec::new(reasons, &["reason"]))?;
-        Ok((Self { training, evaluation, evaluators, disk, rejected }, registry))
+        let held_back_seconds = make.add(Counter::new(
+            full("held_back_seconds_total"),
+            "Time for which connections that sent too much were not read",
+        ))?;
+        Ok((Self { training, evaluation, evaluators, disk, rejected, held_back_seconds }, registry))
     }
 
     /// Counts a message that was not accepted.

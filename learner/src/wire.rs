@@ -1,19 +1,23 @@
 //! Everything the learner declares on Zenoh, in one place. The callbacks only put messages into inboxes.
 
+mod flood;
 mod twin;
 
+use std::sync::Arc;
 use std::time::Duration;
 
 use anyhow::anyhow;
 use quad_protocol::{Name, keys};
 use quad_service::Hint;
 use zenoh::Session;
+use zenoh::key_expr::KeyExpr;
 use zenoh::liveliness::LivelinessToken;
 use zenoh::pubsub::Subscriber;
 use zenoh::qos::CongestionControl;
 use zenoh::query::{Query, Queryable};
-use zenoh::sample::Sample;
+use zenoh::sample::{Locality, Sample, SampleKind};
 
+use self::flood::FloodGuard;
 use crate::inbox::{Inbox, MOST_BYTES};
 use crate::metrics::Metrics;
 use crate::replies::{Asker, Question, Replies};
@@ -35,8 +39,10 @@ pub struct Life {
 pub struct Wire {
     session: Session,
     replies: Replies,
+    flood: Arc<FloodGuard>,
     _queryables: [Queryable<()>; 3],
     _subscribers: [Subscriber<()>; 3],
+    _strays: Option<(Subscriber<()>, Queryable<()>)>,
     _token: LivelinessToken,
 }
 
@@ -58,22 +64,29 @@ impl Wire {
         twin::wait_until_gone(&session, &life).await.hint(twin::HINT)?;
         let run = &life.run;
         let replies = Replies::start(metrics)?;
+        let flood = Arc::new(FloodGuard::new(metrics.held_back_seconds.clone()));
+        // A router sends by one connection what many say. It must not be held back.
+        let direct = session.info().routers_zid().await.next().is_none();
+        if !direct {
+            flood.end();
+        }
         // A slow subscriber loses a snapshot, which it can ask for later, instead of delaying the other subscribers.
         let weights = session.declare_publisher(keys::weights(run)).congestion_control(CongestionControl::Drop).await;
         publisher.send(publisher::Event::Online(weights.map_err(zenoh_error)?));
         hub.send(hub::Event::Online(session.clone()));
 
-        let server = Server { session: &session, metrics, replies: &replies };
+        let server = Server { session: &session, metrics, replies: &replies, flood: &flood };
         let queryables = [
             server.serve(keys::weights_at_any_step(run), publisher, publisher::Event::Query).await?,
             server.serve(keys::jobs(run), hub, hub::Event::Job).await?,
             server.serve(keys::scores(run), hub, hub::Event::Report).await?,
         ];
 
-        let (inbox, counted) = (hub.clone(), metrics.clone());
+        let (inbox, counted, guard) = (hub.clone(), metrics.clone(), flood.clone());
         let progress = session
             .declare_subscriber(keys::all_progress(run))
             .callback(move |sample: Sample| {
+                guard.message();
                 let bytes = sample.payload().len();
                 if bytes > MOST_BYTES {
                     counted.reject("oversized");
@@ -83,12 +96,16 @@ impl Wire {
             })
             .await
             .map_err(zenoh_error)?;
-        let (inbox, counted) = (hub.clone(), metrics.clone());
+        let (inbox, counted, guard) = (hub.clone(), metrics.clone(), flood.clone());
         let evaluators = session
             .liveliness()
             .declare_subscriber(keys::all_evaluators(run))
             .history(true)
-            .callback(move |sample| {
+            .callback(move |sample: Sample| {
+                // Who leaves has come before; and all of a connection's leave at its end, not in its task.
+                if sample.kind() == SampleKind::Put {
+                    guard.message();
+                }
                 // What is lost here is a name in the display, or a job that waits for the end of its lease.
                 if inbox.offer_change(hub::Event::Liveliness(sample)).is_err() {
                     counted.reject("busy");
@@ -97,22 +114,20 @@ impl Wire {
             .await
             .map_err(zenoh_error)?;
 
+        let strays = if direct { Some(server.strays(run).await?) } else { None };
+
         ready()?;
         let token = session.liveliness().declare_token(keys::live_learner(run, life.incarnation)).await;
         let token = token.map_err(zenoh_error)?;
         // Two that start at once may both have seen nobody.
         let twins = twin::watch(&session, &life, hub).await?;
-        Ok(Self {
-            session,
-            replies,
-            _queryables: queryables,
-            _subscribers: [progress, evaluators, twins],
-            _token: token,
-        })
+        let _subscribers = [progress, evaluators, twins];
+        Ok(Self { session, replies, flood, _queryables: queryables, _subscribers, _strays: strays, _token: token })
     }
 
     /// Closes the session; answers that were sent before are still delivered to whoever reads them.
     pub async fn close(self) -> anyhow::Result<()> {
+        self.flood.end();
         let replies = self.replies.clone();
         tokio::task::spawn_blocking(move || replies.finish(LAST_ANSWERS)).await?;
         self.session.close().await.map_err(zenoh_error)
@@ -124,6 +139,7 @@ struct Server<'a> {
     session: &'a Session,
     metrics: &'a Metrics,
     replies: &'a Replies,
+    flood: &'a Arc<FloodGuard>,
 }
 
 impl Server<'_> {
@@ -134,7 +150,9 @@ impl Server<'_> {
         event: fn(Question) -> E,
     ) -> anyhow::Result<Queryable<()>> {
         let (inbox, metrics, replies) = (inbox.clone(), self.metrics.clone(), self.replies.clone());
+        let guard = self.flood.clone();
         let callback = move |query: Query| {
+            guard.message();
             let question = replies.question(query);
             let bytes = question.payload().map_or(0, |payload| payload.len());
             if bytes > MOST_BYTES {
@@ -148,6 +166,34 @@ impl Server<'_> {
         // Complete: whoever asks for the best answer only asks here, too.
         let declared = self.session.declare_queryable(key).complete(true).callback(callback).await;
         declared.map_err(zenoh_error)
+    }
+
+    /// Takes what nobody has a reason to send here: counts it, and holds back whoever sends much of it.
+    async fn strays(&self, run: &Name) -> anyhow::Result<(Subscriber<()>, Queryable<()>)> {
+        let served = [keys::weights_at_any_step(run), keys::jobs(run), keys::scores(run), keys::all_progress(run)];
+        let served = served.map(KeyExpr::new).into_iter().collect::<Result<Vec<_>, _>>().map_err(zenoh_error)?;
+        let (guard, counted) = (self.flood.clone(), self.metrics.clone());
+        let stray = move |key: &KeyExpr<'_>| {
+            let stray = !served.iter().any(|served| served.intersects(key));
+            if stray {
+                guard.message();
+                counted.reject("key");
+            }
+            stray
+        };
+        let (published, asked, replies) = (stray.clone(), stray, self.replies.clone());
+        let published = move |sample: Sample| {
+            published(sample.key_expr());
+        };
+        let asked = move |query: Query| {
+            if asked(query.key_expr()) {
+                replies.question(query);
+            }
+        };
+        let remote = Locality::Remote;
+        let subscriber = self.session.declare_subscriber("**").allowed_origin(remote).callback(published).await;
+        let queryable = self.session.declare_queryable("**").allowed_origin(remote).callback(asked).await;
+        Ok((subscriber.map_err(zenoh_error)?, queryable.map_err(zenoh_error)?))
     }
 }
 

@@ -1,0 +1,157 @@
+//! Holds back connections that send too much.
+//!
+//! Zenoh takes in whatever comes, and each message takes time of a processor that training may need. A callback runs in the
+//! task that reads its connection: while it waits, nothing else is read from there, and TCP makes the sender wait. Other
+//! connections are read by other tasks.
+
+use std::collections::HashMap;
+use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering};
+use std::sync::{Mutex, PoisonError};
+use std::thread;
+use std::time::{Duration, Instant};
+
+use prometheus::Counter;
+use tokio::task::{self, Id};
+
+/// A connection may send a message this often in the long run. An evaluator sends a few in a second.
+const INTERVAL: Duration = Duration::from_millis(5);
+/// And so many at once.
+const BURST: u32 = 400;
+/// Whoever sends more is held back for so long, for several messages together.
+const PAUSE: Duration = Duration::from_millis(50);
+/// Most connections that are held back at a time: each takes one of the 50 threads that Zenoh's runtime may start.
+const MOST_HELD_BACK: usize = 32;
+/// Most connections that are kept account of. Those that are quiet for two seconds are forgotten.
+const MOST_CONNECTIONS: usize = 4096;
+
+/// Who has sent how much.
+#[derive(Debug)]
+pub(super) struct FloodGuard {
+    accounts: Mutex<Accounts>,
+    held_back: AtomicUsize,
+    seconds: Counter,
+    ended: AtomicBool,
+}
+
+impl FloodGuard {
+    /// Adds to `seconds` how long connections were held back.
+    pub fn new(seconds: Counter) -> Self {
+        Self { accounts: Mutex::default(), held_back: AtomicUsize::new(0), seconds, ended: AtomicBool::new(false) }
+    }
+
+    /// Counts a message of the connection whose task this is called in, and waits if there were too many.
+    pub fn message(&self) {
+        if self.ended.load(Ordering::Relaxed) {
+            return;
+        }
+        // Messages from this process come on other threads, in no task of Zenoh's.
+        let Some(connection) = task::try_id() else { return };
+        let too_many = self.accounts.lock().unwrap_or_else(PoisonError::into_inner).message(connection, Instant::now());
+        if !too_many {
+            return;
+        }
+        if self.held_back.fetch_add(1, Ordering::Relaxed) < MOST_HELD_BACK {
+            // Lets another thread read the other connections meanwhile.
+            task::block_in_place(|| thread::sleep(PAUSE));
+            self.seconds.inc_by(PAUSE.as_secs_f64());
+        }
+        self.held_back.fetch_sub(1, Ordering::Relaxed);
+    }
+
+    /// From now on nobody is held back, so that connections can be closed at once.
+    pub fn end(&self) {
+        self.ended.store(true, Ordering::Relaxed);
+    }
+}
+
+/// When each connection would have sent what it has, had it kept to the interval.
+#[derive(Debug, Default)]
+struct Accounts(HashMap<Id, Instant>);
+
+impl Accounts {
+    /// Counts a message, and tells whether its connection is to wait.
+    fn message(&mut self, connection: Id, now: Instant) -> bool {
+        if self.0.len() >= MOST_CONNECTIONS && !self.0.contains_key(&connection) {
+            self.0.retain(|_, due| *due > now);
+            if self.0.len() >= MOST_CONNECTIONS {
+                return false;
+            }
+        }
+        let due = self.0.entry(connection).or_insert(now);
+        let latest = now + BURST * INTERVAL + PAUSE;
+        *due = ((*due).max(now) + INTERVAL).min(latest);
+        *due == latest
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use std::sync::Arc;
+
+    use tokio::runtime::Runtime;
+
+    use super::*;
+
+    fn guard() -> Arc<FloodGuard> {
+        Arc::new(FloodGuard::new(Counter::new("seconds", "held back").unwrap()))
+    }
+
+    /// How long a connection takes to get this many messages through.
+    async fn send(guard: &Arc<FloodGuard>, count: u32) -> Duration {
+        let (guard, begin) = (guard.clone(), Instant::now());
+        let connection = tokio::spawn(async move { (0..count).for_each(|_| guard.message()) });
+        connection.await.unwrap();
+        begin.elapsed()
+    }
+
+    #[test]
+    fn a_connection_that_floods_waits_and_others_do_not() {
+        Runtime::new().unwrap().block_on(async {
+            let guard = guard();
+            assert!(send(&guard, BURST).await < PAUSE, "so much is not too much");
+            let flood = tokio::spawn({
+                let guard = guard.clone();
+                async move { send(&guard, BURST + 100).await }
+            });
+            tokio::time::sleep(2 * PAUSE).await;
+            assert!(send(&guard, BURST).await < PAUSE, "somebody else");
+            assert!(flood.await.unwrap() > 8 * PAUSE, "a hundred too many take half a second");
+            assert!(guard.seconds.get() > 0.4, "it is counted");
+            guard.end();
+            assert!(send(&guard, 2 * BURST).await < PAUSE, "at the end nobody waits");
+        });
+    }
+
+    #[test]
+    fn many_that_flood_leave_threads_for_the_others() {
+        Runtime::new().unwrap().block_on(async {
+            let guard = guard();
+            let floods: Vec<_> = (0..2 * MOST_HELD_BACK)
+                .map(|_| {
+                    let guard = guard.clone();
+                    tokio::spawn(async move { (0..BURST + 50).for_each(|_| guard.message()) })
+                })
+                .collect();
+            let mut most = 0;
+            while !floods.iter().all(|flood| flood.is_finished()) {
+                most = most.max(guard.held_back.load(Ordering::Relaxed));
+                tokio::time::sleep(Duration::from_millis(1)).await;
+            }
+            assert!((2..=MOST_HELD_BACK + 2).contains(&most), "{most} at a time");
+        });
+    }
+
+    #[test]
+    fn accounts_of_quiet_connections_are_closed() {
+        let (mut accounts, now) = (Accounts::default(), Instant::now());
+        let ids: Vec<Id> = Runtime::new()
+            .unwrap()
+            .block_on(async { (0..MOST_CONNECTIONS + 1).map(|_| tokio::spawn(async {}).id()).collect() });
+        for &id in &ids {
+            assert!(!accounts.message(id, now));
+        }
+        assert_eq!(accounts.0.len(), MOST_CONNECTIONS, "the last has no account");
+        accounts.message(ids[MOST_CONNECTIONS], now + INTERVAL);
+        assert_eq!(accounts.0.len(), 1);
+    }
+}
