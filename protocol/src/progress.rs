@@ -1,7 +1,7 @@
 //! Progress of an evaluator.
 
 use crate::codec::{Decode, Encode};
-use crate::{Hash, Lease, Name};
+use crate::{Hash, Job, Lease, Name};
 
 /// How far a job is, and what the evaluator has done so far. Extends the job's lease, if it is further than before.
 ///
@@ -33,6 +33,23 @@ pub struct Progress {
 }
 
 impl Progress {
+    /// Of `job`, in which nothing has been done yet, by an evaluator that has done nothing yet; not signed.
+    pub fn of(job: &Job, evaluator: Name) -> Self {
+        Self {
+            evaluator,
+            run: job.run.clone(),
+            incarnation: job.incarnation,
+            job: job.id,
+            step: job.step,
+            episodes_done: 0,
+            episodes_total: job.seeds.len() as u32,
+            steps_done: 0,
+            environment_steps: 0,
+            episodes: 0,
+            proof: Hash::of(&[]),
+        }
+    }
+
     /// The same with its proof.
     pub fn signed(self, lease: &Lease) -> Self {
         let proof = self.proof_under(lease);

@@ -6,6 +6,7 @@ use std::sync::atomic::{AtomicU8, Ordering};
 use std::time::{Duration, Instant};
 
 use quad_service::{Endpoints, SessionError, open_session, parse_endpoint, reachable_at};
+use rustix::process::{Resource, Rlimit};
 use tokio::task::JoinSet;
 use tokio::time::timeout;
 use zenoh::Session;
@@ -216,4 +217,30 @@ fn endpoints_on_a_command_line() {
     for wrong in ["127.0.0.1:7447", "udp/127.0.0.1:7447", "tcp", "tcp/", ""] {
         assert!(parse_endpoint(wrong).unwrap_err().to_string().contains("tcp/127.0.0.1:7447"), "{wrong}");
     }
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn beyond_the_most_connections_nobody_comes_in_until_one_leaves() {
+    const MOST: usize = 768;
+    // Both ends of each connection are open files of this process.
+    let limit = rustix::process::getrlimit(Resource::Nofile);
+    rustix::process::setrlimit(Resource::Nofile, Rlimit { current: limit.maximum, ..limit }).unwrap();
+    let (learner, endpoint) = meeting_point().await;
+    let _declared = declare_learner(&learner, "run").await;
+    let (come, mut there) = tokio::sync::mpsc::unbounded_channel();
+    for _ in 0..MOST + 20 {
+        let (endpoint, come) = (endpoint.clone(), come.clone());
+        tokio::spawn(async move { come.send(open_session(&connecting_to(&endpoint)).await.unwrap()).unwrap() });
+    }
+    let mut sessions = Vec::new();
+    while sessions.len() < MOST {
+        sessions.push(timeout(PATIENCE, there.recv()).await.expect("there is room").unwrap());
+    }
+    assert!(timeout(2 * LULL, there.recv()).await.is_err(), "one too many");
+    for session in [&sessions[0], &sessions[MOST - 1]] {
+        assert_eq!(ask(session, "run", b"abc".to_vec()).await.unwrap(), b"cba");
+    }
+    sessions.pop().unwrap().close().await.unwrap();
+    let last = timeout(PATIENCE, there.recv()).await.expect("there is room again").unwrap();
+    assert_eq!(ask(&last, "run", b"abc".to_vec()).await.unwrap(), b"cba");
 }

@@ -7,8 +7,7 @@ use std::time::{Duration, Instant};
 
 use quad_dataset::environment;
 use quad_protocol::{
-    EpisodeScore, Hash, Job, JobReply, JobRequest, Message, Name, Progress, ScoreReply, ScoreReport, decode, encode,
-    keys,
+    EpisodeScore, Job, JobReply, JobRequest, Message, Name, Progress, ScoreReply, ScoreReport, decode, encode, keys,
 };
 use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
@@ -170,19 +169,7 @@ impl Member {
     }
 
     async fn progress(&self, job: &Job, steps_done: u64) {
-        let progress = Progress {
-            evaluator: self.name.clone(),
-            run: job.run.clone(),
-            incarnation: job.incarnation,
-            job: job.id,
-            step: job.step,
-            episodes_done: 0,
-            episodes_total: job.seeds.len() as u32,
-            steps_done,
-            environment_steps: steps_done,
-            episodes: 0,
-            proof: Hash::of(&[]),
-        };
+        let progress = Progress { steps_done, environment_steps: steps_done, ..Progress::of(job, self.name.clone()) };
         let message = encode(&progress.signed(&job.lease)).expect("it is small");
         self.session.put(keys::progress(&job.run, &self.name), message).await.expect("the session is open");
     }

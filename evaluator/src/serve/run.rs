@@ -6,7 +6,7 @@ use std::time::{Duration, Instant};
 
 use anyhow::Context;
 use quad_protocol::{
-    Hash, Job, JobReply, JobRequest, Name, Progress, ScoreReply, ScoreReport, Snapshot, WeightsRequest, encode, keys,
+    Job, JobReply, JobRequest, Name, Progress, ScoreReply, ScoreReport, Snapshot, WeightsRequest, encode, keys,
 };
 use rand::Rng;
 use tokio::sync::Notify;
@@ -200,17 +200,11 @@ impl RunClient {
     /// Reports progress to the learner. A lost message does not matter: the next one says the same and more.
     pub async fn publish(&self, job: &Job, (steps_done, episodes_done): (u64, u32)) {
         let progress = Progress {
-            evaluator: self.identity.evaluator.clone(),
-            run: job.run.clone(),
-            incarnation: job.incarnation,
-            job: job.id,
-            step: job.step,
-            episodes_done,
-            episodes_total: job.seeds.len() as u32,
             steps_done,
+            episodes_done,
             environment_steps: self.metrics.environment_steps.get(),
             episodes: self.metrics.episodes.get(),
-            proof: Hash::of(&[]),
+            ..Progress::of(job, self.identity.evaluator.clone())
         };
         let key = keys::progress(&self.run, &self.identity.evaluator);
         let sent = match encode(&progress.signed(&job.lease)) {

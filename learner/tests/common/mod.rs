@@ -1,6 +1,6 @@
 //! What made-up evaluators send.
 
-use quad_protocol::{EpisodeScore, Hash, Job, Name, Progress, ScoreReport};
+use quad_protocol::{EpisodeScore, Job, Name, Progress, ScoreReport};
 
 pub fn name(text: &str) -> Name {
     Name::new(text).unwrap()
@@ -24,18 +24,5 @@ pub fn full_report(job: &Job, evaluator: &str) -> ScoreReport {
 
 /// Of so many environment steps, with its proof.
 pub fn progress(job: &Job, evaluator: &str, steps_done: u64) -> Progress {
-    Progress {
-        evaluator: name(evaluator),
-        run: job.run.clone(),
-        incarnation: job.incarnation,
-        job: job.id,
-        step: job.step,
-        episodes_done: 0,
-        episodes_total: job.seeds.len() as u32,
-        steps_done,
-        environment_steps: 10,
-        episodes: 1,
-        proof: Hash::of(b"none"),
-    }
-    .signed(&job.lease)
+    Progress { steps_done, environment_steps: 10, episodes: 1, ..Progress::of(job, name(evaluator)) }.signed(&job.lease)
 }
