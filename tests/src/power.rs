@@ -108,9 +108,10 @@ fn entry_line(entry: &fs::DirEntry) -> io::Result<String> {
     Ok(format!("{kind} {} {}\n", identity(&entry.path())?, entry.file_name().to_string_lossy()))
 }
 
-/// What stays the same when a file is renamed, and is another for another file. A number alone is given again.
+/// What stays the same when a file is renamed, and is another for another file. A number alone is given again, but some
+/// filesystems know no more; there, a new file that was never synchronised may be left with the contents of a former one.
 fn identity(path: &Path) -> io::Result<String> {
     let metadata = fs::symlink_metadata(path)?;
-    let born = metadata.created()?.duration_since(UNIX_EPOCH).map_err(io::Error::other)?;
-    Ok(format!("{}-{}", metadata.ino(), born.as_nanos()))
+    let born = metadata.created().ok().and_then(|time| time.duration_since(UNIX_EPOCH).ok());
+    Ok(format!("{}-{}", metadata.ino(), born.unwrap_or_default().as_nanos()))
 }
