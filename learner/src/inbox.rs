@@ -1,5 +1,5 @@
 //! A queue from Zenoh's threads to the thread that owns the state. A callback that worked or waited would delay every
-//! other key of the session, so it only puts the message into this queue, which refuses it when it is full.
+//! other key of the connection, so it only puts the message into this queue, which refuses it when it is full.
 
 use std::sync::Arc;
 use std::sync::atomic::{AtomicUsize, Ordering};

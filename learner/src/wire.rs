@@ -1,4 +1,5 @@
-//! Everything the learner declares on Zenoh, in one place. The callbacks only put messages into inboxes.
+//! Everything the learner declares on Zenoh, in one place. The callbacks only put messages into inboxes, and make connections
+//! wait that send too many.
 
 mod flood;
 mod twin;
@@ -121,8 +122,15 @@ impl Wire {
         let token = token.map_err(zenoh_error)?;
         // Two that start at once may both have seen nobody.
         let twins = twin::watch(&session, &life, hub).await?;
-        let _subscribers = [progress, evaluators, twins];
-        Ok(Self { session, replies, flood, _queryables: queryables, _subscribers, _strays: strays, _token: token })
+        Ok(Self {
+            session,
+            replies,
+            flood,
+            _queryables: queryables,
+            _subscribers: [progress, evaluators, twins],
+            _strays: strays,
+            _token: token,
+        })
     }
 
     /// Closes the session; answers that were sent before are still delivered to whoever reads them.

@@ -95,10 +95,10 @@ static CORES: tokio::sync::Mutex<()> = tokio::sync::Mutex::const_new(());
 
 #[tokio::test(flavor = "multi_thread")]
 async fn nonsense_on_every_key_is_counted_and_survived() {
+    let _alone = CORES.lock().await;
     let scratch = Scratch::new();
     let endpoint = format!("tcp/127.0.0.1:{}", free_port());
     let session = router(&endpoint).await;
-    let _alone = CORES.lock().await;
     let endless = Setting { steps: 100_000_000, eval_interval: 500, ..Setting::default() };
     let mut learner = scratch.learner_with("run", endless, &["--connect", &endpoint]);
     let mut evaluator = scratch.evaluator("brave", &endpoint);
