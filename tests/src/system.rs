@@ -93,7 +93,12 @@ pub struct Scratch {
 impl Scratch {
     /// Makes it, with a dataset of a few thousand made-up transitions.
     pub fn new() -> Scratch {
-        let folder = tempfile::tempdir().expect("there is room for a scratch folder");
+        Self::inside(&std::env::temp_dir())
+    }
+
+    /// The same inside of that folder.
+    pub fn inside(parent: &Path) -> Scratch {
+        let folder = tempfile::tempdir_in(parent).expect("there is room for a scratch folder");
         let written = folder.path().join("written.hdf5");
         write_dataset(&written);
         // HDF5 locks the file it writes, and every process that another test starts meanwhile inherits the lock for as

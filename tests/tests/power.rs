@@ -40,7 +40,10 @@ struct System {
 
 impl System {
     fn start() -> System {
-        let scratch = Scratch::new();
+        // Beside the test's program: where a container keeps temporary files, its filesystem may fail when somebody who writes
+        // is killed.
+        let program = std::env::current_exe().unwrap();
+        let scratch = Scratch::inside(program.parent().unwrap());
         let disk = Disk::new(scratch.path());
         let endpoint = format!("tcp/127.0.0.1:{}", free_port());
         let runtime = Runtime::new().unwrap();
