@@ -10,6 +10,7 @@ mod scores;
 use std::iter;
 use std::ops::ControlFlow;
 use std::sync::mpsc::Sender;
+use std::thread;
 use std::time::{Duration, Instant};
 
 use quad_protocol::{
@@ -37,6 +38,9 @@ use scores::Delivered;
 const TICK: Duration = Duration::from_millis(250);
 /// Most messages that are handled before the new scores in them go to the disk.
 const MOST_TOGETHER: usize = 256;
+/// After some messages, the next ones are left to gather for so long. To wake this thread, and those that its answers wake,
+/// takes more of a processor that training needs than what they then do.
+const GATHER: Duration = Duration::from_millis(10);
 
 /// Messages to the thread.
 #[derive(Debug)]
@@ -121,6 +125,7 @@ impl Hub {
         let mut ticked = Instant::now();
         while let Ok(event) = messages.next(TICK) {
             beat.alive();
+            let idle = event.is_none();
             if self.handle_together(event, messages).is_break() {
                 return self.finish(messages);
             }
@@ -130,6 +135,9 @@ impl Hub {
                 self.metrics.evaluation.episodes_missing.set(self.scoreboard.missing().len() as i64);
             }
             self.metrics.evaluation.episodes_pending.set(self.scoreboard.pending() as i64);
+            if !idle {
+                thread::sleep(GATHER);
+            }
         }
     }
 

@@ -86,7 +86,34 @@ struct State {
     waiting: VecDeque<Task>,
     /// Of the answers that are being sent.
     busy: Vec<Asker>,
+    /// Threads that sleep until they are called.
+    asleep: usize,
+    /// One was called, and will look at all that waits.
+    called: bool,
+    /// One sleeps for a short time only: for queries that may be dropped then, and for what a thread that waits for its peer
+    /// has left.
+    timed: bool,
     closed: bool,
+}
+
+impl State {
+    /// The first that may be worked on now.
+    fn next(&self) -> Option<usize> {
+        let now = Instant::now();
+        self.waiting.iter().position(|task| {
+            let threads = self.busy.iter().filter(|asker| **asker == task.asker).count();
+            threads < task.asker.most_threads() && (task.not_before <= now || self.closed)
+        })
+    }
+
+    /// Whether a thread has to be called for a new task. To wake one costs more than to send an answer, so one is not if
+    /// another will come by.
+    fn calls(&mut self) -> bool {
+        let all_asleep = self.asleep + usize::from(self.timed) == THREADS;
+        let calls = !self.called && (all_asleep || !self.timed);
+        self.called |= calls;
+        calls
+    }
 }
 
 struct Shared {
@@ -148,8 +175,10 @@ impl Replies {
         let most = if task.asker == Asker::Nobody { MOST_DROPPED } else { MOST_WAITING_OF_ONE };
         if state.waiting.len() < MOST_WAITING && of_one < most {
             state.waiting.push_back(task);
-            drop(state);
-            self.shared.work.notify_one();
+            if state.calls() {
+                drop(state);
+                self.shared.work.notify_one();
+            }
             return;
         }
         drop(state);
@@ -172,27 +201,31 @@ impl Shared {
         stay_in_background();
         let mut state = self.lock();
         loop {
-            let now = Instant::now();
-            let State { waiting, busy, closed } = &mut *state;
-            let may_start = |task: &Task| {
-                let threads = busy.iter().filter(|asker| **asker == task.asker).count();
-                threads < task.asker.most_threads() && (task.not_before <= now || *closed)
-            };
-            let next = waiting.iter().position(may_start).and_then(|place| waiting.remove(place));
+            state.called = false;
+            let next = state.next().and_then(|place| state.waiting.remove(place));
             let Some(Task { asker, query, work, .. }) = next else {
-                if *closed {
+                if state.closed {
                     return;
                 }
-                if waiting.is_empty() && busy.is_empty() {
+                if state.waiting.is_empty() && state.busy.is_empty() {
                     self.idle.notify_all();
                 }
-                state = match waiting.is_empty() {
-                    true => self.work.wait(state).unwrap_or_else(PoisonError::into_inner),
-                    false => self.work.wait_timeout(state, GRACE).unwrap_or_else(PoisonError::into_inner).0,
-                };
+                if state.waiting.is_empty() || state.timed {
+                    state.asleep += 1;
+                    state = self.work.wait(state).unwrap_or_else(PoisonError::into_inner);
+                    state.asleep -= 1;
+                } else {
+                    state.timed = true;
+                    state = self.work.wait_timeout(state, GRACE).unwrap_or_else(PoisonError::into_inner).0;
+                    state.timed = false;
+                }
                 continue;
             };
-            busy.push(asker.clone());
+            state.busy.push(asker.clone());
+            // What comes next does not wait for this one's peer.
+            if state.next().is_some() && state.calls() {
+                self.work.notify_one();
+            }
             drop(state);
             let answered = match work {
                 Some(work) => {

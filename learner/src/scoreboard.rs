@@ -3,14 +3,17 @@
 //! An evaluation is a snapshot (step and hash) with a list of episode seeds. Jobs hand out some of its episodes under a
 //! lease that progress extends; when the lease runs out or the evaluator leaves, they are handed out again, unless that has
 //! happened too often. For each (step, seed) the first score that is delivered counts, and no other, whoever delivers it. The
-//! current time is an argument, for tests. `job` has the rules of a lease, `refusal` why a message is not accepted.
+//! current time is an argument, for tests. `job` has the rules of a lease, `screen` those of a
+//! report, `refusal` why a message is not accepted.
 
 mod audit;
 mod evaluation;
 mod job;
+mod jobs;
 mod refusal;
+mod screen;
 
-use std::collections::{BTreeMap, BTreeSet};
+use std::collections::BTreeMap;
 use std::time::{Duration, Instant};
 
 use quad_dataset::Task;
@@ -20,18 +23,20 @@ pub use audit::Audited;
 use audit::Audits;
 use evaluation::Evaluation;
 use job::OpenJob;
+use jobs::OpenJobs;
 pub use refusal::Refusal;
 use refusal::require;
+pub use screen::Screened;
 
 use crate::resume::Earlier;
 
 /// After this time an evaluator asks again when there was no job for it, or after this time for each evaluator that there is
 /// if that is longer, so that hundreds which have nothing to do do not keep the learner busy. A new snapshot wakes them all.
-const ASK_AGAIN: [Duration; 2] = [Duration::from_millis(500), Duration::from_millis(10)];
-/// The same for an evaluator that does not have the run's environment.
+const ASK_AGAIN: [Duration; 2] = [Duration::from_millis(500), Duration::from_millis(50)];
+/// The same for how often progress is told: all together send fifty messages a second.
+const TELL_PROGRESS: [Duration; 2] = [Duration::from_secs(1), Duration::from_millis(20)];
+/// After this time an evaluator asks again that does not have the run's environment.
 const NOT_FOR_YOU: Duration = Duration::from_secs(10);
-/// Largest relative difference between a score and the one computed from its return; it allows for rounding only.
-const SCORE_TOLERANCE: f64 = 1e-6;
 
 /// What stays the same for all evaluations of a run.
 #[derive(Clone, Debug)]
@@ -59,8 +64,7 @@ pub struct Rules {
 pub struct Scoreboard {
     rules: Rules,
     evaluations: BTreeMap<u64, Evaluation>,
-    /// The jobs that are open.
-    jobs: BTreeMap<u64, OpenJob>,
+    jobs: OpenJobs,
     next_job: u64,
     /// Scores of an earlier life, by step, whose evaluation has not been asked for in this one.
     earlier: BTreeMap<u64, Earlier>,
@@ -77,15 +81,6 @@ pub struct OtherWeights {
     pub found: Hash,
     /// Hash of those that have scores.
     pub scored: String,
-}
-
-/// A report that passed every check, split into new scores and scores that are recorded already.
-#[derive(Clone, Debug, PartialEq)]
-pub struct Screened {
-    /// Episodes that had no score yet.
-    pub new: Vec<EpisodeScore>,
-    /// Number of episodes that had a score already.
-    pub duplicates: u32,
 }
 
 /// What a report completed.
@@ -127,7 +122,7 @@ impl Scoreboard {
     /// An empty one.
     pub fn new(rules: Rules) -> Self {
         let audits = Audits::new(rules.audit);
-        let (evaluations, jobs, earlier) = (BTreeMap::new(), BTreeMap::new(), BTreeMap::new());
+        let (evaluations, jobs, earlier) = (BTreeMap::new(), OpenJobs::default(), BTreeMap::new());
         Self { rules, evaluations, jobs, next_job: 1, earlier, audits }
     }
 
@@ -191,13 +186,13 @@ impl Scoreboard {
     pub fn claim(&mut self, claim: Claim<'_>, now: Instant) -> JobReply {
         let incarnation = self.rules.incarnation;
         let wait = |time: Duration| JobReply::Wait { incarnation, milliseconds: time.as_millis() as u64 };
-        let later = wait(ASK_AGAIN[0].max(ASK_AGAIN[1] * claim.present as u32));
+        let later = wait(among(claim.present, ASK_AGAIN));
         if !claim.environments.contains(&self.rules.task.environment) {
             return wait(NOT_FOR_YOU);
         }
-        if let Some((&id, job)) = self.jobs.iter().find(|(_, job)| job.evaluator == *claim.evaluator) {
+        if let Some((id, job)) = self.jobs.of(claim.evaluator) {
             return match job.attempt == claim.attempt {
-                true => self.message(id, job).map_or(later, JobReply::Job),
+                true => self.message(id, job, claim.present).map_or(later, JobReply::Job),
                 false => later,
             };
         }
@@ -206,7 +201,7 @@ impl Scoreboard {
         let audit = self.audits.hand_out(id, claim.evaluator, claim.precision, most);
         let Some(episodes) = audit.or_else(|| self.hand_out(id, most)) else { return later };
         let job = OpenJob::new(claim.evaluator.clone(), claim.attempt, episodes, self.rules.lease, now);
-        let message = self.message(id, &job);
+        let message = self.message(id, &job, claim.present);
         self.jobs.insert(id, job);
         self.next_job += 1;
         message.map_or(later, JobReply::Job)
@@ -220,8 +215,8 @@ impl Scoreboard {
         })
     }
 
-    /// The job as it is handed out.
-    fn message(&self, id: u64, job: &OpenJob) -> Option<Job> {
+    /// The job as it is handed out, to one of several evaluators.
+    fn message(&self, id: u64, job: &OpenJob, present: usize) -> Option<Job> {
         let rules = &self.rules;
         Some(Job {
             id,
@@ -234,15 +229,16 @@ impl Scoreboard {
             instance: rules.instance,
             seeds: job.seeds.clone(),
             candidates: rules.candidates,
-            lease_milliseconds: rules.lease.as_millis() as u64,
+            // Often enough to keep the lease when a message is lost.
+            progress_milliseconds: among(present, TELL_PROGRESS).min(rules.lease / 3).as_millis() as u64,
         })
     }
 
     /// Takes a job back from an evaluator that will not do it; says whether it had it.
     pub fn hand_back(&mut self, evaluator: &Name, id: u64, lease: &Lease) -> bool {
-        let has = self.jobs.get(&id).is_some_and(|job| job.evaluator == *evaluator && job.lease == *lease);
-        if has && let Some(job) = self.jobs.remove(&id) {
-            self.release(id, &job, false);
+        let has = self.jobs.get(id).is_some_and(|job| job.evaluator == *evaluator && job.lease == *lease);
+        if has {
+            self.release(id, false);
         }
         has
     }
@@ -251,85 +247,52 @@ impl Scoreboard {
     pub fn progress(&mut self, progress: &Progress, now: Instant) -> Result<(), Refusal> {
         require(progress.run == self.rules.run, Refusal::Run)?;
         require(progress.incarnation == self.rules.incarnation, Refusal::Incarnation)?;
-        let job = self.jobs.get_mut(&progress.job).ok_or(Refusal::Job)?;
+        let job = self.jobs.get_mut(progress.job).ok_or(Refusal::Job)?;
         job.advance(progress, self.rules.lease, now)
-    }
-
-    /// Checks a report against the evaluation that it is about, and says what in it is new. Changes nothing: the caller writes
-    /// the new scores down first, then calls [`record`](Self::record).
-    pub fn screen(&self, report: &ScoreReport) -> Result<Screened, Refusal> {
-        require(report.run == self.rules.run, Refusal::Run)?;
-        let evaluation = self.evaluations.get(&report.step).ok_or(Refusal::Step)?;
-        require(evaluation.weights == report.weights, Refusal::Weights)?;
-        let mut screened = Screened { new: Vec::new(), duplicates: 0 };
-        let mut seen = BTreeSet::new();
-        for score in &report.episodes {
-            require(seen.insert(score.seed), Refusal::Seed(score.seed))?;
-            let is_scored = evaluation.is_scored(score.seed).ok_or(Refusal::Seed(score.seed))?;
-            require(self.is_possible(score), Refusal::Episode(score.seed))?;
-            match is_scored {
-                true => screened.duplicates += 1,
-                false => screened.new.push(*score),
-            }
-        }
-        Ok(screened)
-    }
-
-    /// Checks a report that says why there are no scores. It ends the run, so only whoever has the job may send it.
-    pub fn screen_complaint(&self, report: &ScoreReport) -> Result<(), Refusal> {
-        self.screen(report)?;
-        require(report.incarnation == self.rules.incarnation, Refusal::Incarnation)?;
-        let job = self.jobs.get(&report.job).ok_or(Refusal::Job)?;
-        require(job.evaluator == report.evaluator, Refusal::Evaluator)?;
-        require(job.step == report.step, Refusal::Step)?;
-        let signed = report.cannot_act.as_ref().is_some_and(|reason| reason.is_signed(report.weights, &job.lease));
-        require(signed, Refusal::Proof)
-    }
-
-    fn is_possible(&self, score: &EpisodeScore) -> bool {
-        let task = &self.rules.task;
-        let expected = task.score(score.episode_return);
-        let longest = task.max_episode_steps().unwrap_or(usize::MAX);
-        let length_fits = (1..=longest).contains(&(score.length as usize));
-        length_fits
-            && expected.is_finite()
-            && (score.score - expected).abs() <= SCORE_TOLERANCE * expected.abs().max(1.0)
     }
 
     /// Counts the new scores of a report that [`screen`](Self::screen) let pass.
     pub fn record(&mut self, report: &ScoreReport, new: &[EpisodeScore]) -> Recorded {
         let Some(evaluation) = self.evaluations.get_mut(&report.step) else { return Recorded::default() };
-        evaluation.score(new);
-        let audited = self.audits.compare(report);
+        // The report's own job, and others that had some of its episodes because it came late.
+        let mut jobs = evaluation.score(new);
+        let (audited, checked) = self.audits.compare(report);
+        jobs.extend(checked);
         self.audits.add(report, new);
+        let (audits, open) = (&self.audits, &mut self.jobs);
         let done = |seed| evaluation.is_scored(seed) == Some(true);
-        let (open, audits) = (self.jobs.len(), &self.audits);
-        self.jobs
-            .retain(|&id, job| job.step != report.step || !job.seeds.iter().copied().all(done) || audits.is_open(id));
+        jobs.retain(|&id| {
+            let complete = open.get(id).is_some_and(|job| job.seeds.iter().copied().all(done)) && !audits.is_open(id);
+            complete && open.remove(id).is_some()
+        });
         let evaluation_completed = if new.is_empty() { None } else { evaluation.scores() };
-        Recorded { jobs_completed: open - self.jobs.len(), evaluation_completed, audited }
+        Recorded { jobs_completed: jobs.len(), evaluation_completed, audited }
     }
 
     /// Takes back the jobs whose lease has run out.
     pub fn expire(&mut self, now: Instant) -> Lost {
-        self.take_back(|job| job.is_lost(now))
+        self.take_back(self.jobs.lost(now))
     }
 
     /// Takes back the job of an evaluator that is gone.
     pub fn evaluator_gone(&mut self, evaluator: &Name) -> Lost {
-        self.take_back(|job| job.evaluator == *evaluator)
+        self.take_back(self.jobs.of(evaluator).map(|(id, _)| id).into_iter().collect())
     }
 
-    fn take_back(&mut self, lost: impl Fn(&OpenJob) -> bool) -> Lost {
-        let jobs: Vec<(u64, OpenJob)> = self.jobs.extract_if(.., |_, job| lost(job)).collect();
-        let given_up = jobs.iter().flat_map(|(id, job)| self.release(*id, job, true)).collect();
-        Lost { jobs: jobs.len(), given_up }
+    fn take_back(&mut self, jobs: Vec<u64>) -> Lost {
+        Lost { jobs: jobs.len(), given_up: jobs.into_iter().flat_map(|id| self.release(id, true)).collect() }
     }
 
-    /// Lets the episodes of a job that has ended wait for the next; gives those that were lost too often.
-    fn release(&mut self, id: u64, job: &OpenJob, lost: bool) -> Vec<(u64, u64)> {
+    /// Ends a job, and lets its episodes wait for the next one; gives those that were lost too often.
+    fn release(&mut self, id: u64, lost: bool) -> Vec<(u64, u64)> {
         self.audits.release(id);
-        let given_up = self.evaluations.get_mut(&job.step).map(|evaluation| evaluation.take_back(id, lost));
-        given_up.unwrap_or_default().into_iter().map(|seed| (job.step, seed)).collect()
+        let Some(OpenJob { step, seeds, .. }) = self.jobs.remove(id) else { return Vec::new() };
+        let given_up = self.evaluations.get_mut(&step).map(|evaluation| evaluation.take_back(id, &seeds, lost));
+        given_up.unwrap_or_default().into_iter().map(|seed| (step, seed)).collect()
     }
+}
+
+/// How often one of `present` evaluators does something: at least this often, and no more often than all of them may.
+fn among(present: usize, [least, for_each]: [Duration; 2]) -> Duration {
+    least.max(for_each * u32::try_from(present).unwrap_or(u32::MAX))
 }

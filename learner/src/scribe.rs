@@ -2,6 +2,8 @@
 //! synchronisation. A slow disk delays the thanks for scores, and nothing else: jobs go out meanwhile.
 
 use std::sync::mpsc::{Receiver, RecvTimeoutError};
+use std::thread;
+use std::time::Duration;
 
 use quad_service::Beat;
 use tracing::error;
@@ -9,6 +11,9 @@ use tracing::error;
 use crate::hub::Event;
 use crate::inbox::Inbox;
 use crate::run_dir::{AuditLine, Log, ScoreLine};
+
+/// After a write, scores are left to gather for so long: to synchronise a file takes much of a processor, too.
+const GATHER: Duration = Duration::from_millis(50);
 
 /// What is to be written.
 #[derive(Debug)]
@@ -44,6 +49,7 @@ impl Scribe {
                         error!(%error, "scores could not be saved");
                     }
                     self.hub.send(Event::Written(written.map_err(|error| error.to_string())));
+                    thread::sleep(GATHER);
                 }
                 Ok(Lines::Audits(lines)) => {
                     if let Some(Err(error)) = self.audits.as_mut().map(|log| log.append(&lines)) {

@@ -32,7 +32,7 @@ use crate::trainer::{Trainer, TrainingResult};
 
 /// Episodes in one job: two evaluators share an evaluation of ten.
 const JOB_EPISODES: usize = 5;
-/// An evaluator tells its progress about once a second, and Zenoh notices a lost one after about 5 s.
+/// An evaluator tells its progress three times meanwhile or more often, and Zenoh notices a lost one after about 5 s.
 const LEASE: Duration = Duration::from_secs(15);
 /// A thread that answers others, or writes to the disk, is stuck if it has said nothing for so long.
 const STUCK: Duration = Duration::from_secs(30);

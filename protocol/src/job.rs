@@ -85,8 +85,8 @@ pub struct Job {
     pub seeds: Vec<u64>,
     /// Actions that the policy draws in each state before it takes the best (the paper's N_a).
     pub candidates: u32,
-    /// After so many milliseconds without progress the job goes to another evaluator.
-    pub lease_milliseconds: u64,
+    /// Progress is to be told this often; after three times as long without any, the job may go to another evaluator.
+    pub progress_milliseconds: u64,
 }
 
 impl Job {

@@ -77,7 +77,7 @@ fn claimed_lengths_are_not_believed() {
         instance: 4,
         seeds: vec![1, 2, 3],
         candidates: 10,
-        lease_milliseconds: 1000,
+        progress_milliseconds: 300,
     };
     claim_too_much(&Snapshot { run: name(), incarnation: 1, step: 2, schema, hash, tensors });
     let environments = vec![environment(); 3];

@@ -84,7 +84,7 @@ fn job_request() -> impl Strategy<Value = JobRequest> {
 fn job_reply() -> impl Strategy<Value = JobReply> {
     let job = (any::<[u64; 5]>(), lease(), name(), hash(), text(), vec(any::<u64>(), 0..100), any::<u32>()).prop_map(
         |(
-            [id, incarnation, step, instance, lease_milliseconds],
+            [id, incarnation, step, instance, progress_milliseconds],
             lease,
             run,
             weights,
@@ -103,7 +103,7 @@ fn job_reply() -> impl Strategy<Value = JobReply> {
                 instance,
                 seeds,
                 candidates,
-                lease_milliseconds,
+                progress_milliseconds,
             })
         },
     );

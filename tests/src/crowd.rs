@@ -1,7 +1,7 @@
 //! Evaluators that do everything on the wire and nothing else: they claim, report progress and deliver scores that they made
 //! up. Hundreds of them fit into one test.
 
-use std::sync::atomic::{AtomicU8, Ordering::Relaxed};
+use std::sync::atomic::{AtomicU8, AtomicUsize, Ordering::Relaxed};
 use std::sync::{Arc, Mutex};
 use std::time::{Duration, Instant};
 
@@ -19,13 +19,16 @@ use zenoh::{Config, Session};
 /// An evaluator's patience with its learner.
 const ANSWER: Duration = Duration::from_secs(5);
 
+/// A job at a real pace takes this long, or half of it.
+pub const LONGEST_JOB: Duration = Duration::from_secs(8);
+
 /// What a crowd does.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 #[repr(u8)]
 pub enum Pace {
     /// Nothing but staying connected.
     Still,
-    /// A job takes some seconds, with progress each second, as with real episodes.
+    /// A job takes some seconds, with progress meanwhile, as with real episodes.
     Real,
     /// A job takes no time.
     Instant,
@@ -38,8 +41,17 @@ pub struct Measured {
     pub claims: Vec<Duration>,
     /// How long each acknowledgement of scores took.
     pub reports: Vec<Duration>,
-    /// Questions without an answer.
+    /// Claims without an answer.
     pub unanswered: usize,
+}
+
+impl Measured {
+    /// Adds what was measured later.
+    pub fn add(&mut self, later: Measured) {
+        self.claims.extend(later.claims);
+        self.reports.extend(later.reports);
+        self.unanswered += later.unanswered;
+    }
 }
 
 /// Many light evaluators of one run.
@@ -51,13 +63,20 @@ pub struct Crowd {
 struct Shared {
     run: Name,
     pace: AtomicU8,
+    /// Evaluators that have a job.
+    busy: AtomicUsize,
     measured: Mutex<Measured>,
 }
 
 impl Crowd {
     /// Connects `count` evaluators of `run`, each with a session of its own, to `endpoint`.
     pub async fn connect(count: usize, run: &Name, endpoint: &str) -> Crowd {
-        let shared = Arc::new(Shared { run: run.clone(), pace: AtomicU8::new(0), measured: Mutex::default() });
+        let shared = Arc::new(Shared {
+            run: run.clone(),
+            pace: AtomicU8::new(0),
+            busy: AtomicUsize::new(0),
+            measured: Mutex::default(),
+        });
         let mut tasks = JoinSet::new();
         for number in 0..count {
             let member = Member::connect(number, endpoint, shared.clone()).await;
@@ -69,6 +88,11 @@ impl Crowd {
     /// From now on, everybody does this. A job that was begun is still done.
     pub fn set(&self, pace: Pace) {
         self.shared.pace.store(pace as u8, Relaxed);
+    }
+
+    /// How many have a job.
+    pub fn busy(&self) -> usize {
+        self.shared.busy.load(Relaxed)
     }
 
     /// What was measured since this was last called.
@@ -122,10 +146,15 @@ impl Member {
                 continue;
             }
             match self.claim().await {
-                Some(JobReply::Job(job)) => self.score(job).await,
+                Some(JobReply::Job(job)) => {
+                    self.shared.busy.fetch_add(1, Relaxed);
+                    self.score(job).await;
+                    self.shared.busy.fetch_sub(1, Relaxed);
+                }
                 Some(JobReply::Wait { milliseconds, .. }) => {
                     // A new snapshot wakes a real evaluator, too.
-                    timeout(Duration::from_millis(milliseconds), woken.notified()).await.ok();
+                    let wait = Duration::from_millis(milliseconds).mul_f64(self.random.random_range(0.5..1.0));
+                    timeout(wait, woken.notified()).await.ok();
                 }
                 _ => {}
             }
@@ -136,16 +165,25 @@ impl Member {
         let (environments, precision) = (vec!["hopper".to_owned()], Name::new("f32").expect("a name"));
         let (evaluator, attempt) = (self.name.clone(), self.random.random());
         let claim = JobRequest::Claim { evaluator, attempt, environments, precision };
-        let (answer, took) = self.ask(keys::jobs(&self.shared.run), &claim).await?;
+        let Some((answer, took)) = self.ask(keys::jobs(&self.shared.run), &claim).await else {
+            self.shared.note(|measured| measured.unanswered += 1);
+            return None;
+        };
         self.shared.note(|measured| measured.claims.push(took));
         Some(answer)
     }
 
     async fn score(&mut self, job: Job) {
         if self.shared.pace() == Pace::Real {
-            for second in 0..self.random.random_range(4..8) {
-                self.progress(&job, second).await;
-                sleep(Duration::from_millis(self.random.random_range(900..1100))).await;
+            let mut left = self.random.random_range(LONGEST_JOB / 2..LONGEST_JOB);
+            let every = Duration::from_millis(job.progress_milliseconds);
+            for steps_done in 0.. {
+                self.progress(&job, steps_done).await;
+                sleep(every.min(left)).await;
+                left = left.saturating_sub(every);
+                if left.is_zero() {
+                    break;
+                }
             }
         }
         let spec = environment::find("hopper").expect("hopper is known");
@@ -180,10 +218,7 @@ impl Member {
         let get = self.session.get(key).payload(encode(question).expect("it is small")).timeout(ANSWER);
         let get = get.target(QueryTarget::All).consolidation(ConsolidationMode::None).await;
         let reply = get.expect("the session is open").recv_async().await.ok();
-        let Some(Ok(sample)) = reply.map(|reply| reply.into_result()) else {
-            self.shared.note(|measured| measured.unanswered += 1);
-            return None;
-        };
+        let sample = reply?.into_result().ok()?;
         Some((decode(&sample.payload().to_bytes()).expect("the learner's answer"), begin.elapsed()))
     }
 }

@@ -9,7 +9,7 @@ use crate::http;
 use crate::system::Learner;
 
 /// After a change between quiet and loud, this long is not counted.
-const SETTLE: Duration = Duration::from_millis(500);
+pub const SETTLE: Duration = Duration::from_millis(500);
 
 /// What was found in all phases of one kind.
 #[derive(Clone, Copy, Debug, Default)]

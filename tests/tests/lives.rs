@@ -68,7 +68,7 @@ async fn life(
         instance: 1,
         seeds: vec![1, 2, 3],
         candidates: 1,
-        lease_milliseconds: 1000,
+        progress_milliseconds: 300,
     };
     let (heard_jobs, lease) = (heard.clone(), job.lease.clone());
     let jobs = session.declare_queryable(keys::jobs(&run)).callback(move |query| {

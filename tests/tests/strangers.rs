@@ -54,7 +54,7 @@ async fn haunt(session: &Session) -> impl Sized {
             instance: 1,
             seeds: vec![1, 2],
             candidates,
-            lease_milliseconds: 1000,
+            progress_milliseconds: 300,
         }))
         .unwrap()
     };

@@ -218,7 +218,7 @@ mod tests {
             instance: 1,
             seeds: (0..episodes as u64).collect(),
             candidates,
-            lease_milliseconds: 1000,
+            progress_milliseconds: 300,
         }
     }
 

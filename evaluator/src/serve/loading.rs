@@ -148,7 +148,7 @@ mod tests {
             instance: 1,
             seeds: vec![1],
             candidates: 1,
-            lease_milliseconds: 1000,
+            progress_milliseconds: 300,
         };
         (job, Snapshot { run, incarnation: 3, step: 100, schema, hash: weights, tensors })
     }

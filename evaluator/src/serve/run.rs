@@ -28,7 +28,7 @@ const ANSWER_TIMEOUT: Duration = Duration::from_secs(5);
 const WEIGHTS_TIMEOUT: Duration = Duration::from_secs(30);
 /// Bounds of the pause that a learner without work may ask for: one too short would be a flood of questions, one too
 /// long would lose the evaluator.
-const WAIT: [Duration; 2] = [Duration::from_millis(20), Duration::from_secs(5)];
+const WAIT: [Duration; 2] = [Duration::from_millis(20), Duration::from_secs(30)];
 
 /// Who an evaluator is to every learner.
 #[derive(Clone)]
@@ -167,6 +167,8 @@ impl RunClient {
             JobReply::Wait { milliseconds, .. } => {
                 self.complaint.clear();
                 let wait = Duration::from_millis(milliseconds).clamp(WAIT[0], WAIT[1]);
+                // Those that a snapshot has woken together do not come back together.
+                let wait = wait.mul_f64(rand::random_range(0.5..1.0));
                 self.standing.rest_until(Instant::now() + wait);
                 Ok(None)
             }

@@ -1,7 +1,7 @@
 //! Audits: a share of the episodes is scored a second time, by another evaluator of the same precision. The same weights and
 //! seed give the same score, bit for bit, so a difference is a broken machine, another simulator, or a lie (BOINC's idea).
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 
 use quad_protocol::{EpisodeScore, Hash, Name, ScoreReport};
 
@@ -81,21 +81,22 @@ impl Audits {
         self.waiting.values().any(|waiting| waiting.job == Some(job))
     }
 
-    /// Compares what a report has scored again with what was scored first.
-    pub fn compare(&mut self, report: &ScoreReport) -> Vec<Audited> {
-        let mut audited = Vec::new();
+    /// Compares what a report has scored again with what was scored first; gives the jobs, too, that were to do so.
+    pub fn compare(&mut self, report: &ScoreReport) -> (Vec<Audited>, BTreeSet<u64>) {
+        let (mut audited, mut jobs) = (Vec::new(), BTreeSet::new());
         for second in &report.episodes {
             let key = (report.step, second.seed);
             let by_another =
                 |first: &Waiting| first.evaluator != report.evaluator && first.precision == report.precision;
             if self.waiting.get(&key).is_some_and(by_another)
-                && let Some(Waiting { first, evaluator, .. }) = self.waiting.remove(&key)
+                && let Some(Waiting { first, evaluator, job, .. }) = self.waiting.remove(&key)
             {
+                jobs.extend(job);
                 let second = (*second, report.evaluator.clone());
                 audited.push(Audited { step: report.step, first: (first, evaluator), second });
             }
         }
-        audited
+        (audited, jobs)
     }
 }
 

@@ -1,6 +1,6 @@
 //! An evaluation: the snapshot that it is of, and how far each of its episodes is.
 
-use std::collections::HashMap;
+use std::collections::{BTreeSet, HashMap};
 use std::mem;
 
 use quad_protocol::{EpisodeScore, Hash};
@@ -14,8 +14,9 @@ pub(super) struct Evaluation {
     episodes: Vec<Episode>,
     /// Where among them a seed is.
     places: HashMap<u64, usize>,
-    /// How many of them wait, and how many are handed out. Complete evaluations become many, and are passed over.
-    waiting: usize,
+    /// Which of them wait, and which are given up. Complete evaluations become many, and are passed over.
+    waiting: BTreeSet<usize>,
+    given_up: BTreeSet<usize>,
     handed_out: usize,
 }
 
@@ -47,55 +48,55 @@ impl Evaluation {
         };
         let episodes: Vec<Episode> = seeds.iter().map(episode).collect();
         let places = seeds.iter().enumerate().map(|(place, &seed)| (seed, place)).collect();
-        let waiting = episodes.iter().filter(|episode| matches!(episode.state, EpisodeState::Waiting)).count();
-        Self { weights, episodes, places, waiting, handed_out: 0 }
+        let is_waiting = |&place: &usize| matches!(episodes[place].state, EpisodeState::Waiting);
+        let waiting = (0..episodes.len()).filter(is_waiting).collect();
+        Self { weights, episodes, places, waiting, given_up: BTreeSet::new(), handed_out: 0 }
     }
 
     fn change(&mut self, place: usize, state: EpisodeState) {
-        let before = mem::replace(&mut self.episodes[place].state, state);
-        for (state, change) in [(before, -1), (state, 1)] {
-            match state {
-                EpisodeState::Waiting => self.waiting = self.waiting.saturating_add_signed(change),
-                EpisodeState::HandedOut { .. } => self.handed_out = self.handed_out.saturating_add_signed(change),
-                EpisodeState::GivenUp | EpisodeState::Scored(_) => {}
-            }
+        match mem::replace(&mut self.episodes[place].state, state) {
+            EpisodeState::Waiting => drop(self.waiting.remove(&place)),
+            EpisodeState::HandedOut { .. } => self.handed_out -= 1,
+            EpisodeState::GivenUp => drop(self.given_up.remove(&place)),
+            EpisodeState::Scored(_) => {}
+        }
+        match state {
+            EpisodeState::Waiting => drop(self.waiting.insert(place)),
+            EpisodeState::HandedOut { .. } => self.handed_out += 1,
+            EpisodeState::GivenUp => drop(self.given_up.insert(place)),
+            EpisodeState::Scored(_) => {}
         }
     }
 
     /// Episodes that have no score yet, and may still get one.
     pub fn pending(&self) -> usize {
-        self.waiting + self.handed_out
+        self.waiting.len() + self.handed_out
     }
 
     /// The seeds of those that have no score and are not handed out any more.
     pub fn given_up(&self) -> impl Iterator<Item = u64> {
-        self.episodes.iter().filter(|e| matches!(e.state, EpisodeState::GivenUp)).map(|e| e.seed)
+        self.given_up.iter().map(|&place| self.episodes[place].seed)
     }
 
     /// Hands out some of the episodes that wait; none if there are none.
     pub fn hand_out(&mut self, job: u64, most: usize) -> Vec<u64> {
-        let mut seeds = Vec::new();
-        for place in 0..self.episodes.len() {
-            if self.waiting == 0 || seeds.len() == most {
-                break;
-            }
-            if matches!(self.episodes[place].state, EpisodeState::Waiting) {
-                self.change(place, EpisodeState::HandedOut { job });
-                seeds.push(self.episodes[place].seed);
-            }
+        let places: Vec<usize> = self.waiting.iter().copied().take(most).collect();
+        for &place in &places {
+            self.change(place, EpisodeState::HandedOut { job });
         }
-        seeds
+        places.into_iter().map(|place| self.episodes[place].seed).collect()
     }
 
-    /// Takes the unscored episodes of a job back, from an evaluator that was `lost` with them or not. Gives the seeds of those
-    /// that were lost too often.
-    pub fn take_back(&mut self, job: u64, lost: bool) -> Vec<u64> {
+    /// Takes those of a job's episodes back that have no score yet, from an evaluator that was `lost` with them or not. Gives
+    /// the seeds of those that were lost too often.
+    pub fn take_back(&mut self, job: u64, seeds: &[u64], lost: bool) -> Vec<u64> {
         let mut given_up = Vec::new();
-        for place in 0..self.episodes.len() {
-            let Episode { seed, state, lost: times } = &mut self.episodes[place];
+        for &seed in seeds {
+            let Some(&place) = self.places.get(&seed) else { continue };
+            let Episode { state, lost: times, .. } = &mut self.episodes[place];
             if matches!(state, EpisodeState::HandedOut { job: of } if *of == job) {
                 *times += u32::from(lost);
-                let (seed, hopeless) = (*seed, *times >= MOST_ATTEMPTS);
+                let hopeless = *times >= MOST_ATTEMPTS;
                 given_up.extend(hopeless.then_some(seed));
                 self.change(place, if hopeless { EpisodeState::GivenUp } else { EpisodeState::Waiting });
             }
@@ -103,13 +104,18 @@ impl Evaluation {
         given_up
     }
 
-    /// Counts scores.
-    pub fn score(&mut self, scores: &[EpisodeScore]) {
+    /// Counts scores. Gives the jobs that their episodes were handed out with.
+    pub fn score(&mut self, scores: &[EpisodeScore]) -> BTreeSet<u64> {
+        let mut jobs = BTreeSet::new();
         for score in scores {
             if let Some(&place) = self.places.get(&score.seed) {
+                if let EpisodeState::HandedOut { job } = self.episodes[place].state {
+                    jobs.insert(job);
+                }
                 self.change(place, EpisodeState::Scored(*score));
             }
         }
+        jobs
     }
 
     /// Whether an episode has a score; nothing if there is no such episode.

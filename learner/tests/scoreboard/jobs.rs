@@ -4,7 +4,7 @@ use quad_learner::resume::Earlier;
 use quad_learner::scoreboard::{Claim, Lost};
 use quad_protocol::{JobReply, Lease};
 
-use crate::bench::{Bench, INCARNATION, hash};
+use crate::bench::{Bench, INCARNATION, LEASE, hash};
 use crate::common::{full_report, name, report, score};
 
 #[test]
@@ -16,7 +16,7 @@ fn jobs_go_out_oldest_step_first_and_no_episode_twice() {
         [(1000, vec![1, 2, 3, 4, 5]), (1000, vec![6, 7]), (2000, vec![11, 12, 13, 14, 15]), (2000, vec![16, 17])];
     assert_eq!(handed_out, expected);
     assert_eq!((jobs[0].weights, jobs[2].weights), (hash(1000), hash(2000)));
-    assert_eq!((jobs[0].incarnation, jobs[0].candidates, jobs[0].lease_milliseconds), (INCARNATION, 10, 10_000));
+    assert_eq!((jobs[0].incarnation, jobs[0].candidates), (INCARNATION, 10));
     assert!(jobs[1..].iter().all(|job| job.lease != jobs[0].lease), "each lease is another");
     assert!(matches!(bench.claim("e", 0, 0), JobReply::Wait { milliseconds: 1.., incarnation: INCARNATION }));
     assert_eq!((bench.board.pending(), bench.board.handed_out()), (14, 4));
@@ -55,13 +55,24 @@ fn the_more_have_nothing_to_do_the_less_often_each_asks() {
     for evaluator in ["a", "b", "c", "d"] {
         bench.job(evaluator, 0);
     }
-    for (present, expected) in [(0, 500), (50, 500), (200, 2000), (500, 5000)] {
+    for (present, expected) in [(0, 500), (10, 500), (200, 10_000), (500, 25_000)] {
         bench.present = present;
         let reply = bench.claim("e", 0, 0);
         assert!(
             matches!(reply, JobReply::Wait { milliseconds, .. } if milliseconds == expected),
             "{present}: {reply:?}"
         );
+    }
+}
+
+#[test]
+fn the_more_there_are_the_less_often_each_tells_its_progress() {
+    for (present, expected) in [(0, 1000), (50, 1000), (100, 2000), (500, 3333)] {
+        let mut bench = Bench::new();
+        bench.present = present;
+        let job = bench.job("a", 0);
+        assert_eq!(job.progress_milliseconds, expected, "{present}");
+        assert!(3 * expected <= LEASE.as_millis() as u64, "two messages may be lost");
     }
 }
 

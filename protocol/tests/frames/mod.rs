@@ -25,7 +25,7 @@ pub fn frames() -> Vec<Vec<u8>> {
         instance: 4,
         seeds: vec![1, 2, 3],
         candidates: 10,
-        lease_milliseconds: 1000,
+        progress_milliseconds: 300,
     };
     let progress = Progress {
         evaluator: name(),

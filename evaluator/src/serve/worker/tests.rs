@@ -96,7 +96,7 @@ async fn a_long_job_is_well_and_a_stuck_one_is_not() {
             instance: 1,
             seeds: vec![1, 2],
             candidates: 1,
-            lease_milliseconds: 300,
+            progress_milliseconds: 100,
         };
         let spec = job::check(&job, &run).unwrap();
         let policy = Arc::new(Sleeper { stuck_at, calls: AtomicU32::new(0) });

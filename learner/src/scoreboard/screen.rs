@@ -1,0 +1,63 @@
+//! Which reports are accepted.
+
+use std::collections::BTreeSet;
+
+use quad_protocol::{EpisodeScore, ScoreReport};
+
+use super::Scoreboard;
+use super::refusal::{Refusal, require};
+
+/// Largest relative difference between a score and the one computed from its return; it allows for rounding only.
+const SCORE_TOLERANCE: f64 = 1e-6;
+
+/// A report that passed every check, split into new scores and scores that are recorded already.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Screened {
+    /// Episodes that had no score yet.
+    pub new: Vec<EpisodeScore>,
+    /// Number of episodes that had a score already.
+    pub duplicates: u32,
+}
+
+impl Scoreboard {
+    /// Checks a report against the evaluation that it is about, and says what in it is new. Changes nothing: the caller writes
+    /// the new scores down first, then calls [`record`](Self::record).
+    pub fn screen(&self, report: &ScoreReport) -> Result<Screened, Refusal> {
+        require(report.run == self.rules.run, Refusal::Run)?;
+        let evaluation = self.evaluations.get(&report.step).ok_or(Refusal::Step)?;
+        require(evaluation.weights == report.weights, Refusal::Weights)?;
+        let mut screened = Screened { new: Vec::new(), duplicates: 0 };
+        let mut seen = BTreeSet::new();
+        for score in &report.episodes {
+            require(seen.insert(score.seed), Refusal::Seed(score.seed))?;
+            let is_scored = evaluation.is_scored(score.seed).ok_or(Refusal::Seed(score.seed))?;
+            require(self.is_possible(score), Refusal::Episode(score.seed))?;
+            match is_scored {
+                true => screened.duplicates += 1,
+                false => screened.new.push(*score),
+            }
+        }
+        Ok(screened)
+    }
+
+    /// Checks a report that says why there are no scores. It ends the run, so only whoever has the job may send it.
+    pub fn screen_complaint(&self, report: &ScoreReport) -> Result<(), Refusal> {
+        self.screen(report)?;
+        require(report.incarnation == self.rules.incarnation, Refusal::Incarnation)?;
+        let job = self.jobs.get(report.job).ok_or(Refusal::Job)?;
+        require(job.evaluator == report.evaluator, Refusal::Evaluator)?;
+        require(job.step == report.step, Refusal::Step)?;
+        let signed = report.cannot_act.as_ref().is_some_and(|reason| reason.is_signed(report.weights, &job.lease));
+        require(signed, Refusal::Proof)
+    }
+
+    fn is_possible(&self, score: &EpisodeScore) -> bool {
+        let task = &self.rules.task;
+        let expected = task.score(score.episode_return);
+        let longest = task.max_episode_steps().unwrap_or(usize::MAX);
+        let length_fits = (1..=longest).contains(&(score.length as usize));
+        length_fits
+            && expected.is_finite()
+            && (score.score - expected).abs() <= SCORE_TOLERANCE * expected.abs().max(1.0)
+    }
+}
