@@ -21,6 +21,7 @@ pub mod crowd;
 pub mod dashboard;
 pub mod hosts;
 pub mod http;
+pub mod knock;
 pub mod line;
 pub mod link;
 pub mod pace;

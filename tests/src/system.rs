@@ -144,7 +144,10 @@ impl Scratch {
         fs::remove_file(run_dir.join("endpoints.json")).ok();
         let mut command = through(launcher, "learner");
         command.arg("train").arg("--preset").arg(preset).arg("--dataset").arg(self.dataset());
-        command.arg("--run-dir").arg(&run_dir).args(["--metrics", "127.0.0.1:0"]).args(arguments);
+        command.arg("--run-dir").arg(&run_dir).args(arguments);
+        if !arguments.contains(&"--metrics") {
+            command.args(["--metrics", "127.0.0.1:0"]);
+        }
         let process = Process::start(name, self.path(), command);
         Learner { process, run_dir }
     }

@@ -5,7 +5,6 @@
 //! `QUAD_SECONDS=3 QUAD_ROUNDS=5 cargo test --release --workspace --test hostile -- --nocapture`.
 #![allow(clippy::unwrap_used, clippy::expect_used, clippy::print_stderr)]
 
-use std::net::TcpStream;
 use std::process::{Child, Command, Stdio};
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering::Relaxed};
@@ -14,6 +13,7 @@ use std::time::Duration;
 use quad_protocol::{EpisodeScore, Hash, JobRequest, Name, Progress, ScoreReport, WeightsRequest, encode, keys};
 use quad_service::{Endpoints, open_session};
 use quad_tests::crowd::{Crowd, Pace};
+use quad_tests::knock::knock;
 use quad_tests::pace::{compare, median, on_core};
 use quad_tests::system::{Scratch, Setting};
 use quad_tests::{PATIENCE, eventually, http, number};
@@ -119,7 +119,7 @@ impl Stranger {
                 process = Some(command.stdout(Stdio::null()).spawn().unwrap());
             }
             Attack::Connections => {
-                let (on, address) = (on.clone(), endpoint.trim_start_matches("tcp/").to_owned());
+                let (on, address) = (on.clone(), endpoint.trim_start_matches("tcp/").parse().unwrap());
                 std::thread::spawn(move || knock(&address, &on));
             }
             attack => {
@@ -137,17 +137,6 @@ impl Drop for Stranger {
         if let Some(mut process) = self.process.take() {
             process.kill().ok();
             process.wait().ok();
-        }
-    }
-}
-
-/// Opens connections, says nothing, and leaves the newest hundred open.
-fn knock(address: &str, on: &AtomicBool) {
-    let mut open = std::collections::VecDeque::new();
-    while on.load(Relaxed) {
-        open.extend(TcpStream::connect(address));
-        if open.len() > 100 {
-            open.pop_front();
         }
     }
 }

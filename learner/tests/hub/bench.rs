@@ -81,6 +81,10 @@ fn scribe(scores: Log, hub: Inbox<hub::Event>, disk: Arc<Mutex<usize>>) -> Sende
 impl Bench {
     /// Jobs of two episodes, four episodes per evaluation.
     pub async fn start() -> Self {
+        Self::with_lease(LEASE).await
+    }
+
+    pub async fn with_lease(lease: Duration) -> Self {
         let folder = tempfile::tempdir().unwrap();
         let run = name("bench");
         let run_dir = RunDir::create(&folder.path().join("bench"), &config()).unwrap();
@@ -94,7 +98,7 @@ impl Bench {
             instance: 1,
             candidates: 3,
             job_episodes: 2,
-            lease: LEASE,
+            lease,
             audit: 0.0,
         };
         let plan = EvaluationPlan { seed: 1, episodes: 4 };
