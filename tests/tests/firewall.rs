@@ -65,11 +65,9 @@ fn who_opens_connections_as_fast_as_he_can_is_kept_out_and_others_are_not() {
         let runtime = Runtime::new().unwrap();
         let crowd = runtime.block_on(Crowd::connect(5, &Name::new("run").unwrap(), &endpoint));
         crowd.set(Pace::Real);
-        drop({
-            let stranger = Stranger::start(&address);
-            thread::sleep(USED_UP);
-            stranger
-        });
+        let stranger = Stranger::start(&address);
+        thread::sleep(USED_UP);
+        drop(stranger);
         crowd.measured();
         let mut stranger = None;
         let [quiet, loud] = compare(&learner, rounds, phase, |loud| stranger = loud.then(|| Stranger::start(&address)));
