@@ -3,8 +3,8 @@
 //! An evaluation is a snapshot (step and hash) with a list of episode seeds. Jobs hand out some of its episodes under a
 //! lease that progress extends; when the lease runs out or the evaluator leaves, they are handed out again, unless that has
 //! happened too often. For each (step, seed) the first score that is delivered counts, and no other, whoever delivers it. The
-//! current time is an argument, for tests. `job` has the rules of a lease, `screen` those of a
-//! report, `refusal` why a message is not accepted.
+//! current time is an argument, for tests. `job` has the rules of a lease, `jobs` who has which,
+//! `screen` which reports are accepted, `refusal` why a message is not.
 
 mod audit;
 mod evaluation;
@@ -33,7 +33,8 @@ use crate::resume::Earlier;
 /// After this time an evaluator asks again when there was no job for it, or after this time for each evaluator that there is
 /// if that is longer, so that hundreds which have nothing to do do not keep the learner busy. A new snapshot wakes them all.
 const ASK_AGAIN: [Duration; 2] = [Duration::from_millis(500), Duration::from_millis(50)];
-/// The same for how often progress is told: all together send fifty messages a second.
+/// The same for how often progress is told: all together send fifty messages a second, or as many as their leases need if
+/// that is more.
 const TELL_PROGRESS: [Duration; 2] = [Duration::from_secs(1), Duration::from_millis(20)];
 /// After this time an evaluator asks again that does not have the run's environment.
 const NOT_FOR_YOU: Duration = Duration::from_secs(10);

@@ -41,7 +41,7 @@ pub struct Measured {
     pub claims: Vec<Duration>,
     /// How long each acknowledgement of scores took.
     pub reports: Vec<Duration>,
-    /// Claims without an answer.
+    /// Questions without an answer.
     pub unanswered: usize,
 }
 
@@ -165,10 +165,7 @@ impl Member {
         let (environments, precision) = (vec!["hopper".to_owned()], Name::new("f32").expect("a name"));
         let (evaluator, attempt) = (self.name.clone(), self.random.random());
         let claim = JobRequest::Claim { evaluator, attempt, environments, precision };
-        let Some((answer, took)) = self.ask(keys::jobs(&self.shared.run), &claim).await else {
-            self.shared.note(|measured| measured.unanswered += 1);
-            return None;
-        };
+        let (answer, took) = self.ask(keys::jobs(&self.shared.run), &claim).await?;
         self.shared.note(|measured| measured.claims.push(took));
         Some(answer)
     }
@@ -218,7 +215,10 @@ impl Member {
         let get = self.session.get(key).payload(encode(question).expect("it is small")).timeout(ANSWER);
         let get = get.target(QueryTarget::All).consolidation(ConsolidationMode::None).await;
         let reply = get.expect("the session is open").recv_async().await.ok();
-        let sample = reply?.into_result().ok()?;
+        let Some(Ok(sample)) = reply.map(|reply| reply.into_result()) else {
+            self.shared.note(|measured| measured.unanswered += 1);
+            return None;
+        };
         Some((decode(&sample.payload().to_bytes()).expect("the learner's answer"), begin.elapsed()))
     }
 }

@@ -6,8 +6,11 @@ use std::thread;
 use std::time::{Duration, Instant};
 
 use crate::http;
-use crate::system::Learner;
+use crate::system::{Learner, Setting};
 
+/// A run that outlives any measurement, with more episodes than any crowd can score meanwhile.
+pub const ENDLESS: Setting =
+    Setting { steps: 100_000_000, eval_interval: 30_000, episodes: 10_000, candidates: 1, hidden: 64, seed: 3 };
 /// After a change between quiet and loud, this long is not counted.
 pub const SETTLE: Duration = Duration::from_millis(500);
 

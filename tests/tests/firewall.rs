@@ -14,13 +14,11 @@ use quad_tests::crowd::{Crowd, Pace};
 use quad_tests::hosts::Network;
 use quad_tests::knock::knock;
 use quad_tests::line::Line;
-use quad_tests::pace::{compare, on_core};
-use quad_tests::system::{Scratch, Setting};
+use quad_tests::pace::{ENDLESS, compare, on_core};
+use quad_tests::system::Scratch;
 use quad_tests::{PATIENCE, number};
 use tokio::runtime::Runtime;
 
-const SETTING: Setting =
-    Setting { steps: 100_000_000, eval_interval: 30_000, episodes: 10_000, candidates: 1, hidden: 64, seed: 3 };
 /// The port that the rules are about.
 const PORT: u16 = 7447;
 /// In so long he has used up what he may open at once.
@@ -56,7 +54,7 @@ fn who_opens_connections_as_fast_as_he_can_is_kept_out_and_others_are_not() {
     let (phase, rounds) = (Duration::from_secs(number("QUAD_SECONDS", 1)), number("QUAD_ROUNDS", 3) as usize);
     let (scratch, metrics) = (Scratch::new(), format!("{}:0", home.address));
     let arguments = ["--listen", &format!("tcp/0.0.0.0:{PORT}"), "--metrics", &metrics];
-    let learner = on_core(0, || scratch.learner_through(&home.launcher(), "run", SETTING, &arguments));
+    let learner = on_core(0, || scratch.learner_through(&home.launcher(), "run", ENDLESS, &arguments));
     on_core(1, || {
         let endpoint = format!("tcp/{}:{PORT}", home.address);
         // The stranger has an address of his own.

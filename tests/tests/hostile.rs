@@ -14,14 +14,12 @@ use quad_protocol::{EpisodeScore, Hash, JobRequest, Name, Progress, ScoreReport,
 use quad_service::{Endpoints, open_session};
 use quad_tests::crowd::{Crowd, Pace};
 use quad_tests::knock::knock;
-use quad_tests::pace::{compare, median, on_core};
-use quad_tests::system::{Scratch, Setting};
+use quad_tests::pace::{ENDLESS, compare, median, on_core};
+use quad_tests::system::Scratch;
 use quad_tests::{PATIENCE, eventually, http, number};
 use tokio::runtime::Runtime;
 use zenoh::Session;
 
-const SETTING: Setting =
-    Setting { steps: 100_000_000, eval_interval: 30_000, episodes: 10_000, candidates: 1, hidden: 64, seed: 3 };
 /// Of the evaluators that are served meanwhile.
 const HONEST: usize = 5;
 /// Tells this program that it is the stranger who reads nothing, and where to.
@@ -93,7 +91,7 @@ fn lie() -> Vec<u8> {
         run: run(),
         incarnation: 1,
         job: 1,
-        step: SETTING.eval_interval,
+        step: ENDLESS.eval_interval,
         weights: Hash::of(b"guessed"),
         precision: name("f32"),
         episodes: vec![EpisodeScore { seed: 1, episode_return: f64::NAN, length: 0, score: f64::NAN }],
@@ -197,7 +195,7 @@ async fn read_nothing(endpoint: String) {
     let session = open(&endpoint).await;
     let question = encode(&WeightsRequest { evaluator: name("silent") }).unwrap();
     for _ in 0..300 {
-        let get = session.get(keys::weights_at(&run(), SETTING.eval_interval)).payload(question.clone());
+        let get = session.get(keys::weights_at(&run(), ENDLESS.eval_interval)).payload(question.clone());
         get.timeout(PATIENCE).callback(drop).await.unwrap();
     }
     let stop = format!("kill -STOP {}", std::process::id());
@@ -211,7 +209,7 @@ fn whatever_strangers_do_the_work_goes_on() {
     }
     let (phase, rounds) = (Duration::from_secs(number("QUAD_SECONDS", 1)), number("QUAD_ROUNDS", 1) as usize);
     let scratch = Scratch::new();
-    let mut learner = on_core(0, || scratch.learner("run", SETTING));
+    let mut learner = on_core(0, || scratch.learner("run", ENDLESS));
     on_core(1, || {
         let endpoint = learner.endpoint();
         let runtime = Runtime::new().unwrap();

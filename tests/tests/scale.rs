@@ -11,16 +11,13 @@ use std::time::{Duration, Instant};
 
 use quad_protocol::Name;
 use quad_tests::crowd::{Crowd, LONGEST_JOB, Measured, Pace};
-use quad_tests::pace::{SETTLE, compare, on_core};
+use quad_tests::pace::{ENDLESS, SETTLE, compare, on_core};
 use quad_tests::router::router;
 use quad_tests::system::{Learner, Scratch, Setting, free_port};
 use quad_tests::{PATIENCE, eventually, http, number};
 use tokio::runtime::Runtime;
 use zenoh::Session;
 
-/// More episodes than any crowd can score meanwhile.
-const ENDLESS: Setting =
-    Setting { steps: 100_000_000, eval_interval: 30_000, episodes: 10_000, candidates: 1, hidden: 64, seed: 3 };
 /// No episodes before the test is over.
 const IDLE: Setting = Setting { eval_interval: 50_000_000, ..ENDLESS };
 
@@ -99,7 +96,7 @@ impl Scene {
         );
         let page = http::metrics(&self.learner.metrics()).unwrap();
         let rejected: Vec<_> = page.lines().filter(|line| line.starts_with("quad_learner_rejected")).collect();
-        assert_eq!(measured.unanswered, 0, "claims without an answer at a real pace: {rejected:?}");
+        assert_eq!(measured.unanswered, 0, "questions without an answer at a real pace: {rejected:?}");
         (measured, share)
     }
 }

@@ -22,8 +22,8 @@ use super::turns::Turns;
 use crate::environment;
 use crate::metrics::{JobOutcome, Metrics};
 
-/// Progress is reported at least and at most this often, whatever the learner asks for.
-const HEARTBEAT: [Duration; 2] = [Duration::from_secs(10), Duration::from_millis(50)];
+/// Bounds of the time between two reports of progress that a learner may ask for.
+const HEARTBEAT: [Duration; 2] = [Duration::from_millis(50), Duration::from_secs(10)];
 /// Scores are kept this long for a learner that is gone, which may be disconnected only for a while.
 const KEEP_SCORES: Duration = Duration::from_secs(600);
 /// Memory for the snapshots that were published, of all runs together, bytes; the largest that there may be fits.
@@ -278,8 +278,7 @@ impl Worker {
 }
 
 fn heartbeat(job: &Job) -> Duration {
-    let [rarest, most_often] = HEARTBEAT;
-    Duration::from_millis(job.progress_milliseconds).clamp(most_often, rarest)
+    Duration::from_millis(job.progress_milliseconds).clamp(HEARTBEAT[0], HEARTBEAT[1])
 }
 
 #[cfg(test)]
