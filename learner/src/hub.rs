@@ -40,7 +40,7 @@ const TICK: Duration = Duration::from_millis(250);
 const MOST_TOGETHER: usize = 256;
 /// After some messages, the next ones are left to gather for so long. To wake this thread, and those that its answers wake,
 /// takes more of a processor that training needs than what they then do.
-const GATHER: Duration = Duration::from_millis(10);
+const GATHER: Duration = Duration::from_millis(20);
 
 /// Messages to the thread.
 #[derive(Debug)]

@@ -30,6 +30,8 @@ const THREADS: usize = 12;
 /// A query is dropped so long after its answer: Zenoh's own thread still holds it while it hands it over, and whoever drops it
 /// last may have to wait for the peer.
 const GRACE: Duration = Duration::from_millis(50);
+/// And this much later, if no thread is awake before: nobody waits for that, and to wake one takes longer.
+const LATER: Duration = Duration::from_millis(500);
 /// Most answers that may wait: of all, of one of those who ask, and queries that are only dropped, which take no room.
 const MOST_WAITING: usize = 4096;
 const MOST_WAITING_OF_ONE: usize = 64;
@@ -90,9 +92,11 @@ struct State {
     asleep: usize,
     /// One was called, and will look at all that waits.
     called: bool,
-    /// One sleeps for a short time only: for queries that may be dropped then, and for what a thread that waits for its peer
-    /// has left.
-    timed: bool,
+    /// One sleeps for so long only: for queries that may be dropped then, and for what a thread that waits for its peer has
+    /// left.
+    timed: Option<Duration>,
+    /// Nothing more will be put in.
+    finishing: bool,
     closed: bool,
 }
 
@@ -109,8 +113,8 @@ impl State {
     /// Whether a thread has to be called for a new task. To wake one costs more than to send an answer, so one is not if
     /// another will come by.
     fn calls(&mut self) -> bool {
-        let all_asleep = self.asleep + usize::from(self.timed) == THREADS;
-        let calls = !self.called && (all_asleep || !self.timed);
+        let all_asleep = self.asleep + usize::from(self.timed.is_some()) == THREADS;
+        let calls = !self.called && (all_asleep || self.timed != Some(GRACE));
         self.called |= calls;
         calls
     }
@@ -157,6 +161,8 @@ impl Replies {
     pub fn finish(&self, patience: Duration) {
         let deadline = Instant::now() + patience;
         let mut state = self.shared.lock();
+        state.finishing = true;
+        self.shared.work.notify_all();
         while !(state.waiting.is_empty() && state.busy.is_empty()) {
             let Some(left) = deadline.checked_duration_since(Instant::now()) else { break };
             let waited = self.shared.idle.wait_timeout(state, left);
@@ -210,14 +216,16 @@ impl Shared {
                 if state.waiting.is_empty() && state.busy.is_empty() {
                     self.idle.notify_all();
                 }
-                if state.waiting.is_empty() || state.timed {
+                if state.waiting.is_empty() || state.timed.is_some() {
                     state.asleep += 1;
                     state = self.work.wait(state).unwrap_or_else(PoisonError::into_inner);
                     state.asleep -= 1;
                 } else {
-                    state.timed = true;
-                    state = self.work.wait_timeout(state, GRACE).unwrap_or_else(PoisonError::into_inner).0;
-                    state.timed = false;
+                    let answers = state.waiting.iter().any(|task| task.work.is_some());
+                    let patience = if answers || !state.busy.is_empty() || state.finishing { GRACE } else { LATER };
+                    state.timed = Some(patience);
+                    state = self.work.wait_timeout(state, patience).unwrap_or_else(PoisonError::into_inner).0;
+                    state.timed = None;
                 }
                 continue;
             };

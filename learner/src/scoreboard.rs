@@ -32,10 +32,10 @@ use crate::resume::Earlier;
 
 /// After this time an evaluator asks again when there was no job for it, or after this time for each evaluator that there is
 /// if that is longer, so that hundreds which have nothing to do do not keep the learner busy. A new snapshot wakes them all.
-const ASK_AGAIN: [Duration; 2] = [Duration::from_millis(500), Duration::from_millis(50)];
-/// The same for how often progress is told: all together send fifty messages a second, or as many as their leases need if
-/// that is more.
-const TELL_PROGRESS: [Duration; 2] = [Duration::from_secs(1), Duration::from_millis(20)];
+const ASK_AGAIN: [Duration; 2] = [Duration::from_millis(500), Duration::from_millis(100)];
+/// The same for how often progress is told, up to this long.
+const TELL_PROGRESS: [Duration; 2] = [Duration::from_secs(1), Duration::from_millis(40)];
+const RARELY: Duration = Duration::from_secs(20);
 /// After this time an evaluator asks again that does not have the run's environment.
 const NOT_FOR_YOU: Duration = Duration::from_secs(10);
 
@@ -52,9 +52,9 @@ pub struct Rules {
     pub instance: u64,
     /// Actions sampled per state.
     pub candidates: u32,
-    /// Most episodes in one job.
-    pub job_episodes: usize,
-    /// How long a job may stay without progress.
+    /// Most episodes in one job: while as many evaluators as there are could share them, and if many more wait.
+    pub job_episodes: [usize; 2],
+    /// How long a job may stay without progress. Longer, if there are so many evaluators that they tell it rarely.
     pub lease: Duration,
     /// Share of the episodes that are scored a second time, 0 to 1.
     pub audit: f64,
@@ -198,20 +198,34 @@ impl Scoreboard {
             };
         }
         let id = self.next_job;
-        let most = self.rules.job_episodes;
+        let most = self.job_episodes(claim.present);
         let audit = self.audits.hand_out(id, claim.evaluator, claim.precision, most);
         let Some(episodes) = audit.or_else(|| self.hand_out(id, most)) else { return later };
-        let job = OpenJob::new(claim.evaluator.clone(), claim.attempt, episodes, self.rules.lease, now);
+        let job = OpenJob::new(claim.evaluator.clone(), claim.attempt, episodes, self.lease(claim.present), now);
         let message = self.message(id, &job, claim.present);
         self.jobs.insert(id, job);
         self.next_job += 1;
         message.map_or(later, JobReply::Job)
     }
 
+    /// Most episodes of a job: half of an evaluator's share of those that wait, so that none is idle in the end. Large jobs
+    /// take fewer messages, and fewer evaluators that fetch the same weights.
+    fn job_episodes(&self, present: usize) -> usize {
+        let waiting: usize = self.evaluations.values().map(Evaluation::waiting).sum();
+        let [least, most] = self.rules.job_episodes;
+        (waiting / (2 * present.max(1))).clamp(least, most)
+    }
+
+    /// How long a job may stay without progress: two messages may be lost.
+    fn lease(&self, present: usize) -> Duration {
+        self.rules.lease.max(3 * among(present, TELL_PROGRESS).min(RARELY))
+    }
+
     /// Waiting episodes of the oldest step that has any.
     fn hand_out(&mut self, job: u64, most: usize) -> Option<(u64, Vec<u64>)> {
+        let few = self.rules.job_episodes[0];
         self.evaluations.iter_mut().find_map(|(&step, evaluation)| {
-            let seeds = evaluation.hand_out(job, most);
+            let seeds = evaluation.hand_out(job, [few, most]);
             (!seeds.is_empty()).then_some((step, seeds))
         })
     }
@@ -230,8 +244,8 @@ impl Scoreboard {
             instance: rules.instance,
             seeds: job.seeds.clone(),
             candidates: rules.candidates,
-            // Often enough to keep the lease when a message is lost.
-            progress_milliseconds: among(present, TELL_PROGRESS).min(rules.lease / 3).as_millis() as u64,
+            // Often enough to keep the lease.
+            progress_milliseconds: among(present, TELL_PROGRESS).min(job.patience / 3).as_millis() as u64,
         })
     }
 
@@ -249,7 +263,7 @@ impl Scoreboard {
         require(progress.run == self.rules.run, Refusal::Run)?;
         require(progress.incarnation == self.rules.incarnation, Refusal::Incarnation)?;
         let job = self.jobs.get_mut(progress.job).ok_or(Refusal::Job)?;
-        job.advance(progress, self.rules.lease, now)
+        job.advance(progress, now)
     }
 
     /// Counts the new scores of a report that [`screen`](Self::screen) let pass.

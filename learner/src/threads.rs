@@ -30,8 +30,8 @@ use crate::scribe::Scribe;
 use crate::train::Row;
 use crate::trainer::{Trainer, TrainingResult};
 
-/// Episodes in one job: two evaluators share an evaluation of ten.
-const JOB_EPISODES: usize = 5;
+/// Most episodes in one job: two evaluators share an evaluation of ten. And most if hundreds wait.
+const JOB_EPISODES: [usize; 2] = [5, 20];
 /// An evaluator tells its progress three times meanwhile or more often, and Zenoh notices a lost one after about 5 s.
 const LEASE: Duration = Duration::from_secs(15);
 /// A thread that answers others, or writes to the disk, is stuck if it has said nothing for so long.

@@ -5,8 +5,8 @@
 //! In reading order, which is the order of a process's life:
 //!
 //! - `logging`: where log lines go; `throttle`: how many of a kind.
-//! - `session`: the connection between learner and evaluators, over Zenoh; `certificates`: who a program is there;
-//!   `access`: what others may do.
+//! - `endpoints`: where learner and evaluators meet; `session`: the connection between them, over Zenoh;
+//!   `zenoh_threads`: who does its work; `certificates`: who a program is there; `access`: what others may do.
 //! - `health`: whether the parts of a process still do their work.
 //! - `metrics_server`: `/metrics` and `/healthz`.
 //! - `shutdown`: the signals that end a process.
@@ -17,6 +17,7 @@ mod access;
 mod background;
 mod certificates;
 pub mod doctor;
+mod endpoints;
 mod exit;
 mod health;
 mod logging;
@@ -24,12 +25,15 @@ mod metrics_server;
 mod session;
 mod shutdown;
 mod throttle;
+mod zenoh_threads;
 
 pub use background::stay_in_background;
 pub use certificates::{Certificates, CertificatesError, Role};
+pub use endpoints::{Endpoints, SessionError, default_endpoint, parse_endpoint};
 pub use exit::{Hint, hinted, run_main};
 pub use health::{Beat, Health};
 pub use logging::init_logging;
 pub use metrics_server::{BindError, MetricsServer, serve_metrics};
-pub use session::{Endpoints, SessionError, default_endpoint, open_session, parse_endpoint, reachable_at};
+pub use session::{open_session, reachable_at};
 pub use shutdown::shutdown_signal;
+pub use zenoh_threads::use_fewer_zenoh_threads;

@@ -7,12 +7,11 @@ use serde_json::{Value, json};
 use tokio::sync::oneshot;
 use tokio::time::timeout;
 use tracing::warn;
-use zenoh::config::EndPoint;
 use zenoh::{Config, Session, Wait};
 
 use crate::access;
 use crate::background::stay_in_background;
-use crate::certificates::Certificates;
+use crate::endpoints::{Endpoints, SessionError, leaves_port_open};
 
 /// A process that is frozen or disconnected counts as gone after this time. (One that ends or is killed is noticed at
 /// once.) Half of Zenoh's default; a machine that is busy training may still miss several keep-alive messages in it.
@@ -40,118 +39,6 @@ const CLOSE_AFTER: Duration = Duration::from_secs(2);
 const PATIENCE: Duration = Duration::from_secs(10);
 /// A session asks itself what it listens at, so there is no network in between.
 const SELF_QUERY_TIMEOUT: Duration = Duration::from_secs(5);
-
-/// The protocols that Zenoh is built with here: readable by anybody in between, and encrypted and authenticated.
-const OPEN: &str = "tcp/";
-const PROTECTED: &str = "tls/";
-
-/// Where a session meets the others, as Zenoh's endpoints: `tcp/127.0.0.1:7447`, or with certificates
-/// `tls/127.0.0.1:7447`.
-///
-/// There is no scouting: nobody is found that was not named. A session that listens is a peer, to which others connect
-/// directly; one that does not is a client of the peer or router that it connects to.
-#[derive(Clone, Debug, Default, PartialEq, Eq)]
-pub struct Endpoints {
-    /// Listen here. Port 0 takes a free one; [`reachable_at`] tells which.
-    pub listen: Vec<String>,
-    /// Connect to these. A client keeps one connection: to talk to several meeting points, open a session for each.
-    pub connect: Vec<String>,
-    /// With them, every connection is by TLS, and both sides show who they are. Whoever connects to a session that
-    /// listens may do what deploy/zenoh/router-tls.json5 allows.
-    pub certificates: Option<Certificates>,
-}
-
-/// There is no session, or it does not answer.
-#[derive(Debug, thiserror::Error)]
-pub enum SessionError {
-    /// Nothing to listen at and nothing to connect to.
-    #[error("no endpoint to listen at or to connect to")]
-    NoEndpoint,
-    /// Not an endpoint that this program can use. Zenoh would try for ever to connect to one of another protocol.
-    #[error("{endpoint:?} is not an endpoint; write it like {OPEN}127.0.0.1:7447 or {PROTECTED}127.0.0.1:7447")]
-    NotAnEndpoint {
-        /// What was given.
-        endpoint: String,
-    },
-    /// Certificates are there, but would not be used.
-    #[error("certificates are given, but the connection at {endpoint} would be open to anybody")]
-    Open {
-        /// The endpoint.
-        endpoint: String,
-    },
-    /// Certificates are not there, but would be needed.
-    #[error("{endpoint} needs certificates")]
-    NoCertificates {
-        /// The endpoint.
-        endpoint: String,
-    },
-    /// It cannot be listened at, or its options are wrong.
-    #[error("cannot use the Zenoh endpoint {endpoints}: {reason}")]
-    Endpoint {
-        /// The endpoints.
-        endpoints: String,
-        /// Zenoh's own words.
-        reason: String,
-    },
-    /// The session does not tell which endpoints it has bound.
-    #[error("the Zenoh session does not tell where it listens")]
-    Unknown,
-}
-
-impl SessionError {
-    /// What to do about it.
-    pub fn hint(&self) -> &'static str {
-        match self {
-            SessionError::Open { .. } => "write the endpoint like tls/HOST:PORT, or leave --certificates away",
-            SessionError::NoCertificates { .. } => {
-                "name their folder by --certificates DIR or QUAD_CERTIFICATES; deploy/zenoh/certificates.sh makes one"
-            }
-            _ => {
-                "if the port is taken, perhaps by another learner, choose a free one with --listen tcp/127.0.0.1:0, \
-                 or join a router with --connect"
-            }
-        }
-    }
-}
-
-impl Endpoints {
-    /// Tells early what [`open_session`] would refuse.
-    ///
-    /// # Errors
-    ///
-    /// None or malformed ones; tcp/ with certificates, and tls/ without.
-    pub fn check(&self) -> Result<(), SessionError> {
-        if self.listen.is_empty() && self.connect.is_empty() {
-            return Err(SessionError::NoEndpoint);
-        }
-        for endpoint in self.listen.iter().chain(&self.connect) {
-            let endpoint = parse_endpoint(endpoint)?;
-            match (endpoint.starts_with(PROTECTED), &self.certificates) {
-                (false, Some(_)) => return Err(SessionError::Open { endpoint }),
-                (true, None) => return Err(SessionError::NoCertificates { endpoint }),
-                _ => {}
-            }
-        }
-        Ok(())
-    }
-}
-
-/// Where learner and evaluator of one machine meet, at `port`, if nothing else is said.
-pub fn default_endpoint(certificates: Option<&Certificates>, port: u16) -> String {
-    format!("{}127.0.0.1:{port}", if certificates.is_some() { PROTECTED } else { OPEN })
-}
-
-/// Checks an endpoint that a person wrote, and gives it back as it is: a `value_parser` for a command line.
-///
-/// # Errors
-///
-/// [`SessionError::NotAnEndpoint`]: it is malformed, or names another protocol than TCP and TLS.
-pub fn parse_endpoint(text: &str) -> Result<String, SessionError> {
-    if [OPEN, PROTECTED].iter().any(|protocol| text.starts_with(protocol)) && text.parse::<EndPoint>().is_ok() {
-        return Ok(text.to_owned());
-    }
-    Err(SessionError::NotAnEndpoint { endpoint: text.to_owned() })
-}
 
 /// Opens a session. Needs a multi-thread tokio runtime.
 ///
@@ -244,11 +131,6 @@ fn for_people(error: zenoh::Error) -> String {
     plain
 }
 
-/// Whether the system is to choose the endpoint's port. Options may follow the address: `tcp/127.0.0.1:0#iface=lo`.
-fn leaves_port_open(endpoint: &str) -> bool {
-    endpoint.split(['?', '#']).next().is_some_and(|address| address.ends_with(":0"))
-}
-
 /// Where others meet `session`, which was opened with `endpoints`: what it listens at, with the ports that the system
 /// chose, or, if it does not listen, what it connects to.
 pub async fn reachable_at(session: &Session, endpoints: &Endpoints) -> Result<Vec<String>, SessionError> {
@@ -277,15 +159,5 @@ mod tests {
         let text = "Can not listen: [In use (os error 98) at /a/src/tcp.rs:61.] at /a/src/unicast.rs:338.";
         assert_eq!(for_people(text.into()), "Can not listen: [In use (os error 98)]");
         assert_eq!(for_people("Nobody at home".into()), "Nobody at home");
-    }
-
-    #[test]
-    fn which_ports_the_system_chooses() {
-        for endpoint in ["tcp/127.0.0.1:0", "tcp/[::1]:0", "tcp/0.0.0.0:0#iface=lo", "tcp/127.0.0.1:0?prio=1-7"] {
-            assert!(leaves_port_open(endpoint), "{endpoint}");
-        }
-        for endpoint in ["tcp/127.0.0.1:7447", "tcp/learner:10", "tcp/[::0]:7447", "tcp/127.0.0.1:7447#iface=e:0"] {
-            assert!(!leaves_port_open(endpoint), "{endpoint}");
-        }
     }
 }

@@ -1,6 +1,7 @@
 //! Evaluators that do everything on the wire and nothing else: they claim, report progress and deliver scores that they made
 //! up. Hundreds of them fit into one test.
 
+use std::mem;
 use std::sync::atomic::{AtomicU8, AtomicUsize, Ordering::Relaxed};
 use std::sync::{Arc, Mutex};
 use std::time::{Duration, Instant};
@@ -16,11 +17,23 @@ use tokio::time::{sleep, timeout};
 use zenoh::query::{ConsolidationMode, QueryTarget};
 use zenoh::{Config, Session};
 
+use crate::number;
+
 /// An evaluator's patience with its learner.
 const ANSWER: Duration = Duration::from_secs(5);
 
-/// A job at a real pace takes this long, or half of it.
-pub const LONGEST_JOB: Duration = Duration::from_secs(8);
+/// Most episodes of a job.
+const MOST_EPISODES: u32 = 20;
+
+/// An episode at a real pace takes this long, or half of it.
+fn longest_episode() -> Duration {
+    Duration::from_millis(number("QUAD_EPISODE_MILLISECONDS", 400))
+}
+
+/// A job at a real pace takes no longer.
+pub fn longest_job() -> Duration {
+    MOST_EPISODES * longest_episode()
+}
 
 /// What a crowd does.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -116,6 +129,10 @@ struct Member {
     session: Session,
     shared: Arc<Shared>,
     random: ChaCha8Rng,
+    /// When it last told its progress.
+    told: Option<Instant>,
+    /// Has had no job yet since it was still.
+    begins: bool,
 }
 
 impl Member {
@@ -129,7 +146,8 @@ impl Member {
         }
         let session = zenoh::open(config).await.expect("somebody listens");
         let name = Name::new(format!("light-{number}")).expect("a name");
-        Member { name, session, shared, random: ChaCha8Rng::seed_from_u64(number as u64) }
+        let random = ChaCha8Rng::seed_from_u64(number as u64);
+        Member { name, session, shared, random, told: None, begins: true }
     }
 
     async fn work(mut self) {
@@ -142,6 +160,7 @@ impl Member {
         let _snapshots = snapshots.expect("the session is open");
         loop {
             if self.shared.pace() == Pace::Still {
+                self.begins = true;
                 sleep(Duration::from_millis(100)).await;
                 continue;
             }
@@ -172,10 +191,19 @@ impl Member {
 
     async fn score(&mut self, job: Job) {
         if self.shared.pace() == Pace::Real {
-            let mut left = self.random.random_range(LONGEST_JOB / 2..LONGEST_JOB);
+            let longest = longest_episode() * job.seeds.len() as u32;
+            let mut left = self.random.random_range(longest / 2..longest);
+            // They all begin together, and should not go on so.
+            if mem::take(&mut self.begins) {
+                left = left.mul_f64(self.random.random());
+            }
             let every = Duration::from_millis(job.progress_milliseconds);
             for steps_done in 0.. {
-                self.progress(&job, steps_done).await;
+                // Like a real one, it does not tell more because its jobs are short.
+                if self.told.is_none_or(|told| told.elapsed() >= every) {
+                    self.told = Some(Instant::now());
+                    self.progress(&job, steps_done).await;
+                }
                 sleep(every.min(left)).await;
                 left = left.saturating_sub(every);
                 if left.is_zero() {

@@ -10,7 +10,7 @@ use std::thread;
 use std::time::{Duration, Instant};
 
 use quad_protocol::Name;
-use quad_tests::crowd::{Crowd, LONGEST_JOB, Measured, Pace};
+use quad_tests::crowd::{Crowd, Measured, Pace, longest_job};
 use quad_tests::pace::{ENDLESS, SETTLE, compare, on_core};
 use quad_tests::router::router;
 use quad_tests::system::{Learner, Scratch, Setting, free_port};
@@ -78,7 +78,7 @@ impl Scene {
             if loud {
                 self.crowd.set(Pace::Real);
                 // Until they work in turn.
-                thread::sleep(LONGEST_JOB);
+                thread::sleep(longest_job());
                 self.crowd.measured();
             } else {
                 measured.add(self.crowd.measured());

@@ -1,7 +1,7 @@
 //! Everything that is exchanged with the learner of one run: jobs, snapshots, progress, scores.
 
 use std::collections::BTreeSet;
-use std::sync::Arc;
+use std::sync::{Arc, Mutex, PoisonError};
 use std::time::{Duration, Instant};
 
 use anyhow::Context;
@@ -28,7 +28,7 @@ const ANSWER_TIMEOUT: Duration = Duration::from_secs(5);
 const WEIGHTS_TIMEOUT: Duration = Duration::from_secs(30);
 /// Bounds of the pause that a learner without work may ask for: one too short would be a flood of questions, one too
 /// long would lose the evaluator.
-const WAIT: [Duration; 2] = [Duration::from_millis(20), Duration::from_secs(30)];
+const WAIT: [Duration; 2] = [Duration::from_millis(20), Duration::from_secs(60)];
 
 /// Who an evaluator is to every learner.
 #[derive(Clone)]
@@ -50,6 +50,8 @@ pub struct RunClient {
     incarnation: u64,
     /// Of the claim that has no answer yet.
     attempt: Option<u64>,
+    /// When progress was last reported.
+    told: Mutex<Option<Instant>>,
     /// Scores that the learner has not acknowledged. While there are some, nothing new is asked for.
     undelivered: Option<ScoreReport>,
     /// Its claim to this evaluator's time.
@@ -88,6 +90,7 @@ impl RunClient {
             snapshots,
             incarnation: 0,
             attempt: None,
+            told: Mutex::default(),
             undelivered: None,
             standing: Standing::new(Instant::now()),
             complaint: String::new(),
@@ -199,8 +202,17 @@ impl RunClient {
         Ok(Arc::new(snapshot))
     }
 
-    /// Reports progress to the learner. A lost message does not matter: the next one says the same and more.
-    pub async fn publish(&self, job: &Job, (steps_done, episodes_done): (u64, u32)) {
+    /// Reports progress to the learner, unless that was done less than `every` ago, be it in an earlier job. A message that is
+    /// lost or left out does not matter: the next one says the same and more.
+    pub async fn tell(&self, job: &Job, every: Duration, (steps_done, episodes_done): (u64, u32)) {
+        let now = Instant::now();
+        {
+            let mut told = self.told.lock().unwrap_or_else(PoisonError::into_inner);
+            if told.is_some_and(|told| now - told < every) {
+                return;
+            }
+            *told = Some(now);
+        }
         let progress = Progress {
             steps_done,
             episodes_done,

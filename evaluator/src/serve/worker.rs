@@ -23,7 +23,7 @@ use crate::environment;
 use crate::metrics::{JobOutcome, Metrics};
 
 /// Bounds of the time between two reports of progress that a learner may ask for.
-const HEARTBEAT: [Duration; 2] = [Duration::from_millis(50), Duration::from_secs(10)];
+const HEARTBEAT: [Duration; 2] = [Duration::from_millis(50), Duration::from_secs(20)];
 /// Scores are kept this long for a learner that is gone, which may be disconnected only for a while.
 const KEEP_SCORES: Duration = Duration::from_secs(600);
 /// Memory for the snapshots that were published, of all runs together, bytes; the largest that there may be fits.
@@ -219,12 +219,12 @@ impl Worker {
         let metrics = self.metrics.clone();
         let policy = {
             // The learner grants some time for this, as long as it hears that somebody is at it.
-            run.publish(job, (0, 0)).await;
+            run.tell(job, heartbeat(job), (0, 0)).await;
             let mut loading = std::pin::pin!(self.policy(job, run));
             loop {
                 tokio::select! {
                     policy = &mut loading => break policy?,
-                    () = tokio::time::sleep(heartbeat(job)) => run.publish(job, (0, 0)).await,
+                    () = tokio::time::sleep(heartbeat(job)) => run.tell(job, heartbeat(job), (0, 0)).await,
                 }
             }
         };
@@ -268,7 +268,7 @@ impl Worker {
             }
             if steps > told || (steps == 0 && finished.is_none()) {
                 told = steps;
-                run.publish(job, (steps, running.episodes_done())).await;
+                run.tell(job, heartbeat(job), (steps, running.episodes_done())).await;
             }
             if let Some(episodes) = finished {
                 return episodes;

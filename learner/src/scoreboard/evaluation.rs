@@ -73,14 +73,21 @@ impl Evaluation {
         self.waiting.len() + self.handed_out
     }
 
+    /// Episodes that could be handed out now.
+    pub fn waiting(&self) -> usize {
+        self.waiting.len()
+    }
+
     /// The seeds of those that have no score and are not handed out any more.
     pub fn given_up(&self) -> impl Iterator<Item = u64> {
         self.given_up.iter().map(|&place| self.episodes[place].seed)
     }
 
-    /// Hands out some of the episodes that wait; none if there are none.
-    pub fn hand_out(&mut self, job: u64, most: usize) -> Vec<u64> {
-        let places: Vec<usize> = self.waiting.iter().copied().take(most).collect();
+    /// Hands out some of the episodes that wait; none if there are none. A `few` at most, if an evaluator was lost with the
+    /// first of them: should it be what it was lost of, the fewer suffer.
+    pub fn hand_out(&mut self, job: u64, [few, most]: [usize; 2]) -> Vec<u64> {
+        let lost = self.waiting.first().is_some_and(|&place| self.episodes[place].lost > 0);
+        let places: Vec<usize> = self.waiting.iter().copied().take(if lost { few } else { most }).collect();
         for &place in &places {
             self.change(place, EpisodeState::HandedOut { job });
         }

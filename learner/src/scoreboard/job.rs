@@ -18,6 +18,8 @@ pub(super) struct OpenJob {
     pub step: u64,
     pub seeds: Vec<u64>,
     pub lease: Lease,
+    /// How long it may stay without progress.
+    pub patience: Duration,
     handed_out: Instant,
     lease_until: Instant,
     /// Environment steps and episodes of the last accepted progress.
@@ -26,9 +28,15 @@ pub(super) struct OpenJob {
 
 impl OpenJob {
     /// One that is handed out now.
-    pub fn new(evaluator: Name, attempt: u64, (step, seeds): (u64, Vec<u64>), lease: Duration, now: Instant) -> Self {
-        let lease_until = now + lease;
-        Self { evaluator, attempt, step, seeds, lease: Lease::random(), handed_out: now, lease_until, done: (0, 0) }
+    pub fn new(
+        evaluator: Name,
+        attempt: u64,
+        (step, seeds): (u64, Vec<u64>),
+        patience: Duration,
+        now: Instant,
+    ) -> Self {
+        let (lease, lease_until) = (Lease::random(), now + patience);
+        Self { evaluator, attempt, step, seeds, lease, patience, handed_out: now, lease_until, done: (0, 0) }
     }
 
     /// Whether the evaluator has lost it.
@@ -39,7 +47,7 @@ impl OpenJob {
     /// Extends the lease, if this shows that its owner is further than before: a message that is played again does not. Before
     /// the first environment step there is nothing to be further with, but only a short time; and the whole job has a
     /// longest time, too.
-    pub fn advance(&mut self, progress: &Progress, lease: Duration, now: Instant) -> Result<(), Refusal> {
+    pub fn advance(&mut self, progress: &Progress, now: Instant) -> Result<(), Refusal> {
         require(progress.evaluator == self.evaluator, Refusal::Evaluator)?;
         require(progress.is_signed(&self.lease), Refusal::Proof)?;
         let (steps, episodes) = (progress.steps_done, progress.episodes_done);
@@ -47,7 +55,7 @@ impl OpenJob {
         require(begins || steps > self.done.0 || episodes > self.done.1, Refusal::NotAdvanced)?;
         self.done = (steps.max(self.done.0), episodes.max(self.done.1));
         let longest = if begins { PREPARATION } else { Job::LONGEST };
-        self.lease_until = self.lease_until.max((now + lease).min(self.handed_out + longest));
+        self.lease_until = self.lease_until.max((now + self.patience).min(self.handed_out + longest));
         Ok(())
     }
 }

@@ -97,7 +97,7 @@ impl Bench {
             task: task.clone(),
             instance: 1,
             candidates: 3,
-            job_episodes: 2,
+            job_episodes: [2, 2],
             lease,
             audit: 0.0,
         };

@@ -34,14 +34,14 @@ impl Bench {
             task: quad_dataset::environment::find("hopper").unwrap().into(),
             instance: 5,
             candidates: 10,
-            job_episodes: 5,
+            job_episodes: [5, 20],
             lease: LEASE,
             audit,
         };
         let mut board = Scoreboard::new(rules);
         board.add_evaluation(2000, hash(2000), &Vec::from_iter(11..=17)).unwrap();
         board.add_evaluation(1000, hash(1000), &Vec::from_iter(1..=7)).unwrap();
-        Self { board, present: 0, start: Instant::now() }
+        Self { board, present: 2, start: Instant::now() }
     }
 
     pub fn at(&self, seconds: u64) -> Instant {

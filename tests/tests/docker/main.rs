@@ -10,6 +10,7 @@
 mod compose;
 mod crash;
 mod faults;
+mod firewall;
 mod images;
 mod tls;
 mod whole;

@@ -32,6 +32,9 @@ fn compose_runs_the_whole_system() {
         assert!(!["", "0", "root"].contains(&user), "{container} runs as {user:?}");
     }
 
+    // It has to be root.
+    assert_eq!(inspect(&compose.container("firewall"), "{{.State.Health.Status}}"), "healthy", "firewall");
+
     let verdict = compose.assert_run_is_complete("whole", None);
     assert!(verdict.contains("96 of 96 episodes are scored"), "{verdict}");
     let scores = compose.learner("cat /runs/whole/scores.jsonl");
