@@ -1,5 +1,8 @@
 //! Which episode seeds an evaluation uses.
 
+use std::collections::HashSet;
+use std::iter;
+
 use rand::{RngCore, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 
@@ -12,20 +15,14 @@ const PURPOSE: u64 = u64::from_be_bytes(*b"episodes");
 pub fn episode_seeds(run_seed: u64, step: u64, episodes: u32) -> Vec<u64> {
     let mut generator = ChaCha8Rng::seed_from_u64(run_seed ^ PURPOSE);
     generator.set_stream(step);
-    let mut seeds = Vec::with_capacity(episodes as usize);
-    while seeds.len() < episodes as usize {
-        let seed = generator.next_u64() >> 11;
-        if !seeds.contains(&seed) {
-            seeds.push(seed);
-        }
-    }
-    seeds
+    let mut seen = HashSet::new();
+    let new = |seed: &u64| seen.insert(*seed);
+    iter::repeat_with(|| generator.next_u64() >> 11).filter(new).take(episodes as usize).collect()
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
-    use std::collections::HashSet;
 
     #[test]
     fn seeds_are_repeatable_and_distinct_between_evaluations_and_runs() {

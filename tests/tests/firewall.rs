@@ -54,8 +54,8 @@ fn who_opens_connections_as_fast_as_he_can_is_kept_out_and_others_are_not() {
     let (phase, rounds) = (Duration::from_secs(number("QUAD_SECONDS", 1)), number("QUAD_ROUNDS", 3) as usize);
     let (scratch, metrics) = (Scratch::new(), format!("{}:0", home.address));
     let arguments = ["--listen", &format!("tcp/0.0.0.0:{PORT}"), "--metrics", &metrics];
-    let learner = on_core(0, || scratch.learner_through(&home.launcher(), "run", ENDLESS, &arguments));
-    on_core(1, || {
+    let learner = on_core(1, || scratch.learner_through(&home.launcher(), "run", ENDLESS, &arguments));
+    on_core(0, || {
         let endpoint = format!("tcp/{}:{PORT}", home.address);
         // The stranger has an address of his own.
         let address = format!("{}:{PORT}", network.other_address(&home).unwrap());

@@ -209,8 +209,8 @@ fn whatever_strangers_do_the_work_goes_on() {
     }
     let (phase, rounds) = (Duration::from_secs(number("QUAD_SECONDS", 1)), number("QUAD_ROUNDS", 1) as usize);
     let scratch = Scratch::new();
-    let mut learner = on_core(0, || scratch.learner("run", ENDLESS));
-    on_core(1, || {
+    let mut learner = on_core(1, || scratch.learner("run", ENDLESS));
+    on_core(0, || {
         let endpoint = learner.endpoint();
         let runtime = Runtime::new().unwrap();
         learner.process.wait_for_log("snapshot handed to evaluation", PATIENCE);

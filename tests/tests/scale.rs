@@ -58,7 +58,7 @@ impl Scene {
     fn new(setting: Setting, count: usize) -> Scene {
         let (scratch, run) = (Scratch::new(), Name::new("run").unwrap());
         let endpoint = format!("tcp/127.0.0.1:{}", free_port());
-        let learner = on_core(0, || scratch.learner_with("run", setting, &["--connect", &endpoint]));
+        let learner = on_core(1, || scratch.learner_with("run", setting, &["--connect", &endpoint]));
         let runtime = Runtime::new().unwrap();
         let router = runtime.block_on(router(&endpoint));
         learner.metrics();
@@ -105,7 +105,7 @@ impl Scene {
 fn many_evaluators_are_served_and_training_does_not_notice() {
     let (count, seconds) = (number("QUAD_EVALUATORS", 50) as usize, number("QUAD_SECONDS", 2));
     let (phase, rounds) = (Duration::from_secs(seconds), number("QUAD_ROUNDS", 2) as usize);
-    on_core(1, || {
+    on_core(0, || {
         eprintln!("with nothing to do");
         let (_, share) = Scene::new(IDLE, count).work(rounds, phase);
         assert!(share > 0.5, "training is slow beside {count} that wait");

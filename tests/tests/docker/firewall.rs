@@ -20,7 +20,7 @@ fn compose_keeps_out_who_opens_connections_as_fast_as_he_can() {
     let Some(compose) = Compose::project("firewall", "") else { return };
     compose.run(&["up", "--detach", "router", "firewall"]);
     let network = compose.network();
-    let stranger = ["run", "--rm", "--network", &network, "--entrypoint", "bash", "quad/evaluator", "-c"];
+    let stranger = ["run", "--rm", "--network", &network, "--entrypoint", "bash", "quad/firewall", "-c"];
     for round in ["first", "after a restart"] {
         let firewall = compose.container("firewall");
         eventually("the rules are there", PATIENCE, || {
