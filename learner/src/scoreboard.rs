@@ -33,8 +33,9 @@ use crate::resume::Earlier;
 /// After this time an evaluator asks again when there was no job for it, or after this time for each evaluator that there is
 /// if that is longer, so that hundreds which have nothing to do do not keep the learner busy. A new snapshot wakes them all.
 const ASK_AGAIN: [Duration; 2] = [Duration::from_millis(500), Duration::from_millis(100)];
-/// The same for how often progress is told, up to this long.
+/// The same for how often progress is told.
 const TELL_PROGRESS: [Duration; 2] = [Duration::from_secs(1), Duration::from_millis(40)];
+/// Progress is told at least this often.
 const RARELY: Duration = Duration::from_secs(20);
 /// After this time an evaluator asks again that does not have the run's environment.
 const NOT_FOR_YOU: Duration = Duration::from_secs(10);
@@ -216,7 +217,7 @@ impl Scoreboard {
         (waiting / (2 * present.max(1))).clamp(least, most)
     }
 
-    /// How long a job may stay without progress: two messages may be lost.
+    /// How long a job may stay without progress: one message may be lost, and the next one late.
     fn lease(&self, present: usize) -> Duration {
         self.rules.lease.max(3 * among(present, TELL_PROGRESS).min(RARELY))
     }
