@@ -1,6 +1,6 @@
 //! Snapshots are published, and answered from the disk.
 
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
 use quad_protocol::{Hash, Snapshot, decode, keys};
 
@@ -11,20 +11,28 @@ async fn weights_are_published_and_older_ones_are_answered_from_the_disk() {
     let mut bench = Bench::start().await;
     let client = bench.client().await;
     let published = client.declare_subscriber(keys::weights(&bench.run)).await.unwrap();
-    tokio::time::sleep(Duration::from_millis(200)).await; // the learner learns of the subscription
-    bench.snapshot(10).await;
-    let sample = tokio::time::timeout(PATIENCE, published.recv_async()).await.unwrap().unwrap();
-    assert_eq!(decode::<Snapshot>(&sample.payload().to_bytes()).unwrap().step, 10);
-    bench.snapshot(20).await;
-    for step in [10, 20] {
+    // One may be dropped: before the learner knows of the subscription, or while another test's peer does not read.
+    let (start, mut step) = (Instant::now(), 0);
+    let sample = loop {
+        assert!(start.elapsed() < PATIENCE, "nothing is published");
+        step += 10;
+        bench.snapshot(step).await;
+        if let Ok(sample) = tokio::time::timeout(Duration::from_secs(1), published.recv_async()).await {
+            break sample.unwrap();
+        }
+    };
+    let received = decode::<Snapshot>(&sample.payload().to_bytes()).unwrap().step;
+    assert!((10..=step).contains(&received), "{received}");
+    bench.snapshot(step + 10).await;
+    for step in [step, step + 10] {
         let snapshot: Snapshot = ask(&client, keys::weights_at(&bench.run, step), None).await.unwrap().unwrap();
         assert_eq!((snapshot.step, snapshot.hash, snapshot.tensors), (step, Hash::of(&file(step)), file(step)));
     }
     let missing = ask::<Snapshot>(&client, keys::weights_at(&bench.run, 11), None).await.unwrap();
     assert!(missing.unwrap_err().contains("no snapshot"));
 
-    let path = bench.run_dir.path().join("snapshots/step_000000010.safetensors");
+    let path = bench.run_dir.path().join(format!("snapshots/step_{step:09}.safetensors"));
     std::fs::write(path, "something else").unwrap();
-    let changed = ask::<Snapshot>(&client, keys::weights_at(&bench.run, 10), None).await.unwrap();
+    let changed = ask::<Snapshot>(&client, keys::weights_at(&bench.run, step), None).await.unwrap();
     assert!(changed.unwrap_err().contains("was changed"));
 }
