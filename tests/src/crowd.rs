@@ -13,7 +13,7 @@ use quad_protocol::{
 use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 use tokio::task::JoinSet;
-use tokio::time::{sleep, timeout};
+use tokio::time::{sleep, sleep_until, timeout};
 use zenoh::query::{ConsolidationMode, QueryTarget};
 use zenoh::{Config, Session};
 
@@ -21,6 +21,8 @@ use crate::number;
 
 /// An evaluator's patience with its learner.
 const ANSWER: Duration = Duration::from_secs(5);
+/// And its pause before the next question.
+const APART: Duration = Duration::from_millis(50);
 
 /// Most episodes of a job.
 const MOST_EPISODES: u32 = 20;
@@ -129,6 +131,8 @@ struct Member {
     session: Session,
     shared: Arc<Shared>,
     random: ChaCha8Rng,
+    /// When it last got an answer.
+    answered: Option<Instant>,
     /// When it last told its progress.
     told: Option<Instant>,
     /// Has had no job yet since it was still.
@@ -147,7 +151,7 @@ impl Member {
         let session = zenoh::open(config).await.expect("somebody listens");
         let name = Name::new(format!("light-{number}")).expect("a name");
         let random = ChaCha8Rng::seed_from_u64(number as u64);
-        Member { name, session, shared, random, told: None, begins: true }
+        Member { name, session, shared, random, answered: None, told: None, begins: true }
     }
 
     async fn work(mut self) {
@@ -224,7 +228,7 @@ impl Member {
         }
     }
 
-    async fn deliver(&self, report: &ScoreReport) -> Option<()> {
+    async fn deliver(&mut self, report: &ScoreReport) -> Option<()> {
         let (answer, took) = self.ask::<ScoreReply>(keys::scores(&report.run), report).await?;
         assert!(matches!(answer, ScoreReply::Recorded { .. }), "{answer:?}");
         self.shared.note(|measured| measured.reports.push(took));
@@ -238,11 +242,15 @@ impl Member {
     }
 
     /// The answer and how long it took.
-    async fn ask<A: Message>(&self, key: String, question: &impl Message) -> Option<(A, Duration)> {
+    async fn ask<A: Message>(&mut self, key: String, question: &impl Message) -> Option<(A, Duration)> {
+        if let Some(answered) = self.answered {
+            sleep_until((answered + APART).into()).await;
+        }
         let begin = Instant::now();
         let get = self.session.get(key).payload(encode(question).expect("it is small")).timeout(ANSWER);
         let get = get.target(QueryTarget::All).consolidation(ConsolidationMode::None).await;
         let reply = get.expect("the session is open").recv_async().await.ok();
+        self.answered = Some(Instant::now());
         let Some(Ok(sample)) = reply.map(|reply| reply.into_result()) else {
             self.shared.note(|measured| measured.unanswered += 1);
             return None;

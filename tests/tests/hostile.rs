@@ -15,7 +15,8 @@ use quad_service::{Endpoints, open_session};
 use quad_tests::crowd::{Crowd, Pace};
 use quad_tests::knock::knock;
 use quad_tests::pace::{ENDLESS, compare, median, on_core};
-use quad_tests::system::Scratch;
+use quad_tests::router::router;
+use quad_tests::system::{Learner, Scratch, free_port};
 use quad_tests::{PATIENCE, eventually, http, number};
 use tokio::runtime::Runtime;
 use zenoh::Session;
@@ -202,31 +203,54 @@ async fn read_nothing(endpoint: String) {
     Command::new("sh").args(["-c", &stop]).status().unwrap();
 }
 
-#[test]
-fn whatever_strangers_do_the_work_goes_on() {
-    if let Ok(endpoint) = std::env::var(STRANGER) {
-        return Runtime::new().unwrap().block_on(read_nothing(endpoint));
+/// A learner on one core, and five evaluators that work for it.
+struct Scene {
+    _scratch: Scratch,
+    learner: Learner,
+    endpoint: String,
+    runtime: Runtime,
+    crowd: Crowd,
+    _router: Option<Session>,
+}
+
+impl Scene {
+    /// They meet at the learner.
+    fn direct() -> Scene {
+        let (scratch, runtime) = (Scratch::new(), Runtime::new().unwrap());
+        let learner = on_core(1, || scratch.learner("run", ENDLESS));
+        Self::begin(scratch, runtime, learner.endpoint(), learner, None)
     }
-    let (phase, rounds) = (Duration::from_secs(number("QUAD_SECONDS", 1)), number("QUAD_ROUNDS", 1) as usize);
-    let scratch = Scratch::new();
-    let mut learner = on_core(1, || scratch.learner("run", ENDLESS));
-    on_core(0, || {
-        let endpoint = learner.endpoint();
-        let runtime = Runtime::new().unwrap();
+
+    /// They meet at a router, as Docker Compose starts it, that shares a core with the stranger.
+    fn behind_a_router() -> Scene {
+        let (scratch, runtime) = (Scratch::new(), Runtime::new().unwrap());
+        let endpoint = format!("tcp/127.0.0.1:{}", free_port());
+        let router = runtime.block_on(router(&endpoint));
+        let learner = on_core(1, || scratch.learner_with("run", ENDLESS, &["--connect", &endpoint]));
+        Self::begin(scratch, runtime, endpoint, learner, Some(router))
+    }
+
+    fn begin(scratch: Scratch, runtime: Runtime, endpoint: String, learner: Learner, router: Option<Session>) -> Scene {
         learner.process.wait_for_log("snapshot handed to evaluation", PATIENCE);
         let crowd = runtime.block_on(Crowd::connect(HONEST, &run(), &endpoint));
         crowd.set(Pace::Real);
-        let quiet_memory = learner.process.peak_memory();
+        Scene { _scratch: scratch, learner, endpoint, runtime, crowd, _router: router }
+    }
+
+    /// Lets the stranger try one after the other.
+    fn bears(mut self, attacks: &[Attack]) {
+        let (phase, rounds) = (Duration::from_secs(number("QUAD_SECONDS", 1)), number("QUAD_ROUNDS", 1) as usize);
+        let quiet_memory = self.learner.process.peak_memory();
         let (mut shares, mut taken) = (Vec::new(), Vec::new());
-        for attack in ATTACKS {
+        for &attack in attacks {
             let mut stranger = None;
-            crowd.measured();
-            let [quiet, loud] = compare(&learner, rounds, phase, |loud| {
-                stranger = loud.then(|| Stranger::start(attack, &runtime, &endpoint));
+            self.crowd.measured();
+            let [quiet, loud] = compare(&self.learner, rounds, phase, |loud| {
+                stranger = loud.then(|| Stranger::start(attack, &self.runtime, &self.endpoint));
             });
             // Nobody is served less than before: whoever has waited gets an answer.
             let claims = eventually("claims are answered", PATIENCE, || {
-                let claims = crowd.measured().claims;
+                let claims = self.crowd.measured().claims;
                 (!claims.is_empty()).then_some(claims)
             });
             let slowest = claims.iter().max().unwrap();
@@ -240,11 +264,24 @@ fn whatever_strangers_do_the_work_goes_on() {
         let taken = median(taken.into_iter());
         assert!(taken < 0.05, "most attacks take {taken:.3} s of processor time a second");
         assert!(median(shares.iter().copied()) > 0.7, "training at {shares:.2?}");
-        let growth = learner.process.peak_memory().saturating_sub(quiet_memory) >> 20;
-        let page = http::metrics(&learner.metrics()).unwrap();
+        let growth = self.learner.process.peak_memory().saturating_sub(quiet_memory) >> 20;
+        let page = http::metrics(&self.learner.metrics()).unwrap();
         let rejected = page.lines().filter(|line| line.starts_with("quad_learner_rejected"));
         eprintln!("memory: at most {growth} MiB more\n{}", rejected.collect::<Vec<_>>().join("\n"));
         assert!(growth < 400, "the attacks took {growth} MiB");
-        assert!(learner.process.is_running());
+        assert!(self.learner.process.is_running());
+    }
+}
+
+#[test]
+fn whatever_strangers_do_the_work_goes_on() {
+    if let Ok(endpoint) = std::env::var(STRANGER) {
+        return Runtime::new().unwrap().block_on(read_nothing(endpoint));
+    }
+    on_core(0, || {
+        eprintln!("at a learner that listens");
+        Scene::direct().bears(&ATTACKS);
+        eprintln!("at its router");
+        Scene::behind_a_router().bears(&ATTACKS);
     });
 }

@@ -1,7 +1,12 @@
 //! Several runs behind one router, one evaluator for all of them.
 #![allow(clippy::unwrap_used, clippy::expect_used)]
 
-use quad_tests::router::router;
+use std::sync::Arc;
+use std::sync::atomic::{AtomicUsize, Ordering::Relaxed};
+use std::time::{Duration, Instant};
+
+use quad_service::{Endpoints, open_session};
+use quad_tests::router::{configuration, router};
 use quad_tests::system::{Scratch, Setting, free_port};
 use quad_tests::{PATIENCE, eventually, http};
 
@@ -65,4 +70,62 @@ async fn scores_measured_while_cut_off_are_delivered_later() {
     let page = http::metrics(&evaluator.metrics()).unwrap();
     let measured = http::sum(&page, "quad_evaluator_episodes_total", "");
     assert_eq!(measured, f64::from(setting.episodes), "nothing was measured twice");
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn a_flood_ends_at_the_router_and_an_evaluator_of_many_runs_is_none() {
+    let scratch = Scratch::new();
+    let endpoint = format!("tcp/127.0.0.1:{}", free_port());
+    let session = router(&endpoint).await;
+    let idle = Setting { steps: 100_000_000, eval_interval: 50_000_000, ..Setting::default() };
+    let learners = ["a", "b", "c"].map(|run| scratch.learner_with(run, idle, &["--connect", &endpoint]));
+    let evaluator = scratch.evaluator("shared", &endpoint);
+    for learner in &learners {
+        eventually("the evaluator is there", PATIENCE, || {
+            let page = http::metrics(&learner.metrics())?;
+            (http::sum(&page, "quad_learner_evaluators", "") == 1.0).then_some(())
+        });
+    }
+    // It asks each of them ten times a second or more, and would complain after five seconds without an answer.
+    let honest = tokio::time::sleep(Duration::from_secs(7));
+
+    let flood = async {
+        let endpoints = Endpoints { connect: vec![endpoint.clone()], ..Endpoints::default() };
+        let stranger = open_session(&endpoints).await.unwrap();
+        let keys = ["jobs", "scores", "weights/1", "progress/e"].map(|key| format!("quad/flooded/{key}"));
+        let arrived = [0; 4].map(|_| Arc::new(AtomicUsize::new(0)));
+        let counting = |count: &Arc<AtomicUsize>| {
+            let count = count.clone();
+            move || {
+                count.fetch_add(1, Relaxed);
+            }
+        };
+        let mut queryables = Vec::new();
+        for (key, count) in keys.iter().zip(&arrived).take(3) {
+            let count = counting(count);
+            queryables.push(session.declare_queryable(key).callback(move |_| count()).await.unwrap());
+        }
+        let count = counting(&arrived[3]);
+        let _progress = session.declare_subscriber(&keys[3]).callback(move |_| count()).await.unwrap();
+        let begin = Instant::now();
+        while begin.elapsed() < Duration::from_secs(2) {
+            for key in &keys[..3] {
+                stranger.get(key).timeout(Duration::from_secs(1)).callback(drop).await.unwrap();
+            }
+            stranger.put(&keys[3], "words").await.unwrap();
+            tokio::time::sleep(Duration::from_millis(1)).await;
+        }
+        tokio::time::sleep(Duration::from_millis(200)).await;
+        let most = (begin.elapsed().as_secs_f64() * 25.0) as usize + 1;
+        for (key, count) in keys.iter().zip(&arrived) {
+            let count = count.load(Relaxed);
+            assert!((1..=most).contains(&count), "{count} messages at {key} were passed on");
+        }
+    };
+    tokio::join!(honest, flood);
+    assert!(!evaluator.process.log().contains("nobody answered"), "{}", evaluator.process.log());
+
+    let [plain, protected] =
+        ["router.json5", "router-tls.json5"].map(|file| configuration(file).get_json("downsampling").unwrap());
+    assert_eq!(plain, protected, "both routers end the same floods");
 }

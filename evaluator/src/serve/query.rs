@@ -1,7 +1,7 @@
 //! A query to a learner.
 
 use std::sync::{Arc, Mutex, PoisonError};
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
 use quad_protocol::{Message, decode_from};
 use tokio::sync::oneshot;
@@ -38,6 +38,39 @@ pub enum AskError {
     },
 }
 
+/// After an answer, at least so much time passes before the next question. A router drops questions that come closer together
+/// (`downsampling` in its configuration, deploy/zenoh/router.json5): those of a stranger's flood, and it would drop those of an
+/// evaluator of many runs.
+const APART: Duration = Duration::from_millis(50);
+
+/// When the last question was asked or, later, over.
+static LAST: Mutex<Option<Instant>> = Mutex::new(None);
+
+/// The right to ask a question, until that is over.
+pub struct Turn(());
+
+/// Waits until this process may ask its next question.
+pub async fn take_turn() -> Turn {
+    let begin = note_turn(APART);
+    tokio::time::sleep_until(begin.into()).await;
+    Turn(())
+}
+
+/// Of a question that is asked so long after the last one, or of one that is over.
+fn note_turn(after: Duration) -> Instant {
+    let mut last = LAST.lock().unwrap_or_else(PoisonError::into_inner);
+    let now = Instant::now();
+    let turn = last.map_or(now, |last| now.max(last + after));
+    *last = Some(turn);
+    turn
+}
+
+impl Drop for Turn {
+    fn drop(&mut self) {
+        note_turn(Duration::ZERO);
+    }
+}
+
 /// What one question gathers.
 struct Gathered<A> {
     /// Gone as soon as there is an answer.
@@ -55,6 +88,7 @@ pub async fn ask<A: Message + Send + 'static>(
     metrics: &Metrics,
     fitting: impl Fn(&A) -> Result<(), &'static str> + Send + Sync + 'static,
 ) -> Result<A, AskError> {
+    let _turn = take_turn().await;
     let (tell, told) = oneshot::channel();
     let gathered = Arc::new(Mutex::new(Gathered { tell: Some(tell), unusable: None }));
     let callback = {
