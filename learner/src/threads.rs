@@ -31,7 +31,7 @@ use crate::train::Row;
 use crate::trainer::{Trainer, TrainingResult};
 
 /// Most episodes in one job: two evaluators share an evaluation of ten. And most if hundreds wait.
-const JOB_EPISODES: [usize; 2] = [5, 20];
+const JOB_EPISODES: [usize; 2] = [5, 40];
 /// An evaluator tells its progress three times meanwhile or more often, and Zenoh notices a lost one after about 5 s.
 const LEASE: Duration = Duration::from_secs(15);
 /// A thread that answers others, or writes to the disk, is stuck if it has said nothing for so long.

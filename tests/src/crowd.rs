@@ -1,6 +1,7 @@
 //! Evaluators that do everything on the wire and nothing else: they claim, report progress and deliver scores that they made
 //! up. Hundreds of them fit into one test.
 
+use std::collections::BTreeMap;
 use std::mem;
 use std::sync::atomic::{AtomicU8, AtomicUsize, Ordering::Relaxed};
 use std::sync::{Arc, Mutex};
@@ -21,11 +22,11 @@ use crate::number;
 
 /// An evaluator's patience with its learner.
 const ANSWER: Duration = Duration::from_secs(5);
-/// And its pause before the next question.
+/// And its pause before the next question of the kind.
 const APART: Duration = Duration::from_millis(50);
 
 /// Most episodes of a job.
-const MOST_EPISODES: u32 = 20;
+const MOST_EPISODES: u32 = 40;
 
 /// An episode at a real pace takes this long, or half of it.
 fn longest_episode() -> Duration {
@@ -131,8 +132,8 @@ struct Member {
     session: Session,
     shared: Arc<Shared>,
     random: ChaCha8Rng,
-    /// When it last got an answer.
-    answered: Option<Instant>,
+    /// When it last got an answer, by the key that it asked.
+    answered: BTreeMap<String, Instant>,
     /// When it last told its progress.
     told: Option<Instant>,
     /// Has had no job yet since it was still.
@@ -151,7 +152,7 @@ impl Member {
         let session = zenoh::open(config).await.expect("somebody listens");
         let name = Name::new(format!("light-{number}")).expect("a name");
         let random = ChaCha8Rng::seed_from_u64(number as u64);
-        Member { name, session, shared, random, answered: None, told: None, begins: true }
+        Member { name, session, shared, random, answered: BTreeMap::new(), told: None, begins: true }
     }
 
     async fn work(mut self) {
@@ -243,14 +244,14 @@ impl Member {
 
     /// The answer and how long it took.
     async fn ask<A: Message>(&mut self, key: String, question: &impl Message) -> Option<(A, Duration)> {
-        if let Some(answered) = self.answered {
+        if let Some(&answered) = self.answered.get(&key) {
             sleep_until((answered + APART).into()).await;
         }
         let begin = Instant::now();
-        let get = self.session.get(key).payload(encode(question).expect("it is small")).timeout(ANSWER);
+        let get = self.session.get(&key).payload(encode(question).expect("it is small")).timeout(ANSWER);
         let get = get.target(QueryTarget::All).consolidation(ConsolidationMode::None).await;
         let reply = get.expect("the session is open").recv_async().await.ok();
-        self.answered = Some(Instant::now());
+        self.answered.insert(key, Instant::now());
         let Some(Ok(sample)) = reply.map(|reply| reply.into_result()) else {
             self.shared.note(|measured| measured.unanswered += 1);
             return None;

@@ -14,7 +14,7 @@ use crate::rollout::{EpisodeOutcome, Rollout};
 
 /// Most rows (episodes × candidates) of one network call. The paper's job has 100.
 const MAX_ROWS: usize = 65_536;
-/// Most episodes: each is a simulation of its own. A learner gives twenty at most.
+/// Most episodes: each is a simulation of its own. A learner gives forty at most.
 const MAX_EPISODES: usize = 256;
 /// Most memory that one network call may take, bytes.
 const MAX_BYTES: u64 = 1 << 30;

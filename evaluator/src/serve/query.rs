@@ -1,5 +1,6 @@
 //! A query to a learner.
 
+use std::collections::BTreeMap;
 use std::sync::{Arc, Mutex, PoisonError};
 use std::time::{Duration, Instant};
 
@@ -38,36 +39,47 @@ pub enum AskError {
     },
 }
 
-/// After an answer, at least so much time passes before the next question. A router drops questions that come closer together
-/// (`downsampling` in its configuration, deploy/zenoh/router.json5): those of a stranger's flood, and it would drop those of an
-/// evaluator of many runs.
+/// After an answer, at least so much time passes before the next question of its kind. A router drops those that come closer
+/// together (`downsampling` in its configuration, deploy/zenoh/router.json5): those of a stranger's flood, and it would drop
+/// those of an evaluator of many runs.
 const APART: Duration = Duration::from_millis(50);
 
-/// When the last question was asked or, later, over.
-static LAST: Mutex<Option<Instant>> = Mutex::new(None);
+/// When the last question of each kind was asked or, later, over.
+static LAST: Mutex<BTreeMap<Kind, Instant>> = Mutex::new(BTreeMap::new());
+
+/// What learners are asked for; a router counts each for itself.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
+pub enum Kind {
+    /// A job, or to take one back.
+    Job,
+    /// To record scores.
+    Scores,
+    /// A snapshot.
+    Weights,
+}
 
 /// The right to ask a question, until that is over.
-pub struct Turn(());
+pub struct Turn(Kind);
 
-/// Waits until this process may ask its next question.
-pub async fn take_turn() -> Turn {
-    let begin = note_turn(APART);
+/// Waits until this process may ask its next question of this kind.
+pub async fn take_turn(kind: Kind) -> Turn {
+    let begin = note_turn(kind, APART);
     tokio::time::sleep_until(begin.into()).await;
-    Turn(())
+    Turn(kind)
 }
 
 /// Of a question that is asked so long after the last one, or of one that is over.
-fn note_turn(after: Duration) -> Instant {
+fn note_turn(kind: Kind, after: Duration) -> Instant {
     let mut last = LAST.lock().unwrap_or_else(PoisonError::into_inner);
     let now = Instant::now();
-    let turn = last.map_or(now, |last| now.max(last + after));
-    *last = Some(turn);
+    let turn = last.get(&kind).map_or(now, |&last| now.max(last + after));
+    last.insert(kind, turn);
     turn
 }
 
 impl Drop for Turn {
     fn drop(&mut self) {
-        note_turn(Duration::ZERO);
+        note_turn(self.0, Duration::ZERO);
     }
 }
 
@@ -82,13 +94,13 @@ struct Gathered<A> {
 /// metric's label of what is wrong with one that is not. Whoever else answers, or never does, is not waited for.
 pub async fn ask<A: Message + Send + 'static>(
     session: &Session,
-    key: String,
+    (kind, key): (Kind, String),
     question: Vec<u8>,
     timeout: Duration,
     metrics: &Metrics,
     fitting: impl Fn(&A) -> Result<(), &'static str> + Send + Sync + 'static,
 ) -> Result<A, AskError> {
-    let _turn = take_turn().await;
+    let _turn = take_turn(kind).await;
     let (tell, told) = oneshot::channel();
     let gathered = Arc::new(Mutex::new(Gathered { tell: Some(tell), unusable: None }));
     let callback = {
