@@ -13,7 +13,7 @@ use quad_service::{Endpoints, Role, default_endpoint, parse_endpoint};
 use zenoh::Session;
 
 use crate::rollout::Rollout;
-use crate::serve::{DEFAULT_PORT, Kind, take_turn};
+use crate::serve::{DEFAULT_PORT, take_turn};
 
 /// How long learners are waited for.
 const ANSWER: Duration = Duration::from_secs(5);
@@ -109,8 +109,9 @@ async fn version(findings: &mut Findings, session: &Session, run: &Name) -> anyh
     let precision = Name::new(Precision::Bf16.in_effect().name())?;
     let claim = JobRequest::Claim { evaluator, attempt: rand::random(), environments: Vec::new(), precision };
     let question = encode(&claim)?;
-    let _turn = take_turn(Kind::Job).await;
-    let replies = session.get(keys::jobs(run)).payload(question).timeout(ANSWER).await;
+    let key = keys::jobs(run);
+    let _turn = take_turn(&key).await;
+    let replies = session.get(key).payload(question).timeout(ANSWER).await;
     let replies = replies.map_err(|error| anyhow::anyhow!(error)).context("cannot ask a learner")?;
     let Ok(reply) = replies.recv_async().await else {
         let hint = "is its machine overloaded, or its process stopped? Its log and its /healthz say more";

@@ -6,7 +6,7 @@ use quad_protocol::{Job, JobReply, JobRequest, Name, encode, keys};
 use tracing::{debug, info};
 use zenoh::Session;
 
-use super::query::{Kind, ask};
+use super::query::ask;
 use crate::metrics::Metrics;
 
 /// A job that is to be handed back, so that it need not wait for the end of its lease.
@@ -32,8 +32,7 @@ impl HandBack {
             _ => Err("unexpected"),
         };
         let Ok(request) = encode(&JobRequest::HandBack { evaluator: self.evaluator, job: id, lease }) else { return };
-        let key = (Kind::Job, keys::jobs(&run));
-        match ask(&self.session, key, request, patience, &self.metrics, fitting).await {
+        match ask(&self.session, keys::jobs(&run), request, patience, &self.metrics, fitting).await {
             Ok(JobReply::HandedBack { accepted: true, .. }) => info!(%run, "a job was handed back"),
             Ok(_) => debug!(%run, "a job that was to be handed back had been taken away"),
             Err(error) => debug!(%run, %error, "a job could not be handed back"),

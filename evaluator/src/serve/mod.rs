@@ -42,7 +42,7 @@ use tracing::{info, warn};
 
 use crate::metrics::Metrics;
 use discovery::Discovery;
-pub(crate) use query::{Kind, take_turn};
+pub(crate) use query::take_turn;
 use worker::Worker;
 
 const AFTER_HELP: &str = "\

@@ -45,41 +45,37 @@ pub enum AskError {
 const APART: Duration = Duration::from_millis(50);
 
 /// When the last question of each kind was asked or, later, over.
-static LAST: Mutex<BTreeMap<Kind, Instant>> = Mutex::new(BTreeMap::new());
+static LAST: Mutex<BTreeMap<String, Instant>> = Mutex::new(BTreeMap::new());
 
-/// What learners are asked for; a router counts each for itself.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
-pub enum Kind {
-    /// A job, or to take one back.
-    Job,
-    /// To record scores.
-    Scores,
-    /// A snapshot.
-    Weights,
+/// What is asked for at `key`, which a router counts for all runs together: `jobs`, `scores` or `weights`.
+fn kind(key: &str) -> &str {
+    key.split('/').nth(2).unwrap_or_default()
 }
 
-/// The right to ask a question, until that is over.
-pub struct Turn(Kind);
+/// The right to ask a question of its kind, until that is over.
+pub struct Turn(String);
 
-/// Waits until this process may ask its next question of this kind.
-pub async fn take_turn(kind: Kind) -> Turn {
-    let begin = note_turn(kind, APART);
-    tokio::time::sleep_until(begin.into()).await;
-    Turn(kind)
-}
-
-/// Of a question that is asked so long after the last one, or of one that is over.
-fn note_turn(kind: Kind, after: Duration) -> Instant {
-    let mut last = LAST.lock().unwrap_or_else(PoisonError::into_inner);
-    let now = Instant::now();
-    let turn = last.get(&kind).map_or(now, |&last| now.max(last + after));
-    last.insert(kind, turn);
+/// Waits until this process may ask its next question of the kind of `key`.
+pub async fn take_turn(key: &str) -> Turn {
+    let turn = Turn(kind(key).to_owned());
+    tokio::time::sleep_until(turn.note(APART).into()).await;
     turn
+}
+
+impl Turn {
+    /// Of a question that is asked so long after the last one, or of one that is over.
+    fn note(&self, after: Duration) -> Instant {
+        let mut last = LAST.lock().unwrap_or_else(PoisonError::into_inner);
+        let now = Instant::now();
+        let turn = last.get(&self.0).map_or(now, |&last| now.max(last + after));
+        last.insert(self.0.clone(), turn);
+        turn
+    }
 }
 
 impl Drop for Turn {
     fn drop(&mut self) {
-        note_turn(self.0, Duration::ZERO);
+        self.note(Duration::ZERO);
     }
 }
 
@@ -94,13 +90,13 @@ struct Gathered<A> {
 /// metric's label of what is wrong with one that is not. Whoever else answers, or never does, is not waited for.
 pub async fn ask<A: Message + Send + 'static>(
     session: &Session,
-    (kind, key): (Kind, String),
+    key: String,
     question: Vec<u8>,
     timeout: Duration,
     metrics: &Metrics,
     fitting: impl Fn(&A) -> Result<(), &'static str> + Send + Sync + 'static,
 ) -> Result<A, AskError> {
-    let _turn = take_turn(kind).await;
+    let _turn = take_turn(&key).await;
     let (tell, told) = oneshot::channel();
     let gathered = Arc::new(Mutex::new(Gathered { tell: Some(tell), unusable: None }));
     let callback = {
@@ -169,5 +165,21 @@ fn read<A: Message>(
             warn!(key, "the learner answered with an error: {text}");
             Err(text)
         }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use quad_protocol::{Name, keys};
+
+    use super::kind;
+
+    #[test]
+    fn a_kind_is_what_is_asked_for_whatever_the_run() {
+        let [one, other] = ["one", "other"].map(|run| Name::new(run).unwrap());
+        let kinds =
+            |run| [keys::jobs(run), keys::scores(run), keys::weights_at(run, 7)].map(|key| kind(&key).to_owned());
+        assert_eq!(kinds(&one), ["jobs", "scores", "weights"]);
+        assert_eq!(kinds(&other), kinds(&one));
     }
 }

@@ -17,7 +17,7 @@ use zenoh::liveliness::LivelinessToken;
 use super::budget::Budget;
 use super::discovery::Found;
 use super::hand_back::HandBack;
-use super::query::{Kind, ask};
+use super::query::ask;
 use super::snapshots::SnapshotReceiver;
 use super::turns::Standing;
 use crate::metrics::{JobOutcome, Metrics};
@@ -162,7 +162,7 @@ impl RunClient {
             JobReply::HandedBack { .. } => Err("unexpected"),
             _ => Ok(()),
         };
-        let key = (Kind::Job, keys::jobs(&self.run));
+        let key = keys::jobs(&self.run);
         let answer = ask(&self.session, key, request, ANSWER_TIMEOUT, &self.metrics, fitting).await?;
         self.attempt = None;
         match answer {
@@ -189,7 +189,7 @@ impl RunClient {
         if let Some(snapshot) = self.snapshots.get(job) {
             return Ok(snapshot);
         }
-        let key = (Kind::Weights, keys::weights_at(&self.run, job.step));
+        let key = keys::weights_at(&self.run, job.step);
         let request = encode(&WeightsRequest { evaluator: self.identity.evaluator.clone() })?;
         let wanted = (job.run.clone(), job.incarnation, job.step, job.weights);
         let fitting = move |found: &Snapshot| {
@@ -243,7 +243,7 @@ impl RunClient {
             true => Ok(()),
             false => Err("other_incarnation"),
         };
-        let key = (Kind::Scores, keys::scores(&self.run));
+        let key = keys::scores(&self.run);
         let answer = ask(&self.session, key, encode(report)?, ANSWER_TIMEOUT, &self.metrics, fitting).await?;
         let (run, step) = (&self.run, report.step);
         let accepted = matches!(answer, ScoreReply::Recorded { .. }) && report.cannot_act.is_none();
