@@ -20,8 +20,6 @@ use quad_service::{Beat, hinted, stay_in_background};
 use tokio::sync::mpsc::UnboundedSender;
 use tracing::{debug, warn};
 use zenoh::Session;
-use zenoh::bytes::ZBytes;
-use zenoh::sample::{Sample, SampleKind};
 
 use crate::inbox::Messages;
 use crate::metrics::Metrics;
@@ -61,9 +59,11 @@ pub enum Event {
     /// An evaluator delivers scores.
     Report(Question),
     /// An evaluator reports a job's progress.
-    Progress(Sample),
-    /// A liveliness token of an evaluator came or went.
-    Liveliness(Sample),
+    Progress(Vec<u8>),
+    /// An evaluator is there.
+    Joined(Name),
+    /// An evaluator is gone.
+    Left(Name),
     /// Another learner has the run's name: what to say of it.
     Twin(anyhow::Error),
     /// The scores that the scribe had were written, or why not.
@@ -184,23 +184,24 @@ impl Hub {
             }
             Event::Online(session) => self.session = Some(session),
             Event::Job(question) => {
-                let reply = parse(question.payload()).map(|request| self.job(request));
+                let reply = parse(question.message()).map(|request| self.job(request));
                 self.answer(question, keys::jobs(&self.run), reply);
             }
-            Event::Report(question) => match parse(question.payload()) {
+            Event::Report(question) => match parse(question.message()) {
                 Ok(report) => self.report(question, report),
                 Err(rejection) => self.answer::<ScoreReply>(question, keys::scores(&self.run), Err(rejection)),
             },
-            Event::Progress(sample) => {
-                if let Err(rejection) = self.progress(&sample) {
+            Event::Progress(message) => {
+                if let Err(rejection) = self.progress(&message) {
                     self.reject(&rejection);
                 }
             }
-            Event::Liveliness(sample) => {
-                if let Err(rejection) = self.liveliness(&sample) {
+            Event::Joined(evaluator) => {
+                if let Err(rejection) = self.evaluators.joined(evaluator) {
                     self.reject(&rejection);
                 }
             }
+            Event::Left(evaluator) => self.left(evaluator),
             Event::Twin(error) => {
                 self.notices.send(Notice::Failed(error)).ok();
             }
@@ -238,25 +239,19 @@ impl Hub {
         }
     }
 
-    fn progress(&mut self, sample: &Sample) -> Result<(), Rejection> {
-        let progress: Progress = parse(Some(sample.payload()))?;
+    fn progress(&mut self, message: &[u8]) -> Result<(), Rejection> {
+        let progress: Progress = parse(Some(message))?;
         let now = Instant::now();
         self.scoreboard.progress(&progress, now)?;
         self.evaluators.heard(progress, now)
     }
 
-    fn liveliness(&mut self, sample: &Sample) -> Result<(), Rejection> {
-        let evaluator = keys::evaluator_of(sample.key_expr().as_str()).ok_or(Rejection::Name)?;
-        match sample.kind() {
-            SampleKind::Put => self.evaluators.joined(evaluator)?,
-            SampleKind::Delete if self.evaluators.remove(&evaluator) => {
-                let lost = self.scoreboard.evaluator_gone(&evaluator);
-                self.evaluators.left(evaluator, lost.jobs);
-                self.lost(lost);
-            }
-            SampleKind::Delete => {}
+    fn left(&mut self, evaluator: Name) {
+        if self.evaluators.remove(&evaluator) {
+            let lost = self.scoreboard.evaluator_gone(&evaluator);
+            self.evaluators.left(evaluator, lost.jobs);
+            self.lost(lost);
         }
-        Ok(())
     }
 
     fn tick(&mut self, now: Instant) {
@@ -309,6 +304,6 @@ fn other_weights(error: OtherWeights) -> anyhow::Error {
     hinted(error, hint)
 }
 
-fn parse<M: Message>(payload: Option<&ZBytes>) -> Result<M, Rejection> {
-    Ok(decode(&payload.ok_or(Rejection::Empty)?.to_bytes())?)
+fn parse<M: Message>(message: Option<&[u8]>) -> Result<M, Rejection> {
+    Ok(decode(message.ok_or(Rejection::Empty)?)?)
 }

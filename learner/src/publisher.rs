@@ -136,7 +136,7 @@ impl SnapshotPublisher {
             return;
         };
         let key = keys::weights_at(&self.identity.run, step);
-        let request = question.payload().map(|payload| decode::<WeightsRequest>(&payload.to_bytes()));
+        let request = question.message().map(decode::<WeightsRequest>);
         let asker = match request {
             Some(Ok(request)) => Asker::Evaluator(request.evaluator),
             _ => Asker::Stranger,

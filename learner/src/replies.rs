@@ -9,21 +9,23 @@
 //! What is left is Zenoh's own: when it closes the connection of a peer that is still being sent to, its one sending thread
 //! waits for that sender, so the peers of this session hear nothing for two seconds, or four. They connect again by themselves.
 
+mod question;
+
 use std::collections::VecDeque;
-use std::mem;
 use std::sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError};
 use std::thread;
 use std::time::{Duration, Instant};
 
 use quad_protocol::Name;
 use quad_service::stay_in_background;
-use tracing::debug;
-use zenoh::Wait;
 use zenoh::bytes::ZBytes;
-use zenoh::key_expr::KeyExpr;
 use zenoh::query::Query;
 
 use crate::metrics::Metrics;
+
+use question::kept;
+
+pub use question::Question;
 
 /// Threads that answer.
 const THREADS: usize = 12;
@@ -36,6 +38,8 @@ const LATER: Duration = Duration::from_millis(500);
 const MOST_WAITING: usize = 4096;
 const MOST_WAITING_OF_ONE: usize = 64;
 const MOST_DROPPED: usize = 256;
+/// And what their queries may keep in memory together, bytes.
+const MOST_BYTES_WAITING: usize = 16 << 20;
 
 /// Who gets an answer.
 #[derive(Clone, Debug, PartialEq, Eq)]
@@ -170,16 +174,13 @@ impl Replies {
         }
     }
 
-    /// A query that came in.
-    pub fn question(&self, query: Query) -> Question {
-        Question { query: Some(query), replies: self.clone() }
-    }
-
     fn put(&self, task: Task) {
         let mut state = self.shared.lock();
         let of_one = state.waiting.iter().filter(|waiting| waiting.asker == task.asker).count();
         let most = if task.asker == Asker::Nobody { MOST_DROPPED } else { MOST_WAITING_OF_ONE };
-        if state.waiting.len() < MOST_WAITING && of_one < most {
+        let bytes: usize = state.waiting.iter().map(|waiting| kept(&waiting.query)).sum();
+        let fits = bytes + kept(&task.query) <= MOST_BYTES_WAITING;
+        if state.waiting.len() < MOST_WAITING && of_one < most && fits {
             state.waiting.push_back(task);
             if state.calls() {
                 drop(state);
@@ -251,58 +252,5 @@ impl Shared {
                 state.busy.swap_remove(place);
             }
         }
-    }
-}
-
-/// A query that came in. It is answered, and also dropped, on a thread of [`Replies`].
-pub struct Question {
-    query: Option<Query>,
-    replies: Replies,
-}
-
-impl Question {
-    /// What it asks for.
-    pub fn key(&self) -> Option<&KeyExpr<'static>> {
-        self.query.as_ref().map(Query::key_expr)
-    }
-
-    /// What came with it.
-    pub fn payload(&self) -> Option<&ZBytes> {
-        self.query.as_ref().and_then(Query::payload)
-    }
-
-    /// Answers it.
-    pub fn answer(self, asker: Asker, answer: Answer) {
-        self.answer_with(asker, move || answer);
-    }
-
-    /// Answers it with something that takes time to make, like what has to be read from the disk.
-    pub fn answer_with(mut self, asker: Asker, answer: impl FnOnce() -> Answer + Send + 'static) {
-        let send = move |query: &Query| {
-            let sent = match answer() {
-                Ok((key, bytes)) => query.reply(key, bytes).wait(),
-                Err(text) => query.reply_err(text).wait(),
-            };
-            if let Err(error) = sent {
-                debug!(%error, "an answer could not be sent");
-            }
-        };
-        if let Some(query) = mem::take(&mut self.query) {
-            self.replies.put(Task::answer(asker, query, Box::new(send)));
-        }
-    }
-}
-
-impl Drop for Question {
-    fn drop(&mut self) {
-        if let Some(query) = mem::take(&mut self.query) {
-            self.replies.put(Task::drop_later(Asker::Nobody, query));
-        }
-    }
-}
-
-impl std::fmt::Debug for Question {
-    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
-        f.debug_tuple("Question").field(&self.key()).finish()
     }
 }

@@ -1,5 +1,6 @@
 //! Everything the learner declares on Zenoh, in one place. The callbacks only put messages into inboxes, and make connections
-//! wait that send too many.
+//! wait that send too many. They copy each message: as Zenoh hands it over, it keeps the whole buffer of 64 KiB that it was
+//! received in.
 
 mod flood;
 mod twin;
@@ -91,7 +92,7 @@ impl Wire {
                 let bytes = sample.payload().len();
                 if bytes > MOST_BYTES {
                     counted.reject("oversized");
-                } else if inbox.offer(hub::Event::Progress(sample), bytes).is_err() {
+                } else if inbox.offer(hub::Event::Progress(sample.payload().to_bytes().into_owned()), bytes).is_err() {
                     counted.reject("busy");
                 }
             })
@@ -107,8 +108,15 @@ impl Wire {
                 if sample.kind() == SampleKind::Put {
                     guard.message();
                 }
+                let Some(evaluator) = keys::evaluator_of(sample.key_expr().as_str()) else {
+                    return counted.reject("invalid_name");
+                };
+                let change = match sample.kind() {
+                    SampleKind::Put => hub::Event::Joined(evaluator),
+                    SampleKind::Delete => hub::Event::Left(evaluator),
+                };
                 // What is lost here is a name in the display, or a job that waits for the end of its lease.
-                if inbox.offer_change(hub::Event::Liveliness(sample)).is_err() {
+                if inbox.offer_change(change).is_err() {
                     counted.reject("busy");
                 }
             })
@@ -161,8 +169,8 @@ impl Server<'_> {
         let guard = self.flood.clone();
         let callback = move |query: Query| {
             guard.message();
-            let question = replies.question(query);
-            let bytes = question.payload().map_or(0, |payload| payload.len());
+            let question = Question::new(query, &replies);
+            let bytes = question.bytes();
             if bytes > MOST_BYTES {
                 metrics.reject("oversized");
                 question.answer(Asker::Stranger, Err("the message is too large".to_owned()));
@@ -195,7 +203,7 @@ impl Server<'_> {
         };
         let asked = move |query: Query| {
             if asked(query.key_expr()) {
-                replies.question(query);
+                Question::new(query, &replies);
             }
         };
         let remote = Locality::Remote;

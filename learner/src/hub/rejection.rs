@@ -13,8 +13,6 @@ pub(super) enum Rejection {
     Codec(#[from] CodecError),
     #[error("refused: {0}")]
     Refused(#[from] Refusal),
-    #[error("an evaluator announces itself under a name that is not allowed")]
-    Name,
     #[error("there are too many evaluators")]
     Crowd,
     #[error("scores of the same episodes are being written, deliver these again")]
@@ -29,7 +27,6 @@ impl Rejection {
             Self::Empty => "empty",
             Self::Codec(error) => error.label(),
             Self::Refused(refusal) => refusal.label(),
-            Self::Name => "invalid_name",
             Self::Crowd => "too_many_evaluators",
             Self::InWriting => "in_writing",
             Self::NotSaved(_) => "not_saved",
