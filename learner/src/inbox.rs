@@ -6,13 +6,13 @@ use std::sync::atomic::{AtomicUsize, Ordering};
 use std::sync::mpsc::{self, Receiver, RecvTimeoutError, Sender};
 use std::time::Duration;
 
-/// Most messages from the network that may wait, and their payloads together, bytes. There is room for a question and a
+/// Most messages from the network that may wait, and their sizes together, bytes. There is room for a question and a
 /// progress message of every evaluator while the disk takes its time.
 const MOST_WAITING: usize = 4096;
 const MOST_BYTES_WAITING: usize = 64 << 20;
 /// The same for what Zenoh itself tells of who comes and goes, which takes little room and is not sent again.
 const MOST_CHANGES_WAITING: usize = 4096;
-/// Largest payload of a message to the learner; a score report of a job is a few hundred bytes.
+/// Largest message to the learner with all that comes with it, bytes; a score report of a job is a few hundred bytes.
 pub const MOST_BYTES: usize = 256 * 1024;
 
 /// The sending side. Clones share the bound.
@@ -32,7 +32,7 @@ struct Waiting {
 #[derive(Clone, Copy, Debug)]
 enum Source {
     Process,
-    /// With the size of its payload, bytes.
+    /// With its size, bytes.
     Message(usize),
     Change,
 }
@@ -106,7 +106,7 @@ impl<T> Inbox<T> {
         self.sender.send(Envelope { message, source: Source::Process }).ok();
     }
 
-    /// Sends a message from the network with a payload of `bytes`; gives it back if too many wait already. Never blocks.
+    /// Sends a message from the network that has `bytes`; gives it back if too many wait already. Never blocks.
     pub fn offer(&self, message: T, bytes: usize) -> Result<(), T> {
         self.offer_from(Source::Message(bytes), message)
     }

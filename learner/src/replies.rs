@@ -23,9 +23,8 @@ use zenoh::query::Query;
 
 use crate::metrics::Metrics;
 
-use question::kept;
-
 pub use question::Question;
+use question::kept;
 
 /// Threads that answer.
 const THREADS: usize = 12;
@@ -72,6 +71,8 @@ type Work = Box<dyn FnOnce(&Query) + Send>;
 struct Task {
     asker: Asker,
     query: Query,
+    /// What the query keeps in memory.
+    bytes: usize,
     /// If there is none any more, the query is only to be dropped.
     work: Option<Work>,
     not_before: Instant,
@@ -79,11 +80,11 @@ struct Task {
 
 impl Task {
     fn answer(asker: Asker, query: Query, work: Work) -> Self {
-        Self { asker, query, work: Some(work), not_before: Instant::now() }
+        Self { asker, bytes: kept(&query), query, work: Some(work), not_before: Instant::now() }
     }
 
     fn drop_later(asker: Asker, query: Query) -> Self {
-        Self { asker, query, work: None, not_before: Instant::now() + GRACE }
+        Self { asker, bytes: kept(&query), query, work: None, not_before: Instant::now() + GRACE }
     }
 }
 
@@ -178,9 +179,8 @@ impl Replies {
         let mut state = self.shared.lock();
         let of_one = state.waiting.iter().filter(|waiting| waiting.asker == task.asker).count();
         let most = if task.asker == Asker::Nobody { MOST_DROPPED } else { MOST_WAITING_OF_ONE };
-        let bytes: usize = state.waiting.iter().map(|waiting| kept(&waiting.query)).sum();
-        let fits = bytes + kept(&task.query) <= MOST_BYTES_WAITING;
-        if state.waiting.len() < MOST_WAITING && of_one < most && fits {
+        let bytes = state.waiting.iter().map(|waiting| waiting.bytes).sum::<usize>() + task.bytes;
+        if state.waiting.len() < MOST_WAITING && of_one < most && bytes <= MOST_BYTES_WAITING {
             state.waiting.push_back(task);
             if state.calls() {
                 drop(state);

@@ -268,7 +268,7 @@ impl Scene {
         let page = http::metrics(&self.learner.metrics()).unwrap();
         let rejected = page.lines().filter(|line| line.starts_with("quad_learner_rejected"));
         eprintln!("memory: at most {growth} MiB more\n{}", rejected.collect::<Vec<_>>().join("\n"));
-        assert!(growth < 400, "the attacks took {growth} MiB");
+        assert!(growth < 200, "the attacks took {growth} MiB");
         assert!(self.learner.process.is_running());
     }
 }
