@@ -46,6 +46,8 @@ pub enum Pace {
     Still,
     /// A job takes some seconds, with progress meanwhile, as with real episodes.
     Real,
+    /// The same in a twentieth of the time, so that somebody claims every moment.
+    Quick,
     /// A job takes no time.
     Instant,
 }
@@ -119,7 +121,7 @@ impl Crowd {
 
 impl Shared {
     fn pace(&self) -> Pace {
-        [Pace::Still, Pace::Real, Pace::Instant][self.pace.load(Relaxed) as usize]
+        [Pace::Still, Pace::Real, Pace::Quick, Pace::Instant][self.pace.load(Relaxed) as usize]
     }
 
     fn note(&self, note: impl FnOnce(&mut Measured)) {
@@ -195,8 +197,13 @@ impl Member {
     }
 
     async fn score(&mut self, job: Job) {
-        if self.shared.pace() == Pace::Real {
-            let longest = longest_episode() * job.seeds.len() as u32;
+        let episode = match self.shared.pace() {
+            Pace::Real => longest_episode(),
+            Pace::Quick => longest_episode() / 20,
+            Pace::Still | Pace::Instant => Duration::ZERO,
+        };
+        if !episode.is_zero() {
+            let longest = episode * job.seeds.len() as u32;
             let mut left = self.random.random_range(longest / 2..longest);
             // They all begin together, and should not go on so.
             if mem::take(&mut self.begins) {
