@@ -23,8 +23,6 @@ use zenoh::Session;
 
 /// Of the evaluators that are served meanwhile.
 const HONEST: usize = 5;
-/// How long the last attack, that by tokens, may be felt where a learner has one core and a router passes them on.
-const AFTERMATH: Duration = Duration::from_secs(600);
 /// Tells this program that it is the stranger who reads nothing, and where to.
 const STRANGER: &str = "QUAD_TEST_STRANGER";
 
@@ -265,7 +263,7 @@ impl Scene {
         // What a router had passed on of the tokens before they ended is still to be read, on the core that trains.
         let begin = Instant::now();
         self.crowd.measured();
-        eventually("claims are answered again", AFTERMATH, || (!self.crowd.measured().claims.is_empty()).then_some(()));
+        eventually("claims are answered again", PATIENCE, || (!self.crowd.measured().claims.is_empty()).then_some(()));
         eprintln!("all attacks are over: a claim was answered within {:.1?}", begin.elapsed());
         // Training hardly notices them, although it has to share its core.
         let taken = median(taken.into_iter());
