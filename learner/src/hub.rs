@@ -4,6 +4,7 @@
 
 mod announcer;
 mod evaluators;
+mod followed;
 mod rejection;
 mod scores;
 
@@ -32,6 +33,8 @@ use evaluators::Evaluators;
 use rejection::Rejection;
 use scores::Delivered;
 
+pub use followed::Follow;
+
 /// How often expired leases are looked for.
 const TICK: Duration = Duration::from_millis(250);
 /// Most messages that are handled before the new scores in them go to the disk.
@@ -53,7 +56,12 @@ pub enum Event {
     /// All gradient steps are done; no further evaluation will follow.
     TrainingCompleted,
     /// The Zenoh session is open.
-    Online(Session),
+    Online {
+        /// The session.
+        session: Session,
+        /// If it is a router's client: who sees to it that evaluators' tokens are followed.
+        follower: Option<Sender<Follow>>,
+    },
     /// An evaluator asks for a job, or hands one back.
     Job(Question),
     /// An evaluator delivers scores.
@@ -182,7 +190,12 @@ impl Hub {
                 self.notices.send(Notice::Trained { pending: self.scoreboard.pending() }).ok();
                 self.settle();
             }
-            Event::Online(session) => self.session = Some(session),
+            Event::Online { session, follower } => {
+                self.session = Some(session);
+                if let Some(follower) = follower {
+                    self.evaluators.follow(follower);
+                }
+            }
             Event::Job(question) => {
                 let reply = parse(question.message()).map(|request| self.job(request));
                 self.answer(question, keys::jobs(&self.run), reply);
@@ -214,6 +227,10 @@ impl Hub {
     fn job(&mut self, request: JobRequest) -> (JobReply, Name) {
         match request {
             JobRequest::Claim { evaluator, attempt, environments, precision } => {
+                let now = Instant::now();
+                if let Err(rejection) = self.evaluators.asked(&evaluator, now) {
+                    self.reject(&rejection);
+                }
                 let claim = Claim {
                     evaluator: &evaluator,
                     attempt,
@@ -222,7 +239,7 @@ impl Hub {
                     present: self.evaluators.count(),
                 };
                 let handed_out = self.scoreboard.handed_out();
-                let reply = self.scoreboard.claim(claim, Instant::now());
+                let reply = self.scoreboard.claim(claim, now);
                 if let JobReply::Job(job) = &reply {
                     debug!(job = job.id, step = job.step, %evaluator, %precision, "handed out");
                 }

@@ -3,6 +3,7 @@
 //! received in.
 
 mod flood;
+mod tokens;
 mod twin;
 
 use std::sync::Arc;
@@ -20,6 +21,7 @@ use zenoh::query::{Query, Queryable};
 use zenoh::sample::{Locality, Sample, SampleKind};
 
 use self::flood::FloodGuard;
+use self::tokens::Changes;
 use crate::inbox::{Inbox, MOST_BYTES};
 use crate::metrics::Metrics;
 use crate::replies::{Asker, Question, Replies};
@@ -43,8 +45,9 @@ pub struct Wire {
     replies: Replies,
     flood: Arc<FloodGuard>,
     _queryables: [Queryable<()>; 3],
-    _subscribers: [Subscriber<()>; 3],
-    _strays: Option<(Subscriber<()>, Queryable<()>)>,
+    _progress: Subscriber<()>,
+    _tokens: Option<Subscriber<()>>,
+    _strays: Option<(Subscriber<()>, Subscriber<()>, Queryable<()>)>,
     _token: LivelinessToken,
 }
 
@@ -75,7 +78,12 @@ impl Wire {
         // A slow subscriber loses a snapshot, which it can ask for later, instead of delaying the other subscribers.
         let weights = session.declare_publisher(keys::weights(run)).congestion_control(CongestionControl::Drop).await;
         publisher.send(publisher::Event::Online(weights.map_err(zenoh_error)?));
-        hub.send(hub::Event::Online(session.clone()));
+        let changes = Changes { hub: hub.clone(), metrics: metrics.clone(), flood: flood.clone() };
+        let (tokens, follower) = match direct {
+            true => (Some(tokens::all(&session, run, changes).await?), None),
+            false => (None, Some(tokens::follower(&session, run, changes)?)),
+        };
+        hub.send(hub::Event::Online { session: session.clone(), follower });
 
         let server = Server { session: &session, metrics, replies: &replies, flood: &flood };
         let queryables = [
@@ -98,44 +106,20 @@ impl Wire {
             })
             .await
             .map_err(zenoh_error)?;
-        let (inbox, counted, guard) = (hub.clone(), metrics.clone(), flood.clone());
-        let evaluators = session
-            .liveliness()
-            .declare_subscriber(keys::all_evaluators(run))
-            .history(true)
-            .callback(move |sample: Sample| {
-                // Who leaves has come before; and all of a connection's leave at its end, not in its task.
-                if sample.kind() == SampleKind::Put {
-                    guard.message();
-                }
-                let Some(evaluator) = keys::evaluator_of(sample.key_expr().as_str()) else {
-                    return counted.reject("invalid_name");
-                };
-                let change = match sample.kind() {
-                    SampleKind::Put => hub::Event::Joined(evaluator),
-                    SampleKind::Delete => hub::Event::Left(evaluator),
-                };
-                // What is lost here is a name in the display, or a job that waits for the end of its lease.
-                if inbox.offer_change(change).is_err() {
-                    counted.reject("busy");
-                }
-            })
-            .await
-            .map_err(zenoh_error)?;
-
         let strays = if direct { Some(server.strays(run).await?) } else { None };
 
         ready()?;
         let token = session.liveliness().declare_token(keys::live_learner(run, life.incarnation)).await;
         let token = token.map_err(zenoh_error)?;
         // Two that start at once may both have seen nobody.
-        let twins = twin::watch(&session, &life, hub).await?;
+        twin::watch(&session, &life, hub).await?;
         Ok(Self {
             session,
             replies,
             flood,
             _queryables: queryables,
-            _subscribers: [progress, evaluators, twins],
+            _progress: progress,
+            _tokens: tokens,
             _strays: strays,
             _token: token,
         })
@@ -185,9 +169,10 @@ impl Server<'_> {
     }
 
     /// Takes what nobody has a reason to send here: counts it, and holds back whoever sends much of it.
-    async fn strays(&self, run: &Name) -> anyhow::Result<(Subscriber<()>, Queryable<()>)> {
+    async fn strays(&self, run: &Name) -> anyhow::Result<(Subscriber<()>, Subscriber<()>, Queryable<()>)> {
         let served = [keys::weights_at_any_step(run), keys::jobs(run), keys::scores(run), keys::all_progress(run)];
         let served = served.map(KeyExpr::new).into_iter().collect::<Result<Vec<_>, _>>().map_err(zenoh_error)?;
+        let evaluators = KeyExpr::new(keys::all_evaluators(run)).map_err(zenoh_error)?;
         let (guard, counted) = (self.flood.clone(), self.metrics.clone());
         let stray = move |key: &KeyExpr<'_>| {
             let stray = !served.iter().any(|served| served.intersects(key));
@@ -206,10 +191,18 @@ impl Server<'_> {
                 Question::new(query, &replies);
             }
         };
+        // An evaluator has one for each run that it works for. They are held back, but nothing is wrong with them.
+        let guard = self.flood.clone();
+        let token = move |sample: Sample| {
+            if sample.kind() == SampleKind::Put && !evaluators.intersects(sample.key_expr()) {
+                guard.message();
+            }
+        };
         let remote = Locality::Remote;
         let subscriber = self.session.declare_subscriber("**").allowed_origin(remote).callback(published).await;
         let queryable = self.session.declare_queryable("**").allowed_origin(remote).callback(asked).await;
-        Ok((subscriber.map_err(zenoh_error)?, queryable.map_err(zenoh_error)?))
+        let tokens = self.session.liveliness().declare_subscriber("**").callback(token).await;
+        Ok((subscriber.map_err(zenoh_error)?, tokens.map_err(zenoh_error)?, queryable.map_err(zenoh_error)?))
     }
 }
 

@@ -37,12 +37,15 @@ enum Attack {
     Elsewhere,
     QuestionsElsewhere,
     Subscriptions,
+    /// Of evaluators, of learners, and others.
     Tokens,
+    /// Made-up ones, with tokens, that ask for work and leave.
+    Evaluators,
     Connections,
     ReadsNothing,
 }
 
-const ATTACKS: [Attack; 11] = [
+const ATTACKS: [Attack; 12] = [
     Attack::Nothing,
     Attack::Progress,
     Attack::Claims,
@@ -53,6 +56,7 @@ const ATTACKS: [Attack; 11] = [
     Attack::Subscriptions,
     Attack::Connections,
     Attack::ReadsNothing,
+    Attack::Evaluators,
     Attack::Tokens,
 ];
 
@@ -81,8 +85,8 @@ fn progress() -> Vec<u8> {
     encode(&message).unwrap()
 }
 
-fn claim() -> Vec<u8> {
-    let (evaluator, precision) = (name("flood"), name("f32"));
+fn claim_of(evaluator: Name) -> Vec<u8> {
+    let precision = name("f32");
     encode(&JobRequest::Claim { evaluator, attempt: 1, environments: vec!["moon".to_owned()], precision }).unwrap()
 }
 
@@ -99,6 +103,20 @@ fn lie() -> Vec<u8> {
         cannot_act: None,
     };
     encode(&report).unwrap()
+}
+
+/// One of many ways to write what a learner's weights fit: with a wildcard in place of each letter whose bit is set.
+fn matches_weights(number: usize) -> String {
+    let mut pattern = String::new();
+    for (place, letter) in keys::weights(&run()).chars().rev().enumerate() {
+        if letter == '/' || number >> place & 1 == 0 {
+            pattern.push(letter);
+        } else if !pattern.ends_with("*$") {
+            pattern.push_str("*$");
+        }
+    }
+    let pattern: String = pattern.chars().rev().collect();
+    pattern.split('/').map(|chunk| if chunk == "$*" { "*" } else { chunk }).collect::<Vec<_>>().join("/")
 }
 
 /// Somebody who attacks while he is told to.
@@ -151,7 +169,7 @@ async fn flood(attack: Attack, endpoint: &str, on: &AtomicBool) {
     let ask = async |key: String, question: Vec<u8>| {
         session.get(key).payload(question).timeout(Duration::from_secs(1)).callback(drop).await.unwrap();
     };
-    let (progress, claim, lie) = (progress(), claim(), lie());
+    let (progress, claim, lie) = (progress(), claim_of(name("flood")), lie());
     let mut noise: Vec<u8> = (0..1000u32).map(|i| (i.wrapping_mul(2_654_435_761) >> 24) as u8).collect();
     let mut newer = claim.clone();
     newer[4] ^= 0xff;
@@ -172,15 +190,28 @@ async fn flood(attack: Attack, endpoint: &str, on: &AtomicBool) {
             Attack::Elsewhere => session.put("somewhere/else", progress.clone()).await.unwrap(),
             Attack::QuestionsElsewhere => ask("somewhere/else".to_owned(), claim.clone()).await,
             Attack::Subscriptions => {
-                let key = format!("somewhere/{}", subscriptions.len());
-                subscriptions.push(session.declare_subscriber(key).callback(drop).await.unwrap());
+                let number = subscriptions.len();
+                for key in [format!("somewhere/{number}"), matches_weights(number)] {
+                    subscriptions.push(session.declare_subscriber(key).callback(drop).await.unwrap());
+                }
                 if subscriptions.len() > 1000 {
                     subscriptions.clear();
                 }
             }
             Attack::Tokens => {
-                let key = keys::live_evaluator(&run, &name(&format!("flood-{}", tokens.len())));
-                tokens.push(session.liveliness().declare_token(key).await.unwrap());
+                let number = tokens.len() as u64;
+                let evaluator = keys::live_evaluator(&run, &name(&format!("flood-{number}")));
+                for key in [evaluator, keys::live_learner(&run, number), format!("somewhere/{number}")] {
+                    tokens.push(session.liveliness().declare_token(key).await.unwrap());
+                }
+                if tokens.len() > 1000 {
+                    tokens.clear();
+                }
+            }
+            Attack::Evaluators => {
+                let name = name(&format!("flood-{}", tokens.len()));
+                tokens.push(session.liveliness().declare_token(keys::live_evaluator(&run, &name)).await.unwrap());
+                ask(keys::jobs(&run), claim_of(name)).await;
                 if tokens.len() > 1000 {
                     tokens.clear();
                 }

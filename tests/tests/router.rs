@@ -5,7 +5,9 @@ use std::sync::Arc;
 use std::sync::atomic::{AtomicUsize, Ordering::Relaxed};
 use std::time::{Duration, Instant};
 
+use quad_protocol::{Name, keys};
 use quad_service::{Endpoints, open_session};
+use quad_tests::crowd::{Crowd, Pace};
 use quad_tests::router::{configuration, router};
 use quad_tests::system::{Scratch, Setting, free_port};
 use quad_tests::{PATIENCE, eventually, http};
@@ -128,4 +130,38 @@ async fn a_flood_ends_at_the_router_and_an_evaluator_of_many_runs_is_none() {
     let [plain, protected] =
         ["router.json5", "router-tls.json5"].map(|file| configuration(file).get_json("downsampling").unwrap());
     assert_eq!(plain, protected, "both routers end the same floods");
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn evaluators_behind_a_router_are_seen_once_they_ask_and_missed_when_they_leave() {
+    let scratch = Scratch::new();
+    let endpoint = format!("tcp/127.0.0.1:{}", free_port());
+    let session = router(&endpoint).await;
+    let endless = Setting { steps: 100_000_000, eval_interval: 500, ..Setting::default() };
+    let learner = scratch.learner_with("run", endless, &["--connect", &endpoint]);
+    learner.process.wait_for_log("snapshot handed to evaluation", PATIENCE);
+    let metric = |name: &str, label: &str| Some(http::sum(&http::metrics(&learner.metrics())?, name, label));
+    let lost_jobs = || metric("quad_learner_jobs_total", "expired").unwrap();
+    let present = |count: f64, patience| {
+        let what = format!("{count} evaluators are there");
+        eventually(&what, patience, || (metric("quad_learner_evaluators", "")? == count).then_some(()));
+    };
+
+    // Whoever has only a token is nobody.
+    let (run, mut strangers) = (Name::new("run").unwrap(), Vec::new());
+    for number in 0..50 {
+        let key = keys::live_evaluator(&run, &Name::new(format!("stranger-{number}")).unwrap());
+        strangers.push(session.liveliness().declare_token(key).await.unwrap());
+    }
+    for _ in 0..2 {
+        let lost = lost_jobs();
+        let crowd = Crowd::connect(3, &run, &endpoint).await;
+        crowd.set(Pace::Real);
+        present(3.0, PATIENCE);
+        eventually("all have jobs", PATIENCE, || (crowd.busy() == 3).then_some(()));
+        // They leave in the middle of them. Their leases would last longer.
+        drop(crowd);
+        present(0.0, Duration::from_secs(5));
+        assert_eq!(lost_jobs(), lost + 3.0);
+    }
 }

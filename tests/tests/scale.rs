@@ -64,10 +64,15 @@ impl Scene {
         learner.metrics();
         let alone = learner.process.peak_memory();
         let crowd = runtime.block_on(Crowd::connect(count, &run, &endpoint));
+        // Behind a router, a learner sees who has asked it for work.
+        crowd.set(Pace::Quick);
         eventually("all are there", PATIENCE, || {
             let page = http::metrics(&learner.metrics())?;
             (http::sum(&page, "quad_learner_evaluators", "") == count as f64).then_some(())
         });
+        crowd.set(Pace::Still);
+        eventually("all have done their jobs", PATIENCE, || (crowd.busy() == 0).then_some(()));
+        crowd.measured();
         Scene { learner, crowd, alone, _runtime: runtime, _router: router, _scratch: scratch }
     }
 

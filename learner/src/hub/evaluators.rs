@@ -1,12 +1,14 @@
 //! Which evaluators are connected, and when each last told its progress.
 
 use std::collections::{BTreeMap, BTreeSet};
+use std::sync::mpsc::Sender;
 use std::time::{Duration, Instant};
 
 use quad_protocol::{Name, Progress};
 use tokio::sync::mpsc::UnboundedSender;
 
 use super::announcer::Announcer;
+use super::followed::{Follow, Followed};
 use super::rejection::Rejection;
 use crate::metrics::EvaluatorMetrics;
 use crate::notice::Notice;
@@ -14,12 +16,14 @@ use crate::notice::Notice;
 /// The metrics of an evaluator that has left are dropped this long after its last progress message.
 const FORGET_AFTER: Duration = Duration::from_secs(600);
 /// Most evaluators that the learner tracks. No real pool is this large; the limit is for floods of made-up names.
-const MOST_EVALUATORS: usize = 1024;
+pub(super) const MOST_EVALUATORS: usize = 1024;
 
 /// Those that are connected, and those that were heard of not long ago.
 pub(super) struct Evaluators {
     metrics: EvaluatorMetrics,
     announcer: Announcer,
+    /// Where a router brings them. Who connects to the learner itself is always seen.
+    followed: Option<Followed>,
     present: BTreeSet<Name>,
     last_seen: BTreeMap<Name, Instant>,
 }
@@ -27,7 +31,13 @@ pub(super) struct Evaluators {
 impl Evaluators {
     /// None yet.
     pub fn new(metrics: EvaluatorMetrics, notices: UnboundedSender<Notice>) -> Self {
-        Self { metrics, announcer: Announcer::new(notices), present: BTreeSet::new(), last_seen: BTreeMap::new() }
+        let announcer = Announcer::new(notices);
+        Self { metrics, announcer, followed: None, present: BTreeSet::new(), last_seen: BTreeMap::new() }
+    }
+
+    /// From now on, only those are seen that have asked for work.
+    pub fn follow(&mut self, follower: Sender<Follow>) {
+        self.followed = Some(Followed::new(follower));
     }
 
     /// How many are connected.
@@ -35,8 +45,16 @@ impl Evaluators {
         self.present.len()
     }
 
+    /// One asked for work.
+    pub fn asked(&mut self, evaluator: &Name, now: Instant) -> Result<(), Rejection> {
+        self.followed.as_mut().map_or(Ok(()), |followed| followed.asked(evaluator, now))
+    }
+
     /// One connected.
     pub fn joined(&mut self, evaluator: Name) -> Result<(), Rejection> {
+        if self.followed.as_ref().is_some_and(|followed| !followed.includes(&evaluator)) {
+            return Ok(()); // told while it was no longer wanted
+        }
         if self.present.len() >= MOST_EVALUATORS && !self.present.contains(&evaluator) {
             return Err(Rejection::Crowd);
         }
@@ -50,6 +68,9 @@ impl Evaluators {
 
     /// Whether one that leaves was connected.
     pub fn remove(&mut self, evaluator: &Name) -> bool {
+        if let Some(followed) = &mut self.followed {
+            followed.left(evaluator);
+        }
         let was_present = self.present.remove(evaluator);
         self.metrics.present.set(self.present.len() as i64);
         was_present
@@ -73,6 +94,9 @@ impl Evaluators {
     /// Forgets those that are long gone, and tells of many that came or went.
     pub fn tick(&mut self, now: Instant) {
         self.announcer.tick(now);
+        if let Some(followed) = &mut self.followed {
+            followed.tick(now, &self.present);
+        }
         let (present, metrics) = (&self.present, &self.metrics);
         self.last_seen.retain(|evaluator, seen| {
             let keep = present.contains(evaluator) || now.duration_since(*seen) < FORGET_AFTER;

@@ -5,9 +5,8 @@ use std::time::{Duration, Instant};
 use anyhow::anyhow;
 use quad_protocol::keys;
 use quad_service::hinted;
-use tracing::info;
+use tracing::{debug, info};
 use zenoh::Session;
-use zenoh::pubsub::Subscriber;
 use zenoh::sample::{Sample, SampleKind};
 
 use super::{Life, zenoh_error};
@@ -16,7 +15,8 @@ use crate::inbox::Inbox;
 
 /// The token of a learner that was cut off lasts for as long as Zenoh takes to notice: five seconds.
 const PATIENCE: Duration = Duration::from_secs(8);
-/// So long after the start an earlier learner of the name ends this one. Later only a stranger would come up with one.
+/// So long after the start an earlier learner of the name ends this one. Later only strangers would come up with one, and
+/// they could come up with many.
 const TOGETHER: Duration = Duration::from_secs(10);
 /// How often it is looked for meanwhile, and how long an answer may take.
 const LOOK_AGAIN: Duration = Duration::from_millis(500);
@@ -56,20 +56,26 @@ async fn another(session: &Session, life: &Life) -> anyhow::Result<Option<u64>> 
     Ok(None)
 }
 
-/// Ends the run when a learner shows up that was started a little earlier. (A later one stops by itself.)
-pub(super) async fn watch(session: &Session, life: &Life, hub: &Inbox<hub::Event>) -> anyhow::Result<Subscriber<()>> {
+/// Ends the run when a learner shows up soon that was started a little earlier. (A later one stops by itself.)
+pub(super) async fn watch(session: &Session, life: &Life, hub: &Inbox<hub::Event>) -> anyhow::Result<()> {
     let (mine, inbox) = (life.clone(), hub.clone());
-    let start = Instant::now();
     let callback = move |token: Sample| {
-        let together = start.elapsed() < TOGETHER && token.kind() == SampleKind::Put;
+        let there = token.kind() == SampleKind::Put;
         let found = keys::incarnation_of(token.key_expr().as_str());
-        let earlier = found.filter(|other| together && *other < mine.incarnation);
+        let earlier = found.filter(|other| there && *other < mine.incarnation);
         if let Some(other) = earlier {
             inbox.offer_change(hub::Event::Twin(hinted(is_there(&mine, other), HINT))).ok();
         }
     };
     let tokens = session.liveliness().declare_subscriber(keys::all_lives(&life.run)).history(true).callback(callback);
-    tokens.await.map_err(zenoh_error)
+    let tokens = tokens.await.map_err(zenoh_error)?;
+    tokio::spawn(async move {
+        tokio::time::sleep(TOGETHER).await;
+        if let Err(error) = tokens.undeclare().await {
+            debug!(%error, "learners' tokens go on to be received");
+        }
+    });
+    Ok(())
 }
 
 fn is_there(life: &Life, other: u64) -> anyhow::Error {
