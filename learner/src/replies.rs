@@ -6,8 +6,9 @@
 //! shares a place with all others who do not. (One who gives many names can take all places, for two seconds with each
 //! connection; against that only access control helps.)
 //!
-//! What is left is Zenoh's own: when it closes the connection of a peer that is still being sent to, its one sending thread
-//! waits for that sender, so the peers of this session hear nothing for two seconds, or four. They connect again by themselves.
+//! What is left is Zenoh's own: when it closes the connection of a peer that is still being sent to, one of its two sending
+//! threads waits for that sender, and whoever that thread was about to send to waits with it, two seconds or four. With several
+//! such peers at once, all others do.
 
 mod question;
 

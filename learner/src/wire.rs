@@ -16,7 +16,6 @@ use zenoh::Session;
 use zenoh::key_expr::KeyExpr;
 use zenoh::liveliness::LivelinessToken;
 use zenoh::pubsub::Subscriber;
-use zenoh::qos::CongestionControl;
 use zenoh::query::{Query, Queryable};
 use zenoh::sample::{Locality, Sample, SampleKind};
 
@@ -75,9 +74,7 @@ impl Wire {
         if !direct {
             flood.end();
         }
-        // A slow subscriber loses a snapshot, which it can ask for later, instead of delaying the other subscribers.
-        let weights = session.declare_publisher(keys::weights(run)).congestion_control(CongestionControl::Drop).await;
-        publisher.send(publisher::Event::Online(weights.map_err(zenoh_error)?));
+        publisher.send(publisher::Event::Online(session.clone()));
         let changes = Changes { hub: hub.clone(), metrics: metrics.clone(), flood: flood.clone() };
         let (tokens, follower) = match direct {
             true => (Some(tokens::all(&session, run, changes).await?), None),

@@ -36,4 +36,4 @@ pub use logging::init_logging;
 pub use metrics_server::{BindError, MetricsServer, serve_metrics};
 pub use session::{open_session, reachable_at};
 pub use shutdown::shutdown_signal;
-pub use zenoh_threads::use_fewer_zenoh_threads;
+pub use zenoh_threads::choose_zenoh_threads;
