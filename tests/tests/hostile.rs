@@ -2,12 +2,12 @@
 //! training goes on.
 //!
 //! With all tests each attack lasts a second. What docs/reliability.md says of training's speed meanwhile comes from
-//! `QUAD_SECONDS=3 QUAD_ROUNDS=5 cargo test --release --workspace --test hostile -- --nocapture`.
+//! `QUAD_SECONDS=3 QUAD_ROUNDS=3 cargo test --release --workspace --test hostile -- --nocapture`.
 #![allow(clippy::unwrap_used, clippy::expect_used, clippy::print_stderr)]
 
-use std::process::{Child, Command, Stdio};
-use std::sync::Arc;
-use std::sync::atomic::{AtomicBool, Ordering::Relaxed};
+use std::path::Path;
+use std::process::Command;
+use std::sync::atomic::AtomicBool;
 use std::time::{Duration, Instant};
 
 use quad_protocol::{EpisodeScore, Hash, JobRequest, Name, Progress, ScoreReport, WeightsRequest, encode, keys};
@@ -15,6 +15,7 @@ use quad_service::{Endpoints, open_session};
 use quad_tests::crowd::{Crowd, Pace};
 use quad_tests::knock::knock;
 use quad_tests::pace::{ENDLESS, compare, median, on_core};
+use quad_tests::process::Process;
 use quad_tests::router::router;
 use quad_tests::system::{Learner, Scratch, free_port};
 use quad_tests::{PATIENCE, eventually, http, number};
@@ -23,7 +24,7 @@ use zenoh::Session;
 
 /// Of the evaluators that are served meanwhile.
 const HONEST: usize = 5;
-/// Tells this program that it is the stranger who reads nothing, and where to.
+/// Tells this program that it is the stranger, and what he tries at which endpoint.
 const STRANGER: &str = "QUAD_TEST_STRANGER";
 
 #[derive(Clone, Copy, Debug)]
@@ -119,42 +120,22 @@ fn matches_weights(number: usize) -> String {
     pattern.split('/').map(|chunk| if chunk == "$*" { "*" } else { chunk }).collect::<Vec<_>>().join("/")
 }
 
-/// Somebody who attacks while he is told to.
-struct Stranger {
-    on: Arc<AtomicBool>,
-    process: Option<Child>,
+/// Somebody who attacks, in a process of his own: what his Zenoh waits for must not hold up the evaluators.
+fn start_stranger(attack: Attack, endpoint: &str, folder: &Path) -> Process {
+    let mut command = Command::new(std::env::current_exe().unwrap());
+    command.args(["--exact", "whatever_strangers_do_the_work_goes_on"]).env(STRANGER, format!("{attack:?} {endpoint}"));
+    Process::start("stranger", folder, command)
 }
 
-impl Stranger {
-    fn start(attack: Attack, runtime: &Runtime, endpoint: &str) -> Stranger {
-        let on = Arc::new(AtomicBool::new(true));
-        let mut process = None;
-        match attack {
-            Attack::ReadsNothing => {
-                let mut command = Command::new(std::env::current_exe().unwrap());
-                command.args(["--exact", "whatever_strangers_do_the_work_goes_on"]).env(STRANGER, endpoint);
-                process = Some(command.stdout(Stdio::null()).spawn().unwrap());
-            }
-            Attack::Connections => {
-                let (on, address) = (on.clone(), endpoint.trim_start_matches("tcp/").parse().unwrap());
-                std::thread::spawn(move || knock(&address, &on));
-            }
-            attack => {
-                let (on, endpoint) = (on.clone(), endpoint.to_owned());
-                runtime.spawn(async move { flood(attack, &endpoint, &on).await });
-            }
-        }
-        Stranger { on, process }
-    }
-}
-
-impl Drop for Stranger {
-    fn drop(&mut self) {
-        self.on.store(false, Relaxed);
-        if let Some(mut process) = self.process.take() {
-            process.kill().ok();
-            process.wait().ok();
-        }
+/// What the stranger's process does, until it is killed.
+fn be_a_stranger(what: &str) {
+    let (attack, endpoint) = what.split_once(' ').unwrap();
+    let attack = *ATTACKS.iter().find(|one| format!("{one:?}") == attack).unwrap();
+    let runtime = Runtime::new().unwrap();
+    match attack {
+        Attack::ReadsNothing => runtime.block_on(read_nothing(endpoint)),
+        Attack::Connections => knock(&endpoint.trim_start_matches("tcp/").parse().unwrap(), &AtomicBool::new(true)),
+        attack => runtime.block_on(flood(attack, endpoint)),
     }
 }
 
@@ -163,7 +144,7 @@ async fn open(endpoint: &str) -> Session {
 }
 
 /// Sends as fast as the connection takes it.
-async fn flood(attack: Attack, endpoint: &str, on: &AtomicBool) {
+async fn flood(attack: Attack, endpoint: &str) {
     let session = open(endpoint).await;
     let run = run();
     let ask = async |key: String, question: Vec<u8>| {
@@ -174,7 +155,7 @@ async fn flood(attack: Attack, endpoint: &str, on: &AtomicBool) {
     let mut newer = claim.clone();
     newer[4] ^= 0xff;
     let (mut tokens, mut subscriptions) = (Vec::new(), Vec::new());
-    while on.load(Relaxed) {
+    loop {
         match attack {
             Attack::Progress => session.put(keys::progress(&run, &name("flood")), progress.clone()).await.unwrap(),
             Attack::Claims => ask(keys::jobs(&run), claim.clone()).await,
@@ -223,8 +204,8 @@ async fn flood(attack: Attack, endpoint: &str, on: &AtomicBool) {
 }
 
 /// Asks for weights again and again, and then reads nothing: the process stops itself.
-async fn read_nothing(endpoint: String) {
-    let session = open(&endpoint).await;
+async fn read_nothing(endpoint: &str) {
+    let session = open(endpoint).await;
     let question = encode(&WeightsRequest { evaluator: name("silent") }).unwrap();
     for _ in 0..300 {
         let get = session.get(keys::weights_at(&run(), ENDLESS.eval_interval)).payload(question.clone());
@@ -236,11 +217,11 @@ async fn read_nothing(endpoint: String) {
 
 /// A learner on one core, and five evaluators that work for it.
 struct Scene {
-    _scratch: Scratch,
+    scratch: Scratch,
     learner: Learner,
     endpoint: String,
-    runtime: Runtime,
     crowd: Crowd,
+    _runtime: Runtime,
     _router: Option<Session>,
 }
 
@@ -265,7 +246,7 @@ impl Scene {
         learner.process.wait_for_log("snapshot handed to evaluation", PATIENCE);
         let crowd = runtime.block_on(Crowd::connect(HONEST, &run(), &endpoint));
         crowd.set(Pace::Quick);
-        Scene { _scratch: scratch, learner, endpoint, runtime, crowd, _router: router }
+        Scene { scratch, learner, endpoint, crowd, _runtime: runtime, _router: router }
     }
 
     /// Lets the stranger try one after the other.
@@ -277,7 +258,7 @@ impl Scene {
             let mut stranger = None;
             self.crowd.measured();
             let [quiet, loud] = compare(&self.learner, rounds, phase, |loud| {
-                stranger = loud.then(|| Stranger::start(attack, &self.runtime, &self.endpoint));
+                stranger = loud.then(|| start_stranger(attack, &self.endpoint, self.scratch.path()));
             });
             // Nobody is served less than before: whoever has waited gets an answer.
             let claims = eventually("claims are answered", PATIENCE, || {
@@ -291,7 +272,7 @@ impl Scene {
             shares.push(share);
             taken.push(threads);
         }
-        // What a router had passed on of the tokens before they ended is still to be read, on the core that trains.
+        // Nothing of them is left behind.
         let begin = Instant::now();
         self.crowd.measured();
         eventually("claims are answered again", PATIENCE, || (!self.crowd.measured().claims.is_empty()).then_some(()));
@@ -311,8 +292,8 @@ impl Scene {
 
 #[test]
 fn whatever_strangers_do_the_work_goes_on() {
-    if let Ok(endpoint) = std::env::var(STRANGER) {
-        return Runtime::new().unwrap().block_on(read_nothing(endpoint));
+    if let Ok(what) = std::env::var(STRANGER) {
+        return be_a_stranger(&what);
     }
     on_core(0, || {
         eprintln!("at a learner that listens");
