@@ -137,7 +137,8 @@ async fn evaluators_behind_a_router_are_seen_once_they_ask_and_missed_when_they_
     let scratch = Scratch::new();
     let endpoint = format!("tcp/127.0.0.1:{}", free_port());
     let session = router(&endpoint).await;
-    let endless = Setting { steps: 100_000_000, eval_interval: 500, ..Setting::default() };
+    // Jobs of seconds, so that somebody leaves in the middle of one.
+    let endless = Setting { steps: 100_000_000, eval_interval: 500, episodes: 400, ..Setting::default() };
     let learner = scratch.learner_with("run", endless, &["--connect", &endpoint]);
     learner.process.wait_for_log("snapshot handed to evaluation", PATIENCE);
     let metric = |name: &str, label: &str| Some(http::sum(&http::metrics(&learner.metrics())?, name, label));
@@ -159,9 +160,10 @@ async fn evaluators_behind_a_router_are_seen_once_they_ask_and_missed_when_they_
         crowd.set(Pace::Real);
         present(3.0, PATIENCE);
         eventually("all have jobs", PATIENCE, || (crowd.busy() == 3).then_some(()));
-        // They leave in the middle of them. Their leases would last longer.
+        // Their leases would last longer.
         drop(crowd);
         present(0.0, Duration::from_secs(5));
-        assert_eq!(lost_jobs(), lost + 3.0);
+        // Perhaps not three: somebody may have been done just then.
+        eventually("their jobs are given up", Duration::from_secs(5), || (lost_jobs() > lost).then_some(()));
     }
 }
