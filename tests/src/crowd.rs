@@ -9,7 +9,7 @@ use std::time::{Duration, Instant};
 
 use quad_dataset::environment;
 use quad_protocol::{
-    EpisodeScore, Job, JobReply, JobRequest, Message, Name, Progress, ScoreReply, ScoreReport, decode, encode, keys,
+    EpisodeScore, Job, JobReply, Message, Name, Progress, ScoreReply, ScoreReport, decode, encode, keys,
 };
 use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
@@ -18,6 +18,7 @@ use tokio::time::{sleep, sleep_until, timeout};
 use zenoh::query::{ConsolidationMode, QueryTarget};
 use zenoh::{Config, Session};
 
+use crate::made_up::{self, name};
 use crate::number;
 
 /// An evaluator's patience with its learner.
@@ -152,7 +153,7 @@ impl Member {
             config.insert_json5(key, value).expect("the setting exists");
         }
         let session = zenoh::open(config).await.expect("somebody listens");
-        let name = Name::new(format!("light-{number}")).expect("a name");
+        let name = name(&format!("light-{number}"));
         let random = ChaCha8Rng::seed_from_u64(number as u64);
         Member { name, session, shared, random, answered: BTreeMap::new(), told: None, begins: true }
     }
@@ -188,9 +189,7 @@ impl Member {
     }
 
     async fn claim(&mut self) -> Option<JobReply> {
-        let (environments, precision) = (vec!["hopper".to_owned()], Name::new("f32").expect("a name"));
-        let (evaluator, attempt) = (self.name.clone(), self.random.random());
-        let claim = JobRequest::Claim { evaluator, attempt, environments, precision };
+        let claim = made_up::claim(self.name.as_str(), self.random.random(), "hopper");
         let (answer, took) = self.ask(keys::jobs(&self.shared.run), &claim).await?;
         self.shared.note(|measured| measured.claims.push(took));
         Some(answer)
@@ -228,8 +227,7 @@ impl Member {
             let episode_return = (seed % 3000) as f64;
             EpisodeScore { seed, episode_return, length: 300, score: spec.normalised_score(episode_return) }
         });
-        let precision = Name::new("f32").expect("a name");
-        let report = ScoreReport::of(&job, self.name.clone(), precision, episodes.collect());
+        let report = ScoreReport::of(&job, self.name.clone(), name("f32"), episodes.collect());
         // What was not acknowledged is delivered again.
         while self.deliver(&report).await.is_none() {
             sleep(Duration::from_millis(250)).await;

@@ -9,7 +9,8 @@
 //! - [`router`]: a Zenoh router in the test's own process.
 //! - [`line`](mod@line): a connection on which things go wrong: a [`link`] of TCP, or a cable to a host of its own, in [`hosts`].
 //! - [`power`]: what a disk holds after a power cut.
-//! - [`crowd`]: hundreds of evaluators that only talk; [`pace`]: how fast a learner trains, and what slows it down.
+//! - [`crowd`]: hundreds of evaluators that only talk; [`made_up`]: messages of such as do not exist; [`pace`]: how fast a learner trains, and what slows it down.
+//! - [`certificates`]: one for each role, and sessions that show them.
 //! - [`http`]: fetch a page, read a metric, serve a file.
 //! - [`peers`]: programs that are not ours; where one is missing, a test is skipped or fails.
 //! - [`prometheus`]: one to start, and what to ask any; [`dashboard`]: what Grafana's panels ask it.
@@ -17,6 +18,7 @@
 //! A helper that cannot do its work panics, and so fails its test.
 #![allow(clippy::unwrap_used, clippy::expect_used, clippy::print_stderr)]
 
+pub mod certificates;
 pub mod crowd;
 pub mod dashboard;
 pub mod hosts;
@@ -24,6 +26,7 @@ pub mod http;
 pub mod knock;
 pub mod line;
 pub mod link;
+pub mod made_up;
 pub mod pace;
 pub mod peers;
 pub mod power;

@@ -2,24 +2,21 @@
 //! listens itself.
 #![allow(clippy::unwrap_used, clippy::expect_used)]
 
-use std::fs;
 use std::io::{self, Write};
-use std::path::{Path, PathBuf};
-use std::process::{Command, Output};
+use std::path::PathBuf;
 use std::sync::{Mutex, Once};
 use std::time::{Duration, Instant};
 
-use quad_tests::process::binary;
+use quad_tests::certificates::{Certificates, connect};
 use quad_tests::router::protected_router;
-use quad_tests::system::{Scratch, Setting, free_port};
-use quad_tests::{PATIENCE, eventually, peers};
-use tempfile::{TempDir, tempdir};
+use quad_tests::system::{Scratch, Setting};
+use quad_tests::{PATIENCE, eventually};
 use tokio::time::timeout;
+use zenoh::Session;
 use zenoh::handlers::FifoChannelHandler;
 use zenoh::pubsub::Subscriber;
 use zenoh::query::{Query, Queryable};
 use zenoh::sample::{Sample, SampleKind};
-use zenoh::{Config, Session};
 
 /// For what must not happen.
 const LULL: Duration = Duration::from_millis(500);
@@ -44,76 +41,14 @@ fn wait_for_log(text: &str) {
     eventually(&what, PATIENCE, || String::from_utf8_lossy(&LOG.lock().unwrap()).contains(text).then_some(()));
 }
 
-/// A folder of certificates, one of each role, besides an expired one.
-struct Certificates {
-    folder: TempDir,
-}
-
-impl Certificates {
-    /// `None` if the test is to be skipped.
-    fn make() -> Option<Certificates> {
-        static START: Once = Once::new();
-        START.call_once(|| {
-            let filter = "zenoh=warn,zenoh::net::routing::interceptor=trace";
-            tracing_subscriber::fmt().with_env_filter(filter).with_ansi(false).with_writer(|| Log).init();
-        });
-        let folder = tempdir().unwrap();
-        let made: [&[&str]; 5] = [
-            &["router", "router", "127.0.0.1"],
-            &["learner", "learner"],
-            &["evaluator", "evaluator"],
-            &["monitor", "monitor"],
-            &["--days", "0", "evaluator", "expired"],
-        ];
-        made.iter().all(|arguments| peers::certificates(folder.path(), arguments)).then_some(Certificates { folder })
-    }
-
-    /// An evaluator's that is valid for so many seconds, which the script's days are too long for.
-    fn short(&self, name: &str, seconds: u64) {
-        assert!(peers::certificates(self.folder.path(), &["evaluator", name]));
-        let script = r#"
-            touch index; openssl rand -hex 8 >serial
-            printf '[ca]\ndefault_ca=it\n[it]\ndatabase=index\nserial=serial\nnew_certs_dir=.\npolicy=any\n[any]\n' >config
-            printf 'organizationName=optional\norganizationalUnitName=optional\ncommonName=supplied\n' >>config
-            printf 'extendedKeyUsage=clientAuth\n' >extensions
-            openssl req -new -key "$2/key.pem" -subj /CN=quad-evaluator -out request
-            openssl ca -batch -notext -config config -md sha256 -in request -cert ca/ca.pem -keyfile ca/key.pem \
-              -extfile extensions -enddate "$(date -u -d "+$1 seconds" +%Y%m%d%H%M%SZ)" -out "$2/cert.pem"
-        "#;
-        let arguments = ["-euc", script, "sh", &seconds.to_string(), name];
-        let output = Command::new("sh").args(arguments).current_dir(self.folder.path()).output().unwrap();
-        assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
-    }
-
-    fn of(&self, name: &str) -> PathBuf {
-        self.folder.path().join(name)
-    }
-
-    fn argument(&self, name: &str) -> String {
-        self.of(name).to_str().unwrap().to_owned()
-    }
-}
-
-/// Connects as whoever has the certificate in `folder`, or as nobody, and trusts the authority of `trusted`.
-async fn connect(endpoint: &str, trusted: &Path, folder: Option<&Path>) -> zenoh::Result<Session> {
-    let mut config = Config::default();
-    let mut settings = vec![
-        ("mode", "\"client\"".to_owned()),
-        ("connect/endpoints", format!("[{endpoint:?}]")),
-        ("connect/timeout_ms", "2000".to_owned()),
-        ("connect/exit_on_failure", "true".to_owned()),
-        ("scouting/multicast/enabled", "false".to_owned()),
-        ("transport/link/tls/root_ca_certificate", format!("{:?}", trusted.join("ca.pem"))),
-    ];
-    if let Some(folder) = folder {
-        settings.push(("transport/link/tls/enable_mtls", "true".to_owned()));
-        settings.push(("transport/link/tls/connect_certificate", format!("{:?}", folder.join("cert.pem"))));
-        settings.push(("transport/link/tls/connect_private_key", format!("{:?}", folder.join("key.pem"))));
-    }
-    for (key, value) in settings {
-        config.insert_json5(key, &value).unwrap();
-    }
-    zenoh::open(config).await
+/// `None` if the test is to be skipped.
+fn make_certificates() -> Option<Certificates> {
+    static START: Once = Once::new();
+    START.call_once(|| {
+        let filter = "zenoh=warn,zenoh::net::routing::interceptor=trace";
+        tracing_subscriber::fmt().with_env_filter(filter).with_ansi(false).with_writer(|| Log).init();
+    });
+    Certificates::make()
 }
 
 /// The keys that arrive until `last` does.
@@ -148,7 +83,7 @@ async fn answers(session: &Session, key: &str) -> usize {
 
 #[tokio::test(flavor = "multi_thread")]
 async fn a_run_completes_through_the_shipped_router() {
-    let Some(certificates) = Certificates::make() else { return };
+    let Some(certificates) = make_certificates() else { return };
     let (_router, endpoint) = protected_router(&certificates.of("router")).await;
     let (scratch, setting) = (Scratch::new(), Setting::default());
     let connect =
@@ -164,7 +99,7 @@ async fn a_run_completes_through_the_shipped_router() {
 
 #[tokio::test(flavor = "multi_thread")]
 async fn a_learner_that_listens_itself_asks_who_comes() {
-    let Some(certificates) = Certificates::make() else { return };
+    let Some(certificates) = make_certificates() else { return };
     let (scratch, setting) = (Scratch::new(), Setting { steps: 100_000_000, eval_interval: 500, ..Setting::default() });
     let folder = certificates.argument("learner");
     let mut learner = scratch.learner_with("run", setting, &["--listen", "tls/127.0.0.1:0", "--certificates", &folder]);
@@ -206,8 +141,8 @@ async fn a_learner_that_listens_itself_asks_who_comes() {
 
 #[tokio::test(flavor = "multi_thread")]
 async fn the_router_refuses_and_logs_those_without_a_valid_certificate() {
-    let Some(certificates) = Certificates::make() else { return };
-    let elsewhere = Certificates::make().unwrap();
+    let Some(certificates) = make_certificates() else { return };
+    let elsewhere = make_certificates().unwrap();
     let (_router, endpoint) = protected_router(&certificates.of("router")).await;
     let (authority, evaluator) = (certificates.of("router"), certificates.of("evaluator"));
     // In all but the certificate they are what is let in.
@@ -238,7 +173,7 @@ async fn the_router_refuses_and_logs_those_without_a_valid_certificate() {
 
 #[tokio::test(flavor = "multi_thread")]
 async fn each_role_may_do_what_it_is_for_and_nothing_else() {
-    let Some(certificates) = Certificates::make() else { return };
+    let Some(certificates) = make_certificates() else { return };
     let (_router, endpoint) = protected_router(&certificates.of("router")).await;
     let authority = certificates.of("router");
     let mut sessions = Vec::new();
@@ -319,7 +254,7 @@ fn held_for_good<T>(value: T) {
 
 #[tokio::test(flavor = "multi_thread")]
 async fn an_expired_certificate_ends_a_connection_and_a_renewed_one_brings_it_back() {
-    let Some(certificates) = Certificates::make() else { return };
+    let Some(certificates) = make_certificates() else { return };
     let (_router, endpoint) = protected_router(&certificates.of("router")).await;
     let monitor = connect(&endpoint, &certificates.of("router"), Some(&certificates.of("monitor"))).await.unwrap();
     let tokens = monitor.liveliness().declare_subscriber("quad/run/live/evaluator/*").history(true).await.unwrap();
@@ -334,64 +269,7 @@ async fn an_expired_certificate_ends_a_connection_and_a_renewed_one_brings_it_ba
     assert_eq!(next().await, SampleKind::Put);
     assert_eq!(next().await, SampleKind::Delete, "it stays after its certificate has expired");
 
-    assert!(peers::certificates(certificates.folder.path(), &["evaluator", "brief"]));
+    certificates.renew("brief");
     assert_eq!(next().await, SampleKind::Put);
     assert!(evaluator.process.log().contains("make a new one soon"));
-}
-
-#[test]
-fn what_cannot_be_safe_is_refused_before_anything_starts() {
-    let Some(certificates) = Certificates::make() else { return };
-    let elsewhere = Certificates::make().unwrap();
-    let scratch = Scratch::new();
-    let preset = scratch.preset("run", Setting::default());
-    // Whatever would start nevertheless is stopped, with exit code 124.
-    let start = |program: &str| {
-        let mut command = Command::new("timeout");
-        command.arg(PATIENCE.as_secs().to_string()).arg(binary(program));
-        command
-    };
-    let learner = |arguments: &[&str]| {
-        let mut command = start("learner");
-        command.arg("train").arg("--preset").arg(&preset).arg("--dataset").arg(scratch.dataset());
-        command.arg("--run-dir").arg(scratch.path().join("run")).args(arguments).output().unwrap()
-    };
-    let evaluator = |arguments: &[&str]| start("evaluator").arg("serve").args(arguments).output().unwrap();
-    let (good, tls) = (certificates.argument("evaluator"), format!("tls/127.0.0.1:{}", free_port()));
-
-    let open = evaluator(&["--connect", "tcp/127.0.0.1:1", "--certificates", &good]);
-    assert_refused(&open, "tcp/127.0.0.1:1 would be open to anybody", "tls/HOST:PORT");
-    let open = learner(&["--listen", "tcp/127.0.0.1:0", "--certificates", &certificates.argument("learner")]);
-    assert_refused(&open, "tcp/127.0.0.1:0 would be open to anybody", "tls/HOST:PORT");
-    assert_refused(&evaluator(&["--connect", &tls]), "needs certificates", "--certificates DIR");
-    assert_refused(&learner(&["--listen", &tls]), "needs certificates", "--certificates DIR");
-
-    let with = |folder: &Path| evaluator(&["--connect", &tls, "--certificates", folder.to_str().unwrap()]);
-    assert_refused(&with(&certificates.of("nowhere")), "nowhere/ca.pem", "certificates.sh");
-    assert_refused(&with(&certificates.of("learner")), "is a certificate for quad-learner", "this program's role");
-    assert_refused(&with(&certificates.of("expired")), "which is not now", "make a new certificate");
-    let mixed = certificates.of("mixed");
-    fs::create_dir(&mixed).unwrap();
-    for (from, file) in [(&elsewhere, "ca.pem"), (&certificates, "cert.pem"), (&certificates, "key.pem")] {
-        fs::copy(from.of("evaluator").join(file), mixed.join(file)).unwrap();
-    }
-    assert_refused(&with(&mixed), "is of another authority", "ca.pem");
-    fs::write(mixed.join("key.pem"), "a secret").unwrap();
-    assert_refused(&with(&mixed), "key.pem holds no private key", "ca.pem");
-    let swapped = learner(&["--listen", &tls, "--certificates", &good]);
-    assert_refused(&swapped, "is a certificate for quad-evaluator", "this program's role");
-    assert!(!scratch.path().join("run").exists(), "a refused start leaves a folder behind");
-
-    // The environment variable is the flag, and without an endpoint the default one is protected.
-    let mut command = start("evaluator");
-    command.arg("serve").env("QUAD_CERTIFICATES", certificates.of("nowhere"));
-    assert_refused(&command.output().unwrap(), "nowhere/ca.pem", "certificates.sh");
-}
-
-fn assert_refused(output: &Output, sentence: &str, hint: &str) {
-    let text = String::from_utf8_lossy(&output.stderr);
-    assert_eq!(output.status.code(), Some(1), "{sentence}: {text}");
-    let advice = text.split_once("hint: ").map(|(_, advice)| advice).unwrap_or_default();
-    assert!(text.contains(sentence), "`{sentence}` is not in\n{text}");
-    assert!(advice.contains(hint), "`{hint}` is not in the hint of\n{text}");
 }

@@ -5,7 +5,8 @@ use std::fs;
 use std::time::Duration;
 
 use quad_dataset::environment;
-use quad_protocol::{EpisodeScore, JobReply, JobRequest, Message, Name, ScoreReply, ScoreReport, decode, encode, keys};
+use quad_protocol::{EpisodeScore, JobReply, Message, ScoreReply, ScoreReport, decode, encode, keys};
+use quad_tests::made_up::{self, name};
 use quad_tests::router::router;
 use quad_tests::system::{Scratch, Setting, free_port};
 use quad_tests::{PATIENCE, eventually, http};
@@ -33,10 +34,7 @@ async fn scores_that_were_made_up_are_found_out_by_the_next_evaluator() {
     let mut learner = scratch.learner_with("run", setting, &["--connect", &endpoint, "--audit", "1"]);
 
     // A job done by nobody: its scores are possible, but not true.
-    let name = |text: &str| Name::new(text).unwrap();
-    let (run, liar, precision) = (name("run"), name("liar"), name("f32"));
-    let environments = vec!["hopper".to_owned()];
-    let claim = JobRequest::Claim { evaluator: liar.clone(), attempt: 1, environments, precision: precision.clone() };
+    let (run, claim) = (name("run"), made_up::claim("liar", 1, "hopper"));
     let job = loop {
         match ask(&session, keys::jobs(&run), encode(&claim).unwrap()).await {
             JobReply::Job(job) => break job,
@@ -46,7 +44,7 @@ async fn scores_that_were_made_up_are_found_out_by_the_next_evaluator() {
     let hopper = environment::find("hopper").unwrap();
     let score =
         |&seed: &u64| EpisodeScore { seed, episode_return: 5.0, length: 10, score: hopper.normalised_score(5.0) };
-    let report = ScoreReport::of(&job, liar, precision, job.seeds.iter().map(score).collect());
+    let report = ScoreReport::of(&job, name("liar"), name("f32"), job.seeds.iter().map(score).collect());
     let reply: ScoreReply = ask(&session, keys::scores(&run), encode(&report).unwrap()).await;
     assert!(matches!(reply, ScoreReply::Recorded { new: 4, .. }), "{reply:?}");
 

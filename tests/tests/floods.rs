@@ -5,7 +5,8 @@ use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::Duration;
 
-use quad_protocol::{EpisodeScore, Hash, JobRequest, Name, Progress, ScoreReport, encode, keys};
+use quad_protocol::{Name, encode, keys};
+use quad_tests::made_up::{self, name};
 use quad_tests::router::router;
 use quad_tests::system::{Scratch, Setting, free_port};
 use quad_tests::{PATIENCE, eventually, http};
@@ -16,51 +17,25 @@ static CORES: tokio::sync::Mutex<()> = tokio::sync::Mutex::const_new(());
 /// Most that a learner's memory may grow by, MiB.
 const MOST_GROWTH: u64 = 40;
 
-fn name(text: &str) -> Name {
-    Name::new(text).unwrap()
-}
-
 /// Asks for work that there is not.
 fn claim(number: u64) -> Vec<u8> {
-    let (evaluator, precision) = (name(&format!("flood-{number}")), name("f32"));
-    encode(&JobRequest::Claim { evaluator, attempt: number, environments: vec!["moon".to_owned()], precision }).unwrap()
+    encode(&made_up::claim(&format!("flood-{number}"), number, "moon")).unwrap()
 }
 
 /// Messages that a learner can read, as fast as they can be sent, and evaluators that come and go.
 async fn messages(session: &Session, run: &Name, stop: &AtomicBool) {
-    let progress = |number: u64| Progress {
-        evaluator: name(&format!("flood-{number}")),
-        run: run.clone(),
-        incarnation: 1,
-        job: 1,
-        step: 10,
-        episodes_done: 0,
-        episodes_total: 5,
-        steps_done: number,
-        environment_steps: number,
-        episodes: 0,
-        proof: Hash::of(b"guessed"),
-    };
-    let lie = |number: u64| ScoreReport {
-        evaluator: name("liar"),
-        run: run.clone(),
-        incarnation: 1,
-        job: 1,
-        step: 10 + number % 2,
-        weights: Hash::of(b"guessed"),
-        precision: name("f32"),
-        episodes: vec![EpisodeScore { seed: number, episode_return: f64::NAN, length: 0, score: f64::NAN }],
-        cannot_act: None,
-    };
     let mut number = 0;
     let mut tokens = Vec::new();
     while !stop.load(Ordering::Relaxed) {
         number += 1;
-        session.put(format!("quad/{run}/progress/flood"), encode(&progress(number)).unwrap()).await.unwrap();
-        for (key, message) in [(keys::jobs(run), claim(number)), (keys::scores(run), encode(&lie(number)).unwrap())] {
+        let evaluator = format!("flood-{number}");
+        let progress = encode(&made_up::progress(run, &evaluator, number)).unwrap();
+        session.put(keys::progress(run, &name("flood")), progress).await.unwrap();
+        let report = encode(&made_up::report(run, 10 + number % 2, number)).unwrap();
+        for (key, message) in [(keys::jobs(run), claim(number)), (keys::scores(run), report)] {
             session.get(key).payload(message).timeout(Duration::from_secs(1)).callback(drop).await.unwrap();
         }
-        let token = keys::live_evaluator(run, &name(&format!("flood-{number}")));
+        let token = keys::live_evaluator(run, &name(&evaluator));
         tokens.push(session.liveliness().declare_token(token).await.unwrap());
         // More than a learner counts. Each costs Zenoh more, the more there are.
         if tokens.len() >= 1200 {

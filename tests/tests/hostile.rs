@@ -10,10 +10,11 @@ use std::process::Command;
 use std::sync::atomic::AtomicBool;
 use std::time::{Duration, Instant};
 
-use quad_protocol::{EpisodeScore, Hash, JobRequest, Name, Progress, ScoreReport, WeightsRequest, encode, keys};
+use quad_protocol::{Name, WeightsRequest, encode, keys};
 use quad_service::{Endpoints, open_session};
 use quad_tests::crowd::{Crowd, Pace};
 use quad_tests::knock::knock;
+use quad_tests::made_up::{self, name};
 use quad_tests::pace::{ENDLESS, compare, median, on_core};
 use quad_tests::process::Process;
 use quad_tests::router::router;
@@ -61,49 +62,8 @@ const ATTACKS: [Attack; 12] = [
     Attack::Tokens,
 ];
 
-fn name(text: &str) -> Name {
-    Name::new(text).unwrap()
-}
-
 fn run() -> Name {
     name("run")
-}
-
-fn progress() -> Vec<u8> {
-    let message = Progress {
-        evaluator: name("flood"),
-        run: run(),
-        incarnation: 1,
-        job: 1,
-        step: 10,
-        episodes_done: 0,
-        episodes_total: 5,
-        steps_done: 1,
-        environment_steps: 1,
-        episodes: 0,
-        proof: Hash::of(b"guessed"),
-    };
-    encode(&message).unwrap()
-}
-
-fn claim_of(evaluator: Name) -> Vec<u8> {
-    let precision = name("f32");
-    encode(&JobRequest::Claim { evaluator, attempt: 1, environments: vec!["moon".to_owned()], precision }).unwrap()
-}
-
-fn lie() -> Vec<u8> {
-    let report = ScoreReport {
-        evaluator: name("liar"),
-        run: run(),
-        incarnation: 1,
-        job: 1,
-        step: ENDLESS.eval_interval,
-        weights: Hash::of(b"guessed"),
-        precision: name("f32"),
-        episodes: vec![EpisodeScore { seed: 1, episode_return: f64::NAN, length: 0, score: f64::NAN }],
-        cannot_act: None,
-    };
-    encode(&report).unwrap()
 }
 
 /// One of many ways to write what a learner's weights fit: with a wildcard in place of each letter whose bit is set.
@@ -150,7 +110,9 @@ async fn flood(attack: Attack, endpoint: &str) {
     let ask = async |key: String, question: Vec<u8>| {
         session.get(key).payload(question).timeout(Duration::from_secs(1)).callback(drop).await.unwrap();
     };
-    let (progress, claim, lie) = (progress(), claim_of(name("flood")), lie());
+    let claim_of = |evaluator: &str| encode(&made_up::claim(evaluator, 1, "moon")).unwrap();
+    let (progress, claim) = (encode(&made_up::progress(&run, "flood", 1)).unwrap(), claim_of("flood"));
+    let report = encode(&made_up::report(&run, ENDLESS.eval_interval, 1)).unwrap();
     let mut noise: Vec<u8> = (0..1000u32).map(|i| (i.wrapping_mul(2_654_435_761) >> 24) as u8).collect();
     let mut newer = claim.clone();
     newer[4] ^= 0xff;
@@ -159,7 +121,7 @@ async fn flood(attack: Attack, endpoint: &str) {
         match attack {
             Attack::Progress => session.put(keys::progress(&run, &name("flood")), progress.clone()).await.unwrap(),
             Attack::Claims => ask(keys::jobs(&run), claim.clone()).await,
-            Attack::LyingReports => ask(keys::scores(&run), lie.clone()).await,
+            Attack::LyingReports => ask(keys::scores(&run), report.clone()).await,
             Attack::Garbage => {
                 noise.rotate_left(1);
                 session.put(keys::progress(&run, &name("noise")), noise.clone()).await.unwrap();
@@ -190,9 +152,10 @@ async fn flood(attack: Attack, endpoint: &str) {
                 }
             }
             Attack::Evaluators => {
-                let name = name(&format!("flood-{}", tokens.len()));
-                tokens.push(session.liveliness().declare_token(keys::live_evaluator(&run, &name)).await.unwrap());
-                ask(keys::jobs(&run), claim_of(name)).await;
+                let evaluator = format!("flood-{}", tokens.len());
+                let token = keys::live_evaluator(&run, &name(&evaluator));
+                tokens.push(session.liveliness().declare_token(token).await.unwrap());
+                ask(keys::jobs(&run), claim_of(&evaluator)).await;
                 if tokens.len() > 1000 {
                     tokens.clear();
                 }

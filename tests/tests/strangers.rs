@@ -6,6 +6,7 @@ use std::sync::atomic::{AtomicUsize, Ordering};
 use std::time::{Duration, Instant};
 
 use quad_protocol::{Hash, Job, JobReply, JobRequest, Lease, Name, Schema, ScoreReply, Snapshot, decode, encode, keys};
+use quad_tests::made_up::{self, name};
 use quad_tests::router::router;
 use quad_tests::system::{Scratch, Setting, free_port};
 use quad_tests::{PATIENCE, eventually, http};
@@ -29,14 +30,9 @@ fn garbage(real: &[u8]) -> Vec<Vec<u8>> {
     ]
 }
 
-fn claim(evaluator: &str, attempt: u64) -> JobRequest {
-    let (evaluator, precision) = (Name::new(evaluator).unwrap(), Name::new("f32").unwrap());
-    JobRequest::Claim { evaluator, attempt, environments: vec!["hopper".to_owned()], precision }
-}
-
 /// A run whose learner answers claims with nonsense of every kind, one after another.
 async fn haunt(session: &Session) -> impl Sized {
-    let ghost = Name::new("ghost").unwrap();
+    let ghost = name("ghost");
     let job = |run: &Name, candidates: u32, environment: &str| {
         let weights = Hash::of(b"no tensors");
         let (run, environment) = (run.clone(), environment.to_owned());
@@ -60,7 +56,7 @@ async fn haunt(session: &Session) -> impl Sized {
         job(&ghost, 1, "hopper"), // its weights are no safetensors
         job(&ghost, u32::MAX, "hopper"),
         job(&ghost, 1, "moon"),
-        job(&Name::new("another").unwrap(), 1, "hopper"),
+        job(&name("another"), 1, "hopper"),
     ];
     let schema =
         Schema { environment: "hopper".to_owned(), observation_dim: 11, action_dim: 3, policy: "diffusion".to_owned() };
@@ -97,11 +93,11 @@ async fn nonsense_on_every_key_is_counted_and_survived() {
     let mut evaluator = scratch.evaluator("brave", &endpoint);
     let first = eventually("there are scores", PATIENCE, || Some(learner.scores().first()?.key().0));
 
-    let run = Name::new("run").unwrap();
+    let run = name("run");
     let replies = session.get(keys::weights_at(&run, first)).await.unwrap();
     let snapshot = replies.recv_async().await.unwrap().into_result().unwrap().payload().to_bytes().into_owned();
     decode::<Snapshot>(&snapshot).unwrap();
-    let request = claim("stranger", 1);
+    let request = made_up::claim("stranger", 1, "hopper");
     let payloads = garbage(&snapshot).into_iter().chain(garbage(&encode(&request).unwrap()));
     let _ghost = haunt(&session).await;
     for payload in payloads {
@@ -172,7 +168,7 @@ async fn whoever_answers_in_the_learners_place_or_never_costs_nothing() {
     let scratch = Scratch::new();
     let endpoint = format!("tcp/127.0.0.1:{}", free_port());
     let session = router(&endpoint).await;
-    let run = Name::new("run").unwrap();
+    let run = name("run");
     let _impostor = impostor(&session, &run).await;
     let setting = Setting { steps: 200, ..Setting::default() };
     let evaluator = scratch.evaluator("loyal", &endpoint);

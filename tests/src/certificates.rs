@@ -1,0 +1,83 @@
+//! Certificates of every role, made with deploy/zenoh/certificates.sh, and sessions that show them.
+
+use std::path::{Path, PathBuf};
+use std::process::Command;
+
+use tempfile::{TempDir, tempdir};
+use zenoh::{Config, Session};
+
+use crate::peers;
+
+/// A folder of certificates, one of each role, besides an expired one.
+pub struct Certificates {
+    folder: TempDir,
+}
+
+impl Certificates {
+    /// Of a new authority. `None` if the test is to be skipped.
+    pub fn make() -> Option<Certificates> {
+        let folder = tempdir().unwrap();
+        let made: [&[&str]; 5] = [
+            &["router", "router", "127.0.0.1"],
+            &["learner", "learner"],
+            &["evaluator", "evaluator"],
+            &["monitor", "monitor"],
+            &["--days", "0", "evaluator", "expired"],
+        ];
+        made.iter().all(|arguments| peers::certificates(folder.path(), arguments)).then_some(Certificates { folder })
+    }
+
+    /// Makes an evaluator's anew, under the name that it had.
+    pub fn renew(&self, name: &str) {
+        assert!(peers::certificates(self.folder.path(), &["evaluator", name]));
+    }
+
+    /// An evaluator's that is valid for so many seconds, which the script's days are too long for.
+    pub fn short(&self, name: &str, seconds: u64) {
+        self.renew(name);
+        let script = r#"
+            touch index; openssl rand -hex 8 >serial
+            printf '[ca]\ndefault_ca=it\n[it]\ndatabase=index\nserial=serial\nnew_certs_dir=.\npolicy=any\n[any]\n' >config
+            printf 'organizationName=optional\norganizationalUnitName=optional\ncommonName=supplied\n' >>config
+            printf 'extendedKeyUsage=clientAuth\n' >extensions
+            openssl req -new -key "$2/key.pem" -subj /CN=quad-evaluator -out request
+            openssl ca -batch -notext -config config -md sha256 -in request -cert ca/ca.pem -keyfile ca/key.pem \
+              -extfile extensions -enddate "$(date -u -d "+$1 seconds" +%Y%m%d%H%M%SZ)" -out "$2/cert.pem"
+        "#;
+        let arguments = ["-euc", script, "sh", &seconds.to_string(), name];
+        let output = Command::new("sh").args(arguments).current_dir(self.folder.path()).output().unwrap();
+        assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
+    }
+
+    /// The folder of the certificate called so.
+    pub fn of(&self, name: &str) -> PathBuf {
+        self.folder.path().join(name)
+    }
+
+    /// The same, for a command line.
+    pub fn argument(&self, name: &str) -> String {
+        self.of(name).to_str().unwrap().to_owned()
+    }
+}
+
+/// Connects as whoever has the certificate in `folder`, or as nobody, and trusts the authority of `trusted`.
+pub async fn connect(endpoint: &str, trusted: &Path, folder: Option<&Path>) -> zenoh::Result<Session> {
+    let mut config = Config::default();
+    let mut settings = vec![
+        ("mode", "\"client\"".to_owned()),
+        ("connect/endpoints", format!("[{endpoint:?}]")),
+        ("connect/timeout_ms", "2000".to_owned()),
+        ("connect/exit_on_failure", "true".to_owned()),
+        ("scouting/multicast/enabled", "false".to_owned()),
+        ("transport/link/tls/root_ca_certificate", format!("{:?}", trusted.join("ca.pem"))),
+    ];
+    if let Some(folder) = folder {
+        settings.push(("transport/link/tls/enable_mtls", "true".to_owned()));
+        settings.push(("transport/link/tls/connect_certificate", format!("{:?}", folder.join("cert.pem"))));
+        settings.push(("transport/link/tls/connect_private_key", format!("{:?}", folder.join("key.pem"))));
+    }
+    for (key, value) in settings {
+        config.insert_json5(key, &value).unwrap();
+    }
+    zenoh::open(config).await
+}

@@ -1,0 +1,68 @@
+//! With certificates that do not do, or without any where they are needed, no program starts.
+#![allow(clippy::unwrap_used, clippy::expect_used)]
+
+use std::fs;
+use std::path::Path;
+use std::process::{Command, Output};
+
+use quad_tests::PATIENCE;
+use quad_tests::certificates::Certificates;
+use quad_tests::process::binary;
+use quad_tests::system::{Scratch, Setting, free_port};
+
+#[test]
+fn what_cannot_be_safe_is_refused_before_anything_starts() {
+    let Some(certificates) = Certificates::make() else { return };
+    let elsewhere = Certificates::make().unwrap();
+    let scratch = Scratch::new();
+    let preset = scratch.preset("run", Setting::default());
+    // Whatever would start nevertheless is stopped, with exit code 124.
+    let start = |program: &str| {
+        let mut command = Command::new("timeout");
+        command.arg(PATIENCE.as_secs().to_string()).arg(binary(program));
+        command
+    };
+    let learner = |arguments: &[&str]| {
+        let mut command = start("learner");
+        command.arg("train").arg("--preset").arg(&preset).arg("--dataset").arg(scratch.dataset());
+        command.arg("--run-dir").arg(scratch.path().join("run")).args(arguments).output().unwrap()
+    };
+    let evaluator = |arguments: &[&str]| start("evaluator").arg("serve").args(arguments).output().unwrap();
+    let (good, tls) = (certificates.argument("evaluator"), format!("tls/127.0.0.1:{}", free_port()));
+
+    let open = evaluator(&["--connect", "tcp/127.0.0.1:1", "--certificates", &good]);
+    assert_refused(&open, "tcp/127.0.0.1:1 would be open to anybody", "tls/HOST:PORT");
+    let open = learner(&["--listen", "tcp/127.0.0.1:0", "--certificates", &certificates.argument("learner")]);
+    assert_refused(&open, "tcp/127.0.0.1:0 would be open to anybody", "tls/HOST:PORT");
+    assert_refused(&evaluator(&["--connect", &tls]), "needs certificates", "--certificates DIR");
+    assert_refused(&learner(&["--listen", &tls]), "needs certificates", "--certificates DIR");
+
+    let with = |folder: &Path| evaluator(&["--connect", &tls, "--certificates", folder.to_str().unwrap()]);
+    assert_refused(&with(&certificates.of("nowhere")), "nowhere/ca.pem", "certificates.sh");
+    assert_refused(&with(&certificates.of("learner")), "is a certificate for quad-learner", "this program's role");
+    assert_refused(&with(&certificates.of("expired")), "which is not now", "make a new certificate");
+    let mixed = certificates.of("mixed");
+    fs::create_dir(&mixed).unwrap();
+    for (from, file) in [(&elsewhere, "ca.pem"), (&certificates, "cert.pem"), (&certificates, "key.pem")] {
+        fs::copy(from.of("evaluator").join(file), mixed.join(file)).unwrap();
+    }
+    assert_refused(&with(&mixed), "is of another authority", "ca.pem");
+    fs::write(mixed.join("key.pem"), "a secret").unwrap();
+    assert_refused(&with(&mixed), "key.pem holds no private key", "ca.pem");
+    let swapped = learner(&["--listen", &tls, "--certificates", &good]);
+    assert_refused(&swapped, "is a certificate for quad-evaluator", "this program's role");
+    assert!(!scratch.path().join("run").exists(), "a refused start leaves a folder behind");
+
+    // The environment variable is the flag, and without an endpoint the default one is protected.
+    let mut command = start("evaluator");
+    command.arg("serve").env("QUAD_CERTIFICATES", certificates.of("nowhere"));
+    assert_refused(&command.output().unwrap(), "nowhere/ca.pem", "certificates.sh");
+}
+
+fn assert_refused(output: &Output, sentence: &str, hint: &str) {
+    let text = String::from_utf8_lossy(&output.stderr);
+    assert_eq!(output.status.code(), Some(1), "{sentence}: {text}");
+    let advice = text.split_once("hint: ").map(|(_, advice)| advice).unwrap_or_default();
+    assert!(text.contains(sentence), "`{sentence}` is not in\n{text}");
+    assert!(advice.contains(hint), "`{hint}` is not in the hint of\n{text}");
+}
