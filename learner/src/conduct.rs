@@ -3,13 +3,14 @@
 use std::thread;
 use std::time::{Duration, Instant};
 
-use anyhow::anyhow;
+use anyhow::{anyhow, bail};
 use quad_protocol::Name;
 use quad_service::Endpoints;
 use tokio::runtime::Handle;
 use tokio::sync::mpsc::UnboundedReceiver;
 use tokio::sync::oneshot;
 use tokio::time::{MissedTickBehavior, interval, timeout};
+use tracing::{error, warn};
 use zenoh::Session;
 
 use crate::display::{Display, evaluators};
@@ -29,6 +30,10 @@ const EVALUATOR_PATIENCE: Duration = Duration::from_secs(10);
 const DISK_PATIENCE: Duration = Duration::from_secs(30);
 /// Longest time to close the session in, should the network hang.
 const CLOSE_PATIENCE: Duration = Duration::from_secs(5);
+/// When a run has failed, what still waits for the disk is given up after this time: the disk may be in trouble, too.
+const LAST_WRITES: Duration = Duration::from_secs(15);
+/// How long a file is left alone that the disk did not take.
+const RETRY: Duration = Duration::from_secs(2);
 
 /// A Zenoh session that may still wait for a router.
 pub type Opening = oneshot::Receiver<anyhow::Result<Session>>;
@@ -95,7 +100,7 @@ impl Conductor {
         let mut wire = None;
         let ending = self.watch(opening, &mut wire).await;
         self.display.finish();
-        let ended = tokio::task::spawn_blocking(|| self.threads.join()).await?;
+        let ended = end(self.threads, &ending).await;
         let ending = match (ending, ended) {
             // Why a thread ended badly is known already if the run has failed by it.
             (Ending::Failed(error), _) | (_, Err(error)) => Ending::Failed(error),
@@ -166,9 +171,13 @@ impl Conductor {
         let session = session??;
         self.reachable_at = quad_service::reachable_at(&session, &self.endpoints).await?;
         let endpoints = RunEndpoints { zenoh: self.reachable_at.clone(), metrics: self.metrics_address.clone() };
-        let ready = || Ok(self.run_dir.write_endpoints(&endpoints)?);
+        let ready = || write_endpoints(self.run_dir.clone(), endpoints.clone());
         let (hub, publisher) = (&self.threads.hub, &self.threads.publisher);
-        let life = Life { run: self.run.clone(), incarnation: self.incarnation };
+        let life = Life {
+            run: self.run.clone(),
+            incarnation: self.incarnation,
+            behind_router: !self.endpoints.connect.is_empty(),
+        };
         let wire = Wire::declare(session, life, hub, publisher, &self.metrics, ready).await?;
         let (zenoh, metrics) = (endpoints.zenoh.join(", "), &endpoints.metrics);
         self.display.say(&format!("run {} is at {zenoh}, its metrics at http://{metrics}/metrics", self.run));
@@ -220,6 +229,36 @@ impl Conductor {
             [endpoint, ..] => format!("no evaluator is here; start one with: evaluator serve --connect {endpoint}"),
         }
     }
+}
+
+/// Ends the threads. Those of a run that has failed get some time for it, in which its user is told why.
+async fn end(threads: Threads, ending: &Ending) -> anyhow::Result<()> {
+    let mut ended = tokio::task::spawn_blocking(|| threads.join());
+    let Ending::Failed(error) = ending else { return ended.await? };
+    if let Ok(ended) = timeout(Duration::from_secs(1), &mut ended).await {
+        return ended?;
+    }
+    error!("{error:#}; ending as soon as the disk has taken what waits for it, in {} s at most", LAST_WRITES.as_secs());
+    match timeout(LAST_WRITES, ended).await {
+        Ok(ended) => ended?,
+        Err(_) => bail!("the disk did not take what was to be saved last"),
+    }
+}
+
+/// Writes where the learner can be reached, as soon as the disk takes it. Nothing but the user's scripts needs it.
+fn write_endpoints(run_dir: RunDir, endpoints: RunEndpoints) -> anyhow::Result<()> {
+    let work = move || {
+        let mut said = false;
+        while let Err(error) = run_dir.write_endpoints(&endpoints) {
+            if !said {
+                said = true;
+                warn!("{:#}; it is tried again until the disk takes it", anyhow::Error::from(error));
+            }
+            thread::sleep(RETRY);
+        }
+    };
+    thread::Builder::new().name("endpoints".to_owned()).spawn(work)?;
+    Ok(())
 }
 
 /// For how long no evaluator has been connected.

@@ -19,7 +19,7 @@ use quad_protocol::{
 };
 use quad_service::{Beat, hinted, stay_in_background};
 use tokio::sync::mpsc::UnboundedSender;
-use tracing::{debug, warn};
+use tracing::{debug, info, warn};
 use zenoh::Session;
 
 use crate::inbox::Messages;
@@ -43,6 +43,9 @@ const MOST_TOGETHER: usize = 256;
 /// takes more of a processor that training needs than what they then do.
 const GATHER: Duration = Duration::from_millis(20);
 
+/// When all scores are there, those that could be scored a second time wait so long for somebody who can do it.
+const LAST_AUDITS: Duration = Duration::from_secs(30);
+
 /// Messages to the thread.
 #[derive(Debug)]
 pub enum Event {
@@ -59,8 +62,8 @@ pub enum Event {
     Online {
         /// The session.
         session: Session,
-        /// If it is a router's client: who sees to it that evaluators' tokens are followed.
-        follower: Option<Sender<Follow>>,
+        /// Who sees to it that evaluators' tokens are followed.
+        follower: Sender<Follow>,
     },
     /// An evaluator asks for a job, or hands one back.
     Job(Question),
@@ -72,8 +75,8 @@ pub enum Event {
     Joined(Name),
     /// An evaluator is gone.
     Left(Name),
-    /// Another learner has the run's name: what to say of it.
-    Twin(anyhow::Error),
+    /// The run cannot go on, and why.
+    Failed(anyhow::Error),
     /// The scores that the scribe had were written, or why not.
     Written(Result<(), String>),
     /// End, after the messages sent before this one are handled.
@@ -101,6 +104,8 @@ pub struct Hub {
     session: Option<Session>,
     delivered: Delivered,
     training_completed: bool,
+    /// After all scores were there: since when nobody has scored any a second time.
+    audited_last: Option<Instant>,
 }
 
 impl Hub {
@@ -124,6 +129,7 @@ impl Hub {
             session: None,
             delivered: Delivered::default(),
             training_completed: false,
+            audited_last: None,
         }
     }
 
@@ -192,9 +198,7 @@ impl Hub {
             }
             Event::Online { session, follower } => {
                 self.session = Some(session);
-                if let Some(follower) = follower {
-                    self.evaluators.follow(follower);
-                }
+                self.evaluators.follow(follower);
             }
             Event::Job(question) => {
                 let reply = parse(question.message()).map(|request| self.job(request));
@@ -209,13 +213,9 @@ impl Hub {
                     self.reject(&rejection);
                 }
             }
-            Event::Joined(evaluator) => {
-                if let Err(rejection) = self.evaluators.joined(evaluator) {
-                    self.reject(&rejection);
-                }
-            }
+            Event::Joined(evaluator) => self.evaluators.joined(evaluator, Instant::now()),
             Event::Left(evaluator) => self.left(evaluator),
-            Event::Twin(error) => {
+            Event::Failed(error) => {
                 self.notices.send(Notice::Failed(error)).ok();
             }
             Event::Written(written) => self.written(&written),
@@ -265,19 +265,22 @@ impl Hub {
 
     fn left(&mut self, evaluator: Name) {
         if self.evaluators.remove(&evaluator) {
-            let lost = self.scoreboard.evaluator_gone(&evaluator);
+            let lost = self.scoreboard.evaluator_gone(&evaluator, Instant::now());
             self.evaluators.left(evaluator, lost.jobs);
             self.lost(lost);
         }
     }
 
     fn tick(&mut self, now: Instant) {
-        self.evaluators.tick(now);
+        for evaluator in self.evaluators.tick(now) {
+            self.left(evaluator);
+        }
         let expired = self.scoreboard.expire(now);
         if expired.jobs > 0 {
             self.notices.send(Notice::JobsExpired(expired.jobs)).ok();
         }
         self.lost(expired);
+        self.settle();
     }
 
     fn lost(&mut self, lost: Lost) {
@@ -292,10 +295,26 @@ impl Hub {
     }
 
     fn settle(&mut self) {
-        if self.training_completed && self.scoreboard.pending() == 0 {
-            self.training_completed = false; // said once
-            self.notices.send(Notice::Settled).ok();
+        if !self.training_completed || self.scoreboard.pending() > 0 {
+            return;
         }
+        let [waiting, open] = self.scoreboard.audits();
+        if waiting + open > 0 && self.evaluators.count() > 1 {
+            let now = Instant::now();
+            let since = *self.audited_last.get_or_insert_with(|| {
+                info!(episodes = waiting + open, "every score is there; some are checked by another evaluator");
+                now
+            });
+            if open > 0 {
+                self.audited_last = Some(now);
+                return;
+            }
+            if now - since < LAST_AUDITS {
+                return;
+            }
+        }
+        self.training_completed = false; // said once
+        self.notices.send(Notice::Settled).ok();
     }
 
     fn reject(&self, rejection: &Rejection) {

@@ -148,7 +148,7 @@ impl SnapshotPublisher {
             return;
         }
         let (identity, run_dir) = (self.identity.clone(), self.run_dir.clone());
-        question.answer_with(asker, move || {
+        question.answer_from_disk(asker, move || {
             let bytes = saved(identity, &run_dir, step, hash);
             bytes.map(|bytes| (key, bytes)).map_err(|error| format!("{error:#}"))
         });

@@ -14,7 +14,6 @@ mod question;
 
 use std::collections::VecDeque;
 use std::sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError};
-use std::thread;
 use std::time::{Duration, Instant};
 
 use quad_protocol::Name;
@@ -22,13 +21,17 @@ use quad_service::stay_in_background;
 use zenoh::bytes::ZBytes;
 use zenoh::query::Query;
 
+use crate::hub;
+use crate::inbox::Inbox;
 use crate::metrics::Metrics;
+use crate::threads::spawn_for_hub;
 
 pub use question::Question;
 use question::kept;
 
-/// Threads that answer.
+/// Threads that answer, and how many of them may read from the disk at a time: should it hang, the others go on.
 const THREADS: usize = 12;
+const MOST_READING: usize = 4;
 /// A query is dropped so long after its answer: Zenoh's own thread still holds it while it hands it over, and whoever drops it
 /// last may have to wait for the peer.
 const GRACE: Duration = Duration::from_millis(50);
@@ -76,16 +79,18 @@ struct Task {
     bytes: usize,
     /// If there is none any more, the query is only to be dropped.
     work: Option<Work>,
+    /// Whether the answer is read from the disk.
+    reads: bool,
     not_before: Instant,
 }
 
 impl Task {
-    fn answer(asker: Asker, query: Query, work: Work) -> Self {
-        Self { asker, bytes: kept(&query), query, work: Some(work), not_before: Instant::now() }
+    fn answer(asker: Asker, query: Query, work: Work, reads: bool) -> Self {
+        Self { asker, bytes: kept(&query), query, work: Some(work), reads, not_before: Instant::now() }
     }
 
     fn drop_later(asker: Asker, query: Query) -> Self {
-        Self { asker, bytes: kept(&query), query, work: None, not_before: Instant::now() + GRACE }
+        Self { asker, bytes: kept(&query), query, work: None, reads: false, not_before: Instant::now() + GRACE }
     }
 }
 
@@ -94,6 +99,8 @@ struct State {
     waiting: VecDeque<Task>,
     /// Of the answers that are being sent.
     busy: Vec<Asker>,
+    /// How many of them are being read from the disk.
+    reading: usize,
     /// Threads that sleep until they are called.
     asleep: usize,
     /// One was called, and will look at all that waits.
@@ -112,7 +119,8 @@ impl State {
         let now = Instant::now();
         self.waiting.iter().position(|task| {
             let threads = self.busy.iter().filter(|asker| **asker == task.asker).count();
-            threads < task.asker.most_threads() && (task.not_before <= now || self.closed)
+            let may_read = !task.reads || self.reading < MOST_READING;
+            threads < task.asker.most_threads() && may_read && (task.not_before <= now || self.closed)
         })
     }
 
@@ -152,13 +160,13 @@ impl Drop for CloseOnDrop {
 }
 
 impl Replies {
-    /// Starts the threads.
-    pub fn start(metrics: &Metrics) -> std::io::Result<Self> {
+    /// Starts the threads. If one of them panics, the hub is told that the run cannot go on.
+    pub fn start(metrics: &Metrics, hub: &Inbox<hub::Event>) -> std::io::Result<Self> {
         let (work, idle) = (Condvar::new(), Condvar::new());
         let shared = Arc::new(Shared { state: Mutex::default(), work, idle, metrics: metrics.clone() });
         for _ in 0..THREADS {
             let shared = shared.clone();
-            thread::Builder::new().name("reply".to_owned()).spawn(move || shared.work())?;
+            spawn_for_hub("reply", hub, move || shared.work())?;
         }
         Ok(Self { _last: Arc::new(CloseOnDrop(shared.clone())), shared })
     }
@@ -211,7 +219,7 @@ impl Shared {
         loop {
             state.called = false;
             let next = state.next().and_then(|place| state.waiting.remove(place));
-            let Some(Task { asker, query, work, .. }) = next else {
+            let Some(Task { asker, query, work, reads, .. }) = next else {
                 if state.closed {
                     return;
                 }
@@ -232,6 +240,7 @@ impl Shared {
                 continue;
             };
             state.busy.push(asker.clone());
+            state.reading += usize::from(reads);
             // What comes next does not wait for this one's peer.
             if state.next().is_some() && state.calls() {
                 self.work.notify_one();
@@ -248,6 +257,7 @@ impl Shared {
                 }
             };
             state = self.lock();
+            state.reading -= usize::from(reads);
             state.waiting.extend(answered);
             if let Some(place) = state.busy.iter().position(|other| *other == asker) {
                 state.busy.swap_remove(place);

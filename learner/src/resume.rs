@@ -4,7 +4,7 @@ use std::collections::{BTreeMap, BTreeSet};
 use std::path::PathBuf;
 
 use anyhow::{anyhow, bail};
-use quad_protocol::{EpisodeScore, Hash};
+use quad_protocol::{EpisodeScore, Hash, Name};
 use quad_service::{Hint, hinted};
 use tracing::{info, warn};
 
@@ -37,6 +37,19 @@ pub struct Earlier {
     pub weights: String,
     /// Each seed once.
     pub episodes: Vec<EpisodeScore>,
+    /// Those of them that nobody has scored a second time.
+    pub unchecked: Vec<Unchecked>,
+}
+
+/// A score that was not audited.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Unchecked {
+    /// The score.
+    pub score: EpisodeScore,
+    /// Who measured it.
+    pub evaluator: Name,
+    /// Arithmetic that the policy was computed in.
+    pub precision: Name,
 }
 
 /// Opens and locks the folder if there is a run in it.
@@ -104,7 +117,8 @@ impl Past {
     fn read(dir: &RunDir, experiment: &Experiment) -> anyhow::Result<Self> {
         let checkpoint = dir.newest_checkpoint()?;
         let step = checkpoint.as_ref().map_or(0, |checkpoint| checkpoint.step);
-        let scores = by_step(dir.read_scores()?)?;
+        let audited = dir.read_audits()?.into_iter().map(|line| (line.step, line.seed)).collect();
+        let scores = by_step(dir.read_scores()?, &audited)?;
         let (schedule, mut snapshots) = (experiment.schedule(), BTreeMap::new());
         for of in dir.snapshots()?.into_iter().filter(|of| schedule.is_evaluated(*of)) {
             // One that the training comes by again, and that nobody has looked at, will be made again.
@@ -129,20 +143,26 @@ impl Past {
 }
 
 /// The scores of each step, which all are of the same weights, with each seed once.
-fn by_step(lines: Vec<ScoreLine>) -> anyhow::Result<BTreeMap<u64, Earlier>> {
+fn by_step(lines: Vec<ScoreLine>, audited: &BTreeSet<(u64, u64)>) -> anyhow::Result<BTreeMap<u64, Earlier>> {
     let mut scores: BTreeMap<u64, Earlier> = BTreeMap::new();
     let mut seen = BTreeSet::new();
     for line in lines {
         let (step, seed) = (line.step, line.seed);
-        let earlier =
-            scores.entry(step).or_insert_with(|| Earlier { weights: line.weights.clone(), episodes: Vec::new() });
+        let none = || Earlier { weights: line.weights.clone(), episodes: Vec::new(), unchecked: Vec::new() };
+        let earlier = scores.entry(step).or_insert_with(none);
         if earlier.weights != line.weights {
             bail!("scores.jsonl has scores of two different snapshots of step {step}");
         }
         if !seen.insert((step, seed)) {
             bail!("scores.jsonl has two scores of step {step}, seed {seed}");
         }
-        earlier.episodes.push(line.episode());
+        let score = line.episode();
+        earlier.episodes.push(score);
+        if let (Ok(evaluator), Ok(precision), false) =
+            (Name::new(line.evaluator), Name::new(line.precision), audited.contains(&(step, seed)))
+        {
+            earlier.unchecked.push(Unchecked { score, evaluator, precision });
+        }
     }
     Ok(scores)
 }

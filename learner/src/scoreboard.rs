@@ -13,7 +13,7 @@ mod jobs;
 mod refusal;
 mod screen;
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 use std::time::{Duration, Instant};
 
 use quad_dataset::Task;
@@ -71,6 +71,8 @@ pub struct Scoreboard {
     /// Scores of an earlier life, by step, whose evaluation has not been asked for in this one.
     earlier: BTreeMap<u64, Earlier>,
     audits: Audits,
+    /// Evaluators that have scored something since they came.
+    proven: BTreeSet<Name>,
 }
 
 /// Training has come by a step again, and its weights are not those that were scored.
@@ -125,7 +127,7 @@ impl Scoreboard {
     pub fn new(rules: Rules) -> Self {
         let audits = Audits::new(rules.audit);
         let (evaluations, jobs, earlier) = (BTreeMap::new(), OpenJobs::default(), BTreeMap::new());
-        Self { rules, evaluations, jobs, next_job: 1, earlier, audits }
+        Self { rules, evaluations, jobs, next_job: 1, earlier, audits, proven: BTreeSet::new() }
     }
 
     /// Which start of the learner this is.
@@ -163,7 +165,11 @@ impl Scoreboard {
         if known.is_some() {
             return Ok(None);
         }
-        let scores = self.earlier.remove(&step).map(|earlier| earlier.episodes).unwrap_or_default();
+        let (scores, unchecked) = match self.earlier.remove(&step) {
+            Some(Earlier { episodes, unchecked, .. }) => (episodes, unchecked),
+            None => Default::default(),
+        };
+        unchecked.into_iter().for_each(|unchecked| self.audits.add_one(step, unchecked));
         let evaluation = Evaluation::new(weights, seeds, &scores);
         let complete = evaluation.scores();
         self.evaluations.insert(step, evaluation);
@@ -173,6 +179,11 @@ impl Scoreboard {
     /// Episodes that have no score yet, and may still get one: without those that are [`missing`](Self::missing).
     pub fn pending(&self) -> usize {
         self.evaluations.values().map(Evaluation::pending).sum()
+    }
+
+    /// Episodes that are to be scored a second time: how many wait for somebody who can do so, and how many are handed out.
+    pub fn audits(&self) -> [usize; 2] {
+        self.audits.count()
     }
 
     /// Step and seed of the episodes that have no score and are not handed out any more.
@@ -201,7 +212,8 @@ impl Scoreboard {
         let id = self.next_job;
         let most = self.job_episodes(claim.present);
         let audit = self.audits.hand_out(id, claim.evaluator, claim.precision, most);
-        let Some(episodes) = audit.or_else(|| self.hand_out(id, most)) else { return later };
+        let newcomer = (!self.proven.contains(claim.evaluator)).then_some(now);
+        let Some(episodes) = audit.or_else(|| self.hand_out(id, most, newcomer)) else { return later };
         let job = OpenJob::new(claim.evaluator.clone(), claim.attempt, episodes, self.lease(claim.present), now);
         let message = self.message(id, &job, claim.present);
         self.jobs.insert(id, job);
@@ -223,10 +235,10 @@ impl Scoreboard {
     }
 
     /// Waiting episodes of the oldest step that has any.
-    fn hand_out(&mut self, job: u64, most: usize) -> Option<(u64, Vec<u64>)> {
+    fn hand_out(&mut self, job: u64, most: usize, newcomer: Option<Instant>) -> Option<(u64, Vec<u64>)> {
         let few = self.rules.job_episodes[0];
         self.evaluations.iter_mut().find_map(|(&step, evaluation)| {
-            let seeds = evaluation.hand_out(job, [few, most]);
+            let seeds = evaluation.hand_out(job, [few, most], newcomer);
             (!seeds.is_empty()).then_some((step, seeds))
         })
     }
@@ -254,7 +266,7 @@ impl Scoreboard {
     pub fn hand_back(&mut self, evaluator: &Name, id: u64, lease: &Lease) -> bool {
         let has = self.jobs.get(id).is_some_and(|job| job.evaluator == *evaluator && job.lease == *lease);
         if has {
-            self.release(id, false);
+            self.release(id, None);
         }
         has
     }
@@ -275,6 +287,9 @@ impl Scoreboard {
         let (audited, checked) = self.audits.compare(report);
         jobs.extend(checked);
         self.audits.add(report, new);
+        if !new.is_empty() {
+            self.proven.insert(report.evaluator.clone());
+        }
         let (audits, open) = (&self.audits, &mut self.jobs);
         let done = |seed| evaluation.is_scored(seed) == Some(true);
         jobs.retain(|&id| {
@@ -287,20 +302,21 @@ impl Scoreboard {
 
     /// Takes back the jobs whose lease has run out.
     pub fn expire(&mut self, now: Instant) -> Lost {
-        self.take_back(self.jobs.lost(now))
+        self.take_back(self.jobs.lost(now), now)
     }
 
     /// Takes back the job of an evaluator that is gone.
-    pub fn evaluator_gone(&mut self, evaluator: &Name) -> Lost {
-        self.take_back(self.jobs.of(evaluator).map(|(id, _)| id).into_iter().collect())
+    pub fn evaluator_gone(&mut self, evaluator: &Name, now: Instant) -> Lost {
+        self.proven.remove(evaluator);
+        self.take_back(self.jobs.of(evaluator).map(|(id, _)| id).into_iter().collect(), now)
     }
 
-    fn take_back(&mut self, jobs: Vec<u64>) -> Lost {
-        Lost { jobs: jobs.len(), given_up: jobs.into_iter().flat_map(|id| self.release(id, true)).collect() }
+    fn take_back(&mut self, jobs: Vec<u64>, now: Instant) -> Lost {
+        Lost { jobs: jobs.len(), given_up: jobs.into_iter().flat_map(|id| self.release(id, Some(now))).collect() }
     }
 
     /// Ends a job, and lets its episodes wait for the next one; gives those that were lost too often.
-    fn release(&mut self, id: u64, lost: bool) -> Vec<(u64, u64)> {
+    fn release(&mut self, id: u64, lost: Option<Instant>) -> Vec<(u64, u64)> {
         self.audits.release(id);
         let Some(OpenJob { step, seeds, .. }) = self.jobs.remove(id) else { return Vec::new() };
         let given_up = self.evaluations.get_mut(&step).map(|evaluation| evaluation.take_back(id, &seeds, lost));

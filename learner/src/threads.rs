@@ -180,15 +180,16 @@ impl Threads {
     /// Ends them all: snapshots and scores that were handed over are on disk afterwards.
     pub fn join(self) -> anyhow::Result<()> {
         self.stop_training();
-        finish("training", self.training)?;
-        finish("metrics", self.rows)?;
+        let training = finish("training", self.training);
+        let metrics = finish("metrics", self.rows);
         self.desk.close();
-        finish("keeper", self.keeper)?;
+        let keeper = finish("keeper", self.keeper);
         self.publisher.send(publisher::Event::Stop);
-        finish("publisher", self.publisher_thread)?;
+        let publisher = finish("publisher", self.publisher_thread);
         self.hub.send(hub::Event::Stop);
-        finish("hub", self.hub_thread)?;
-        finish("scribe", self.scribe)
+        let hub = finish("hub", self.hub_thread);
+        // One that ended badly does not keep the others from what they still have to write.
+        [training, metrics, keeper, publisher, hub, finish("scribe", self.scribe)].into_iter().collect()
     }
 }
 
@@ -216,11 +217,30 @@ fn spawn(
     notices: &UnboundedSender<Notice>,
     work: impl FnOnce() + Send + 'static,
 ) -> std::io::Result<Thread> {
-    let (thread, notices) = (name.to_owned(), notices.clone());
+    let notices = notices.clone();
+    spawn_or(name, move |error| drop(notices.send(Notice::Failed(error))), work)
+}
+
+/// The same for a thread of the network's side, which ends with the process.
+pub(crate) fn spawn_for_hub(
+    name: &str,
+    hub: &Inbox<hub::Event>,
+    work: impl FnOnce() + Send + 'static,
+) -> std::io::Result<()> {
+    let hub = hub.clone();
+    spawn_or(name, move |error| hub.send(hub::Event::Failed(error)), work).map(drop)
+}
+
+fn spawn_or(
+    name: &str,
+    failed: impl FnOnce(anyhow::Error) + Send + 'static,
+    work: impl FnOnce() + Send + 'static,
+) -> std::io::Result<Thread> {
+    let thread = name.to_owned();
     thread::Builder::new().name(name.to_owned()).spawn(move || {
         catch_unwind(AssertUnwindSafe(work)).map_err(|payload| {
             let panicked = Panicked { thread, message: message(payload.as_ref()) };
-            notices.send(Notice::Failed(anyhow!("{panicked}"))).ok();
+            failed(anyhow!("{panicked}"));
             panicked
         })
     })
@@ -261,6 +281,10 @@ mod tests {
         let Some(Notice::Failed(error)) = notices.blocking_recv() else { panic!("no notice") };
         assert!(error.to_string().contains("`hub` panicked") && error.to_string().contains("a test's own panic"));
         assert!(finish("hub", thread).is_err());
+        let (hub, messages) = inbox();
+        spawn_for_hub("reply", &hub, || panic!("another")).unwrap();
+        let Ok(Some(hub::Event::Failed(error))) = messages.next(Duration::from_secs(20)) else { panic!("no event") };
+        assert!(error.to_string().contains("`reply` panicked"), "{error}");
         let (notify, _notices) = unbounded_channel();
         finish("hub", spawn("hub", &notify, || ()).unwrap()).unwrap();
     }

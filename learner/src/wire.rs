@@ -20,7 +20,6 @@ use zenoh::query::{Query, Queryable};
 use zenoh::sample::{Locality, Sample, SampleKind};
 
 use self::flood::FloodGuard;
-use self::tokens::Changes;
 use crate::inbox::{Inbox, MOST_BYTES};
 use crate::metrics::Metrics;
 use crate::replies::{Asker, Question, Replies};
@@ -36,6 +35,8 @@ pub struct Life {
     pub run: Name,
     /// Which start of its learner.
     pub incarnation: u64,
+    /// Whether a router brings it all messages by one connection; else it listens itself.
+    pub behind_router: bool,
 }
 
 /// The learner's declarations; dropping it undeclares them.
@@ -45,7 +46,6 @@ pub struct Wire {
     flood: Arc<FloodGuard>,
     _queryables: [Queryable<()>; 3],
     _progress: Subscriber<()>,
-    _tokens: Option<Subscriber<()>>,
     _strays: Option<(Subscriber<()>, Subscriber<()>, Queryable<()>)>,
     _token: LivelinessToken,
 }
@@ -67,19 +67,14 @@ impl Wire {
     ) -> anyhow::Result<Self> {
         twin::wait_until_gone(&session, &life).await.hint(twin::HINT)?;
         let run = &life.run;
-        let replies = Replies::start(metrics)?;
+        let replies = Replies::start(metrics, hub)?;
         let flood = Arc::new(FloodGuard::new(metrics.held_back_seconds.clone()));
         // A router sends by one connection what many say. It must not be held back.
-        let direct = session.info().routers_zid().await.next().is_none();
-        if !direct {
+        if life.behind_router {
             flood.end();
         }
         publisher.send(publisher::Event::Online(session.clone()));
-        let changes = Changes { hub: hub.clone(), metrics: metrics.clone(), flood: flood.clone() };
-        let (tokens, follower) = match direct {
-            true => (Some(tokens::all(&session, run, changes).await?), None),
-            false => (None, Some(tokens::follower(&session, run, changes)?)),
-        };
+        let follower = tokens::follower(&session, run, hub, metrics)?;
         hub.send(hub::Event::Online { session: session.clone(), follower });
 
         let server = Server { session: &session, metrics, replies: &replies, flood: &flood };
@@ -103,7 +98,7 @@ impl Wire {
             })
             .await
             .map_err(zenoh_error)?;
-        let strays = if direct { Some(server.strays(run).await?) } else { None };
+        let strays = if life.behind_router { None } else { Some(server.strays(run).await?) };
 
         ready()?;
         let token = session.liveliness().declare_token(keys::live_learner(run, life.incarnation)).await;
@@ -116,7 +111,6 @@ impl Wire {
             flood,
             _queryables: queryables,
             _progress: progress,
-            _tokens: tokens,
             _strays: strays,
             _token: token,
         })
@@ -169,7 +163,6 @@ impl Server<'_> {
     async fn strays(&self, run: &Name) -> anyhow::Result<(Subscriber<()>, Subscriber<()>, Queryable<()>)> {
         let served = [keys::weights_at_any_step(run), keys::jobs(run), keys::scores(run), keys::all_progress(run)];
         let served = served.map(KeyExpr::new).into_iter().collect::<Result<Vec<_>, _>>().map_err(zenoh_error)?;
-        let evaluators = KeyExpr::new(keys::all_evaluators(run)).map_err(zenoh_error)?;
         let (guard, counted) = (self.flood.clone(), self.metrics.clone());
         let stray = move |key: &KeyExpr<'_>| {
             let stray = !served.iter().any(|served| served.intersects(key));
@@ -188,10 +181,11 @@ impl Server<'_> {
                 Question::new(query, &replies);
             }
         };
-        // An evaluator has one for each run that it works for. They are held back, but nothing is wrong with them.
+        // An evaluator has one for each run that it works for. They are held back, but nothing is wrong with them. Who leaves has
+        // come before; and all of a connection's leave at its end, not in its task.
         let guard = self.flood.clone();
         let token = move |sample: Sample| {
-            if sample.kind() == SampleKind::Put && !evaluators.intersects(sample.key_expr()) {
+            if sample.kind() == SampleKind::Put {
                 guard.message();
             }
         };

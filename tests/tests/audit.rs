@@ -27,8 +27,7 @@ async fn ask<A: Message>(session: &Session, key: String, question: Vec<u8>) -> A
 #[tokio::test(flavor = "multi_thread")]
 async fn scores_that_were_made_up_are_found_out_by_the_next_evaluator() {
     let scratch = Scratch::new();
-    // The run ends with its last score, and does not wait for audits: some of twenty evaluations come before.
-    let setting = Setting { steps: 400, episodes: 4, ..Setting::default() };
+    let setting = Setting { episodes: 4, ..Setting::default() };
     let endpoint = format!("tcp/127.0.0.1:{}", free_port());
     let session = router(&endpoint).await;
     let mut learner = scratch.learner_with("run", setting, &["--connect", &endpoint, "--audit", "1"]);
@@ -68,5 +67,5 @@ async fn scores_that_were_made_up_are_found_out_by_the_next_evaluator() {
         assert_eq!((line["agree"] == false, line["step"] == job.step), (lied, lied), "{line}");
         assert_ne!(line["evaluators"][0], line["evaluators"][1], "{line}");
     }
-    assert!(lines.len() > 4, "honest scores are checked, too");
+    assert_eq!(lines.len(), 4 * setting.evaluated_steps().len(), "honest scores are checked, too, up to the last");
 }

@@ -7,7 +7,8 @@ use std::process::Command;
 use std::thread::sleep;
 use std::time::{Duration, Instant};
 
-use quad_tests::system::{Learner, Scratch, Setting};
+use quad_tests::router::router;
+use quad_tests::system::{Learner, Scratch, Setting, free_port};
 use quad_tests::{PATIENCE, eventually, http};
 
 const SETTING: Setting = Setting { steps: 4000, eval_interval: 500, episodes: 4, candidates: 2, hidden: 32, seed: 2 };
@@ -78,18 +79,67 @@ fn a_full_disk_delays_scores_and_checkpoints_until_there_is_room() {
 }
 
 #[test]
+fn what_only_scripts_read_is_written_later_if_it_must_be() {
+    let scratch = Scratch::new();
+    // Nothing can be written to a file that is a folder.
+    let obstacle = scratch.path().join("run/endpoints.json.partial");
+    fs::create_dir_all(&obstacle).unwrap();
+    let setting = Setting { steps: 500, eval_interval: 250, ..SETTING };
+    let mut learner = scratch.learner_with("run", setting, &LISTEN);
+    learner.process.wait_for_log("cannot write", PATIENCE);
+    learner.process.wait_for_log("training is done", PATIENCE);
+    fs::remove_dir(&obstacle).unwrap();
+    let _evaluator = scratch.evaluator("one", &learner.endpoint());
+    let status = learner.process.wait(PATIENCE);
+    assert!(status.success(), "the learner ended with {status}");
+    learner.assert_complete(&setting);
+}
+
+/// Makes the disk of a learner that has ended hang at its next snapshot; gives the step of that.
+fn hang(learner: &Learner) -> u64 {
+    let kept = fs::read_dir(learner.run_dir.join("snapshots")).unwrap().count() as u64;
+    let next = (kept + 1) * SETTING.eval_interval;
+    assert!(next < SETTING.steps, "the training was over too soon");
+    // Who opens a pipe to write into it waits until somebody reads from it.
+    assert!(Command::new("mkfifo").arg(pipe(learner, next)).status().unwrap().success());
+    next
+}
+
+fn pipe(learner: &Learner, step: u64) -> PathBuf {
+    learner.snapshot(step).with_extension("safetensors.partial")
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn a_run_that_fails_while_the_disk_hangs_says_why_and_ends() {
+    let (scratch, other) = (Scratch::new(), Scratch::new());
+    let mut learner = scratch.learner_with("run", SETTING, &LISTEN);
+    learner.process.wait_for_log("snapshot handed to evaluation", PATIENCE);
+    learner.process.terminate(PATIENCE);
+    let next = hang(&learner);
+
+    let endpoint = format!("tcp/127.0.0.1:{}", free_port());
+    let _router = router(&endpoint).await;
+    let endless = Setting { steps: 100_000_000, ..SETTING };
+    let first = other.learner_with("run", endless, &["--connect", &endpoint]);
+    first.process.wait_for_log("its metrics at", PATIENCE);
+    let mut learner = scratch.learner_with("run", SETTING, &["--connect", &endpoint, "--checkpoint-seconds", "0"]);
+    learner.process.wait_for_log("there is another learner of run run", PATIENCE);
+    let begin = Instant::now();
+    let status = learner.process.wait(PATIENCE);
+    let took = begin.elapsed();
+    assert!(!learner.snapshot(next).exists(), "the disk did not hang");
+    assert_eq!(status.code(), Some(1), "{}", learner.process.log());
+    assert!((10..25).contains(&took.as_secs()), "it took {took:?} to give the disk up");
+}
+
+#[test]
 fn a_disk_that_hangs_holds_up_neither_training_nor_the_end() {
     let scratch = Scratch::new();
     let mut learner = scratch.learner_with("run", SETTING, &LISTEN);
     learner.process.wait_for_log("snapshot handed to evaluation", PATIENCE);
     learner.process.terminate(PATIENCE);
 
-    // Who opens a pipe to write into it waits until somebody reads from it.
-    let kept = fs::read_dir(learner.run_dir.join("snapshots")).unwrap().count() as u64;
-    let next = (kept + 1) * SETTING.eval_interval;
-    assert!(next < SETTING.steps, "the training was over too soon");
-    let pipe = learner.snapshot(next).with_extension("safetensors.partial");
-    assert!(Command::new("mkfifo").arg(&pipe).status().unwrap().success());
+    let next = hang(&learner);
     // One signal ends it within 10 s, two end it at once.
     for (signals, least, most) in [(1, 5, 10), (2, 0, 4)] {
         let mut learner = scratch.learner_with("run", SETTING, &LISTEN);
@@ -108,7 +158,7 @@ fn a_disk_that_hangs_holds_up_neither_training_nor_the_end() {
         assert_eq!(status.code(), Some(130), "{status}");
     }
 
-    fs::remove_file(&pipe).unwrap();
+    fs::remove_file(pipe(&learner, next)).unwrap();
     let mut learner = scratch.learner_with("run", SETTING, &LISTEN);
     let _evaluator = scratch.evaluator("one", &learner.endpoint());
     let status = learner.process.wait(PATIENCE);

@@ -22,7 +22,7 @@ pub(super) const MOST_EVALUATORS: usize = 1024;
 pub(super) struct Evaluators {
     metrics: EvaluatorMetrics,
     announcer: Announcer,
-    /// Where a router brings them. Who connects to the learner itself is always seen.
+    /// Those that are looked for, as soon as there is a network.
     followed: Option<Followed>,
     present: BTreeSet<Name>,
     last_seen: BTreeMap<Name, Instant>,
@@ -35,7 +35,7 @@ impl Evaluators {
         Self { metrics, announcer, followed: None, present: BTreeSet::new(), last_seen: BTreeMap::new() }
     }
 
-    /// From now on, only those are seen that have asked for work.
+    /// From now on, those are seen that ask for work.
     pub fn follow(&mut self, follower: Sender<Follow>) {
         self.followed = Some(Followed::new(follower));
     }
@@ -50,20 +50,16 @@ impl Evaluators {
         self.followed.as_mut().map_or(Ok(()), |followed| followed.asked(evaluator, now))
     }
 
-    /// One connected.
-    pub fn joined(&mut self, evaluator: Name) -> Result<(), Rejection> {
-        if self.followed.as_ref().is_some_and(|followed| !followed.includes(&evaluator)) {
-            return Ok(()); // told while it was no longer wanted
-        }
-        if self.present.len() >= MOST_EVALUATORS && !self.present.contains(&evaluator) {
-            return Err(Rejection::Crowd);
+    /// One is connected.
+    pub fn joined(&mut self, evaluator: Name, now: Instant) {
+        if !self.followed.as_mut().is_some_and(|followed| followed.joined(&evaluator, now)) {
+            return;
         }
         let is_new = self.present.insert(evaluator.clone());
         self.metrics.present.set(self.present.len() as i64);
         if is_new {
             self.announcer.joined(evaluator);
         }
-        Ok(())
     }
 
     /// Whether one that leaves was connected.
@@ -87,16 +83,16 @@ impl Evaluators {
             return Err(Rejection::Crowd);
         }
         self.metrics.observe(&progress);
+        if let Some(followed) = &mut self.followed {
+            followed.heard(&progress.evaluator, now);
+        }
         self.last_seen.insert(progress.evaluator, now);
         Ok(())
     }
 
-    /// Forgets those that are long gone, and tells of many that came or went.
-    pub fn tick(&mut self, now: Instant) {
+    /// Forgets those that are long gone, and tells of many that came or went. Gives those that must have left.
+    pub fn tick(&mut self, now: Instant) -> Vec<Name> {
         self.announcer.tick(now);
-        if let Some(followed) = &mut self.followed {
-            followed.tick(now, &self.present);
-        }
         let (present, metrics) = (&self.present, &self.metrics);
         self.last_seen.retain(|evaluator, seen| {
             let keep = present.contains(evaluator) || now.duration_since(*seen) < FORGET_AFTER;
@@ -105,5 +101,6 @@ impl Evaluators {
             }
             keep
         });
+        self.followed.as_mut().map(|followed| followed.tick(now)).unwrap_or_default()
     }
 }

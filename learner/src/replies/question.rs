@@ -56,11 +56,15 @@ impl Question {
 
     /// Answers it.
     pub fn answer(self, asker: Asker, answer: Answer) {
-        self.answer_with(asker, move || answer);
+        self.send(asker, move || answer, false);
     }
 
-    /// Answers it with something that takes time to make, like what has to be read from the disk.
-    pub fn answer_with(mut self, asker: Asker, answer: impl FnOnce() -> Answer + Send + 'static) {
+    /// Answers it with something that has to be read from the disk.
+    pub fn answer_from_disk(self, asker: Asker, read: impl FnOnce() -> Answer + Send + 'static) {
+        self.send(asker, read, true);
+    }
+
+    fn send(mut self, asker: Asker, answer: impl FnOnce() -> Answer + Send + 'static, reads: bool) {
         let send = move |query: &Query| {
             let sent = match answer() {
                 Ok((key, bytes)) => query.reply(key, bytes).wait(),
@@ -71,7 +75,7 @@ impl Question {
             }
         };
         if let Some(query) = mem::take(&mut self.query) {
-            self.replies.put(Task::answer(asker, query, Box::new(send)));
+            self.replies.put(Task::answer(asker, query, Box::new(send), reads));
         }
     }
 }

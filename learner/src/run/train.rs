@@ -68,8 +68,11 @@ pub fn train(args: &TrainArgs) -> anyhow::Result<()> {
     // Zenoh and the training thread have threads of their own; this runtime serves the metrics and the main loop.
     let mut runtime = tokio::runtime::Builder::new_multi_thread();
     let runtime = runtime.worker_threads(2).on_thread_start(stay_in_background).enable_all().build()?;
-    let (run_dir, ending) = runtime.block_on(conduct(args, endpoints, &path, begun, name, &config, transitions))?;
-    conclude(&run_dir, &config, ending)
+    let conducted = runtime.block_on(conduct(args, endpoints, &path, begun, name, &config, transitions));
+    let concluded = conducted.and_then(|(run_dir, ending)| conclude(&run_dir, &config, ending));
+    // Without waiting for a thread that waits for a broken disk.
+    runtime.shutdown_background();
+    concluded
 }
 
 fn record_hint(experiment: &Experiment) -> String {

@@ -6,7 +6,7 @@ use serde::{Deserialize, Serialize};
 use crate::scoreboard::Audited;
 
 /// Where a learner can be reached: `endpoints.json`.
-#[derive(Debug, Serialize)]
+#[derive(Clone, Debug, Serialize)]
 pub struct RunEndpoints {
     /// Zenoh endpoints that an evaluator can connect to.
     pub zenoh: Vec<String>,
@@ -60,7 +60,7 @@ impl ScoreLine {
 }
 
 /// A line of `audits.jsonl`: an episode that two evaluators of the same precision have scored.
-#[derive(Clone, Debug, PartialEq, Serialize)]
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct AuditLine {
     /// Gradient step of the snapshot.
     pub step: u64,

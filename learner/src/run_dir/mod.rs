@@ -22,6 +22,7 @@ use std::fs;
 use std::io;
 use std::path::{Path, PathBuf};
 
+use serde::de::DeserializeOwned;
 use serde::{Deserialize, Serialize};
 
 use crate::config::RunConfig;
@@ -220,7 +221,16 @@ impl RunDir {
 
     /// The lines of `scores.jsonl`; none if nothing was scored yet. A last line that is not complete yet is left out.
     pub fn read_scores(&self) -> Result<Vec<ScoreLine>, RunDirError> {
-        let path = self.path.join("scores.jsonl");
+        self.read_lines("scores.jsonl")
+    }
+
+    /// The lines of `audits.jsonl`, likewise.
+    pub fn read_audits(&self) -> Result<Vec<AuditLine>, RunDirError> {
+        self.read_lines("audits.jsonl")
+    }
+
+    fn read_lines<T: DeserializeOwned>(&self, name: &str) -> Result<Vec<T>, RunDirError> {
+        let path = self.path.join(name);
         let text = match fs::read_to_string(&path) {
             Err(error) if error.kind() == io::ErrorKind::NotFound => return Ok(Vec::new()),
             other => other.map_err(io_error("read", &path))?,

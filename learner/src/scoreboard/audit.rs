@@ -5,6 +5,8 @@ use std::collections::{BTreeMap, BTreeSet};
 
 use quad_protocol::{EpisodeScore, Hash, Name, ScoreReport};
 
+use crate::resume::Unchecked;
+
 /// The episodes that are to be scored again.
 #[derive(Debug)]
 pub(super) struct Audits {
@@ -49,10 +51,23 @@ impl Audits {
 
     /// Takes in scores that are new; the seed and the step decide which of them are scored again.
     pub fn add(&mut self, report: &ScoreReport, new: &[EpisodeScore]) {
-        for first in new.iter().filter(|score| is_chosen(self.share, report.step, score.seed)) {
+        for score in new {
             let (evaluator, precision) = (report.evaluator.clone(), report.precision.clone());
-            self.waiting.insert((report.step, first.seed), Waiting { first: *first, evaluator, precision, job: None });
+            self.add_one(report.step, Unchecked { score: *score, evaluator, precision });
         }
+    }
+
+    /// The same for one that may be of an earlier life.
+    pub fn add_one(&mut self, step: u64, Unchecked { score: first, evaluator, precision }: Unchecked) {
+        if is_chosen(self.share, step, first.seed) {
+            self.waiting.insert((step, first.seed), Waiting { first, evaluator, precision, job: None });
+        }
+    }
+
+    /// How many wait for somebody who can do them, and how many are being done.
+    pub fn count(&self) -> [usize; 2] {
+        let open = self.waiting.values().filter(|waiting| waiting.job.is_some()).count();
+        [self.waiting.len() - open, open]
     }
 
     /// Hands out episodes of one step that `evaluator` can check; nothing if there are none.

@@ -2,11 +2,16 @@
 
 use std::collections::{BTreeSet, HashMap};
 use std::mem;
+use std::time::{Duration, Instant};
 
 use quad_protocol::{EpisodeScore, Hash};
 
 /// An episode whose evaluator was lost so often is not handed out any more: it may be what they are lost of.
 const MOST_ATTEMPTS: u32 = 20;
+/// Lost more often than this, an episode rests before it goes to somebody who has scored nothing yet. Else one machine that
+/// fails again and again, under a new name each time, would soon have taken all attempts.
+const ATTEMPTS_AT_ONCE: u32 = 3;
+const LONGEST_REST: Duration = Duration::from_secs(60);
 
 #[derive(Debug)]
 pub(super) struct Evaluation {
@@ -26,6 +31,17 @@ struct Episode {
     state: EpisodeState,
     /// How often an evaluator that had it was lost.
     lost: u32,
+    /// Until then, it rests.
+    rests_until: Option<Instant>,
+}
+
+impl Episode {
+    fn is_lost(&mut self, now: Instant) {
+        self.lost += 1;
+        let doublings = self.lost.saturating_sub(ATTEMPTS_AT_ONCE).min(16);
+        let rest = (doublings > 0).then(|| Duration::from_secs(1 << doublings).min(LONGEST_REST));
+        self.rests_until = rest.map(|rest| now + rest);
+    }
 }
 
 #[derive(Clone, Copy, Debug)]
@@ -44,7 +60,8 @@ impl Evaluation {
     pub fn new(weights: Hash, seeds: &[u64], scores: &[EpisodeScore]) -> Self {
         let episode = |&seed| {
             let score = scores.iter().find(|score| score.seed == seed);
-            Episode { seed, state: score.map_or(EpisodeState::Waiting, |score| EpisodeState::Scored(*score)), lost: 0 }
+            let state = score.map_or(EpisodeState::Waiting, |score| EpisodeState::Scored(*score));
+            Episode { seed, state, lost: 0, rests_until: None }
         };
         let episodes: Vec<Episode> = seeds.iter().map(episode).collect();
         let places = seeds.iter().enumerate().map(|(place, &seed)| (seed, place)).collect();
@@ -84,26 +101,33 @@ impl Evaluation {
     }
 
     /// Hands out some of the episodes that wait; none if there are none. A `few` at most, if an evaluator was lost with the
-    /// first of them: should it be what it was lost of, the fewer suffer.
-    pub fn hand_out(&mut self, job: u64, [few, most]: [usize; 2]) -> Vec<u64> {
-        let lost = self.waiting.first().is_some_and(|&place| self.episodes[place].lost > 0);
-        let places: Vec<usize> = self.waiting.iter().copied().take(if lost { few } else { most }).collect();
+    /// first of them: should it be what it was lost of, the fewer suffer. To somebody who has scored nothing yet, a
+    /// `newcomer` at this time, those that rest are not handed out.
+    pub fn hand_out(&mut self, job: u64, [few, most]: [usize; 2], newcomer: Option<Instant>) -> Vec<u64> {
+        let rests = |place: &usize| {
+            newcomer.is_some_and(|now| self.episodes[*place].rests_until.is_some_and(|rested| now < rested))
+        };
+        let mut ready = self.waiting.iter().copied().filter(|place| !rests(place)).peekable();
+        let lost = ready.peek().is_some_and(|&place| self.episodes[place].lost > 0);
+        let places: Vec<usize> = ready.take(if lost { few } else { most }).collect();
         for &place in &places {
             self.change(place, EpisodeState::HandedOut { job });
         }
         places.into_iter().map(|place| self.episodes[place].seed).collect()
     }
 
-    /// Takes those of a job's episodes back that have no score yet, from an evaluator that was `lost` with them or not. Gives
-    /// the seeds of those that were lost too often.
-    pub fn take_back(&mut self, job: u64, seeds: &[u64], lost: bool) -> Vec<u64> {
+    /// Takes those of a job's episodes back that have no score yet, from an evaluator that was `lost` with them at some time,
+    /// or was not. Gives the seeds of those that were lost too often.
+    pub fn take_back(&mut self, job: u64, seeds: &[u64], lost: Option<Instant>) -> Vec<u64> {
         let mut given_up = Vec::new();
         for &seed in seeds {
             let Some(&place) = self.places.get(&seed) else { continue };
-            let Episode { state, lost: times, .. } = &mut self.episodes[place];
-            if matches!(state, EpisodeState::HandedOut { job: of } if *of == job) {
-                *times += u32::from(lost);
-                let hopeless = *times >= MOST_ATTEMPTS;
+            let episode = &mut self.episodes[place];
+            if matches!(episode.state, EpisodeState::HandedOut { job: of } if of == job) {
+                if let Some(now) = lost {
+                    episode.is_lost(now);
+                }
+                let hopeless = episode.lost >= MOST_ATTEMPTS;
                 given_up.extend(hopeless.then_some(seed));
                 self.change(place, if hopeless { EpisodeState::GivenUp } else { EpisodeState::Waiting });
             }

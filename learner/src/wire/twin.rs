@@ -64,7 +64,7 @@ pub(super) async fn watch(session: &Session, life: &Life, hub: &Inbox<hub::Event
         let found = keys::incarnation_of(token.key_expr().as_str());
         let earlier = found.filter(|other| there && *other < mine.incarnation);
         if let Some(other) = earlier {
-            inbox.offer_change(hub::Event::Twin(hinted(is_there(&mine, other), HINT))).ok();
+            inbox.offer_change(hub::Event::Failed(hinted(is_there(&mine, other), HINT))).ok();
         }
     };
     let tokens = session.liveliness().declare_subscriber(keys::all_lives(&life.run)).history(true).callback(callback);

@@ -117,7 +117,7 @@ impl Bench {
         let endpoint = format!("tcp/127.0.0.1:{port}");
         let session =
             open_session(&Endpoints { listen: vec![endpoint.clone()], ..Endpoints::default() }).await.unwrap();
-        let life = Life { run: run.clone(), incarnation: INCARNATION };
+        let life = Life { run: run.clone(), incarnation: INCARNATION, behind_router: false };
         let wire = Wire::declare(session, life, &hub, &publisher, &metrics, || Ok(())).await.unwrap();
         Self { run, run_dir, endpoint, metrics, notices, publisher, hub, disk, _wire: wire, _folder: folder }
     }

@@ -16,9 +16,9 @@ async fn jobs_of_evaluators_that_die_or_fall_silent_go_to_others() {
 
     let mortal = bench.client().await;
     let _token = mortal.liveliness().declare_token(keys::live_evaluator(&bench.run, &name("mortal"))).await.unwrap();
+    let lost = claim_eventually(&mortal, &bench.run, "mortal").await;
     bench.until(|notice| matches!(notice, Notice::EvaluatorJoined(who) if *who == name("mortal"))).await;
     assert_eq!(bench.metrics.evaluators.present.get(), 1);
-    let lost = claim_eventually(&mortal, &bench.run, "mortal").await;
     mortal.close().await.unwrap();
     let left = bench.until(|notice| matches!(notice, Notice::EvaluatorLeft(..))).await;
     assert!(matches!(left, Notice::EvaluatorLeft(_, 1)), "{left:?}");

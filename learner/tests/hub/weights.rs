@@ -2,9 +2,10 @@
 
 use std::time::{Duration, Instant};
 
-use quad_protocol::{Hash, Snapshot, decode, keys};
+use quad_protocol::{Hash, Snapshot, WeightsRequest, decode, encode, keys};
 
-use crate::bench::{Bench, PATIENCE, ask, file};
+use crate::bench::{Bench, PATIENCE, ask, claim, file};
+use crate::common::name;
 
 #[tokio::test(flavor = "multi_thread")]
 async fn weights_are_published_and_older_ones_are_answered_from_the_disk() {
@@ -35,4 +36,29 @@ async fn weights_are_published_and_older_ones_are_answered_from_the_disk() {
     std::fs::write(path, "something else").unwrap();
     let changed = ask::<Snapshot>(&client, keys::weights_at(&bench.run, step), None).await.unwrap();
     assert!(changed.unwrap_err().contains("was changed"));
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn while_the_disk_hangs_that_is_read_from_claims_and_new_weights_are_answered() {
+    let mut bench = Bench::start().await;
+    let client = bench.client().await;
+    for step in [10, 20] {
+        bench.snapshot(step).await;
+    }
+    // Who opens a pipe to read from it waits until somebody writes into it.
+    let path = bench.run_dir.path().join("snapshots/step_000000010.safetensors");
+    std::fs::remove_file(&path).unwrap();
+    assert!(std::process::Command::new("mkfifo").arg(&path).status().unwrap().success());
+    for number in 0..20 {
+        let request = encode(&WeightsRequest { evaluator: name(&format!("e-{number}")) }).unwrap();
+        let get = client.get(keys::weights_at(&bench.run, 10)).payload(request).timeout(PATIENCE);
+        get.callback(drop).await.unwrap();
+    }
+    tokio::time::sleep(Duration::from_millis(200)).await;
+    let start = Instant::now();
+    claim(&client, &bench.run, "a").await.expect("there is work");
+    let request = encode(&WeightsRequest { evaluator: name("a") }).unwrap();
+    let newest: Snapshot = ask(&client, keys::weights_at(&bench.run, 20), Some(request)).await.unwrap().unwrap();
+    assert_eq!(newest.step, 20);
+    assert!(start.elapsed() < Duration::from_secs(5), "{:?}", start.elapsed());
 }

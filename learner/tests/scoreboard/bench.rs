@@ -2,7 +2,7 @@
 
 use std::time::{Duration, Instant};
 
-use quad_learner::scoreboard::{Claim, Recorded, Refusal, Rules, Scoreboard, Screened};
+use quad_learner::scoreboard::{Claim, Lost, Recorded, Refusal, Rules, Scoreboard, Screened};
 use quad_protocol::{Hash, Job, JobReply, Progress, ScoreReport};
 
 use crate::common::name;
@@ -74,6 +74,11 @@ impl Bench {
     pub fn progress(&mut self, progress: &Progress, seconds: u64) -> Result<(), Refusal> {
         let now = self.at(seconds);
         self.board.progress(progress, now)
+    }
+
+    pub fn gone(&mut self, evaluator: &str, seconds: u64) -> Lost {
+        let now = self.at(seconds);
+        self.board.evaluator_gone(&name(evaluator), now)
     }
 
     pub fn expire(&mut self, seconds: u64) -> usize {

@@ -96,7 +96,7 @@ fn the_more_episodes_wait_the_more_are_in_a_job() {
     // An evaluator that is lost may have been lost of one of them.
     bench.present = 1;
     assert_eq!(bench.job("a", 0).seeds.len(), 20);
-    bench.board.evaluator_gone(&name("a"));
+    bench.gone("a", 0);
     assert_eq!(["b", "c", "d", "e", "f"].map(|evaluator| bench.job(evaluator, 0).seeds.len()), [5, 5, 5, 5, 20]);
 }
 
@@ -104,8 +104,8 @@ fn the_more_episodes_wait_the_more_are_in_a_job() {
 fn an_evaluator_that_goes_loses_its_job_and_nobody_elses() {
     let mut bench = Bench::new();
     let (first, other) = (bench.job("a", 0), bench.job("b", 0));
-    assert_eq!(bench.board.evaluator_gone(&name("a")), Lost { jobs: 1, given_up: vec![] });
-    assert_eq!(bench.board.evaluator_gone(&name("a")), Lost::default());
+    assert_eq!(bench.gone("a", 0), Lost { jobs: 1, given_up: vec![] });
+    assert_eq!(bench.gone("a", 0), Lost::default());
     assert_eq!(bench.job("c", 0).seeds, first.seeds);
     assert_eq!(bench.deliver(&full_report(&other, "b")).unwrap().1.jobs_completed, 1);
 }
@@ -132,8 +132,10 @@ fn episodes_that_take_every_evaluator_with_them_are_given_up() {
     }
     let mut given_up = Vec::new();
     for attempt in 1..=20 {
-        assert_eq!((bench.job("a", 0).seeds, given_up.len()), (Vec::from_iter(1..=5), 0), "attempt {attempt}");
-        given_up = bench.board.evaluator_gone(&name("a")).given_up;
+        // As late as it takes, for somebody who has scored nothing.
+        let later = 60 * attempt;
+        assert_eq!((bench.job("a", later).seeds, given_up.len()), (Vec::from_iter(1..=5), 0), "attempt {attempt}");
+        given_up = bench.gone("a", later).given_up;
     }
     let expected = Vec::from_iter((1..=5).map(|seed| (1000, seed)));
     assert_eq!((&given_up, &bench.board.missing()), (&expected, &expected));
@@ -143,6 +145,34 @@ fn episodes_that_take_every_evaluator_with_them_are_given_up() {
     let late = report(&next, "b", vec![score(1, 0.0)]);
     assert_eq!(bench.deliver(&late).unwrap().0.new.len(), 1, "but is glad of them");
     assert_eq!(bench.board.missing(), expected[1..]);
+}
+
+#[test]
+fn an_evaluator_that_fails_again_and_again_takes_no_episode_from_those_that_work() {
+    let mut bench = Bench::new();
+    // Under another name each time, it asks as soon as it is there again.
+    let (mut failed, mut seconds) = (0, 0);
+    while bench.board.missing().is_empty() {
+        seconds += 1;
+        if let JobReply::Job(_) = bench.claim(&format!("crash-{seconds}"), 1, seconds) {
+            bench.gone(&format!("crash-{seconds}"), seconds);
+            failed += 1;
+        }
+    }
+    assert!((600..1200).contains(&seconds), "given up after {seconds} s and {failed} failures");
+
+    let mut bench = Bench::new();
+    let job = bench.job("works", 0);
+    bench.deliver(&full_report(&job, "works")).unwrap();
+    for seconds in 1..=30 {
+        if let JobReply::Job(_) = bench.claim("crashes", seconds, seconds) {
+            bench.gone("crashes", seconds);
+        }
+    }
+    assert!(matches!(bench.claim("crashes", 31, 31), JobReply::Wait { .. }), "all of them rest");
+    assert_eq!(bench.job("works", 31).seeds, [6, 7], "but not for who has shown that it works");
+    bench.gone("works", 31);
+    assert!(matches!(bench.claim("works", 32, 31), JobReply::Wait { .. }), "until it is lost itself");
 }
 
 #[test]
@@ -157,8 +187,9 @@ fn an_evaluation_asked_for_twice_is_one() {
 #[test]
 fn scores_of_an_earlier_life_count_and_other_weights_are_found_out() {
     let mut bench = Bench::new();
-    let earlier = Earlier { weights: hash(3000).to_string(), episodes: vec![score(22, 400.0)] };
-    let whole = Earlier { weights: hash(4000).to_string(), episodes: vec![score(32, 1.0), score(31, 2.0)] };
+    let earlier = Earlier { weights: hash(3000).to_string(), episodes: vec![score(22, 400.0)], unchecked: vec![] };
+    let episodes = vec![score(32, 1.0), score(31, 2.0)];
+    let whole = Earlier { weights: hash(4000).to_string(), episodes, unchecked: vec![] };
     bench.board.remember([(3000, earlier), (4000, whole)].into());
     let pending = bench.board.pending();
     assert_eq!(bench.board.add_evaluation(3000, hash(3000), &[21, 22, 23]), Ok(None));
