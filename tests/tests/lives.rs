@@ -15,12 +15,15 @@ use zenoh::bytes::ZBytes;
 use zenoh::query::Query;
 use zenoh::{Session, Wait};
 
-/// What an evaluator has sent.
+/// What an evaluator has sent, and what becomes of it.
 #[derive(Default)]
 struct Heard {
     attempts: Vec<u64>,
     progress: Vec<Progress>,
     reports: Vec<ScoreReport>,
+    /// Whether lives acknowledge reports, and how many they have.
+    acknowledges: bool,
+    acknowledged: usize,
 }
 
 /// The weights of a real learner.
@@ -47,14 +50,8 @@ fn reply<M: quad_protocol::Message>(query: &Query, message: &M) {
     query.reply(query.key_expr().clone(), encode(message).unwrap()).wait().unwrap();
 }
 
-/// A life that hands out one job, after it has ignored the first claim, and acknowledges reports if it is asked to.
-async fn life(
-    session: &Session,
-    tensors: &[u8],
-    incarnation: u64,
-    acknowledges: bool,
-    heard: &Arc<Mutex<Heard>>,
-) -> impl Sized + use<> {
+/// A life that hands out one job, after it has ignored the first claim.
+async fn life(session: &Session, tensors: &[u8], incarnation: u64, heard: &Arc<Mutex<Heard>>) -> impl Sized + use<> {
     let run = Name::new("run").unwrap();
     let weights = snapshot(tensors, incarnation);
     let job = Job {
@@ -85,10 +82,12 @@ async fn life(
     let scores = session.declare_queryable(keys::scores(&run)).callback(move |query| {
         let report: ScoreReport = message(query.payload());
         let new = report.episodes.len() as u32;
-        heard_scores.lock().unwrap().reports.push(report);
+        let mut heard = heard_scores.lock().unwrap();
+        heard.reports.push(report);
         // What a life says that nobody follows does not count, though it comes first.
         reply(&query, &ScoreReply::Refused { incarnation: 99, reason: "not mine".to_owned() });
-        if acknowledges {
+        if heard.acknowledges {
+            heard.acknowledged += 1;
             reply(&query, &ScoreReply::Recorded { incarnation, new, duplicates: 0 });
         }
     });
@@ -113,7 +112,7 @@ async fn scores_measured_for_one_life_are_delivered_to_the_next() {
     let endpoint = format!("tcp/127.0.0.1:{}", free_port());
     let session = router(&endpoint).await;
     let heard = Arc::new(Mutex::new(Heard::default()));
-    let first = life(&session, &tensors, 5, false, &heard).await;
+    let first = life(&session, &tensors, 5, &heard).await;
     let evaluator = scratch.evaluator("patient", &endpoint);
     eventually("scores are delivered, and not acknowledged", PATIENCE, || {
         (!heard.lock().unwrap().reports.is_empty()).then_some(())
@@ -133,7 +132,8 @@ async fn scores_measured_for_one_life_are_delivered_to_the_next() {
 
     drop(first);
     let count = heard.lock().unwrap().reports.len();
-    let _second = life(&session, &tensors, 6, true, &heard).await;
+    heard.lock().unwrap().acknowledges = true;
+    let _second = life(&session, &tensors, 6, &heard).await;
     eventually("the next life has the scores", PATIENCE, || (jobs("scored") == 1.0).then_some(()));
     let heard = heard.lock().unwrap();
     assert!(heard.reports.len() > count);
@@ -142,4 +142,22 @@ async fn scores_measured_for_one_life_are_delivered_to_the_next() {
     assert_eq!(report.episodes.iter().map(|episode| episode.seed).collect::<Vec<_>>(), [1, 2, 3]);
     let attempts = &heard.attempts;
     assert!(attempts[2..].iter().all(|attempt| *attempt != attempts[0]), "another claim has another number");
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn an_evaluator_that_leaves_delivers_what_was_not_acknowledged() {
+    let scratch = Scratch::new();
+    let tensors = tensors(&scratch);
+    let endpoint = format!("tcp/127.0.0.1:{}", free_port());
+    let session = router(&endpoint).await;
+    let heard = Arc::new(Mutex::new(Heard::default()));
+    let _life = life(&session, &tensors, 5, &heard).await;
+    let mut evaluator = scratch.evaluator("leaving", &endpoint);
+    // By then it tries again every four or five seconds.
+    eventually("scores are delivered again and again", PATIENCE, || {
+        (heard.lock().unwrap().reports.len() >= 5).then_some(())
+    });
+    heard.lock().unwrap().acknowledges = true;
+    evaluator.process.terminate(PATIENCE);
+    assert_eq!(heard.lock().unwrap().acknowledged, 1);
 }

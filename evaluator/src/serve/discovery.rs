@@ -4,7 +4,7 @@ use std::collections::{BTreeMap, BTreeSet};
 use std::convert::Infallible;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering::Relaxed};
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
 use anyhow::Context;
 use quad_protocol::{Name, keys};
@@ -19,8 +19,10 @@ use zenoh::sample::{Sample, SampleKind};
 use crate::metrics::Metrics;
 
 /// Most runs that are served at a time, and most learners of one run that are told apart: for floods of made-up ones.
-const MOST_RUNS: usize = 64;
+const MOST_RUNS: usize = 256;
 const MOST_LIVES: usize = 8;
+/// Where there is no room, a run that has come to nothing for this long gives its place to another one.
+const CHANCE: Duration = Duration::from_secs(30);
 /// A run that there was no room for is looked for again after this long.
 const LOOK_AGAIN: Duration = Duration::from_secs(10);
 /// The label of a key that names no learner.
@@ -39,6 +41,10 @@ pub struct Found {
     /// The incarnations that announce themselves, at least one: a learner that was cut off or killed may still seem to be
     /// there when the next one starts.
     pub lives: BTreeSet<u64>,
+    /// Since when it is served.
+    pub since: Instant,
+    /// Whether its learner has ever accepted scores.
+    pub proven: Arc<AtomicBool>,
 }
 
 /// The runs that are there.
@@ -137,7 +143,9 @@ impl Watch {
         let (kind, key) = (token.kind(), token.key_expr().as_str());
         let mut problem = None;
         self.found.send_if_modified(|runs| {
-            let followed = follow(runs, self.index, &self.session, kind, key);
+            let followed = follow(runs, (self.index, &self.session), kind, key, Instant::now());
+            // Whoever has given its place to another one is looked for as well.
+            self.no_room.fetch_or(runs.len() >= MOST_RUNS, Relaxed);
             followed.unwrap_or_else(|label| {
                 problem = Some(label);
                 false
@@ -153,16 +161,34 @@ impl Watch {
     }
 }
 
+/// Makes room for another run, if one has come to nothing for long.
+fn make_room(runs: &mut Runs, now: Instant) -> bool {
+    let idle = runs.iter().filter(|(_, run)| !run.proven.load(Relaxed) && now - run.since >= CHANCE);
+    let Some(place) = idle.min_by_key(|(_, run)| run.since).map(|(place, _)| place.clone()) else { return false };
+    debug!(run = %place.1, "gives its place to another run");
+    runs.remove(&place);
+    true
+}
+
 /// Takes in a token; says whether the runs have changed, or why it is not taken in.
-fn follow(runs: &mut Runs, index: usize, session: &Session, kind: SampleKind, key: &str) -> Result<bool, &'static str> {
+fn follow(
+    runs: &mut Runs,
+    (index, session): (usize, &Session),
+    kind: SampleKind,
+    key: &str,
+    now: Instant,
+) -> Result<bool, &'static str> {
     let (run, incarnation) = keys::run_of(key).zip(keys::incarnation_of(key)).ok_or(INVALID)?;
     let place = (index, run.clone());
-    let count = runs.len();
+    let new = kind == SampleKind::Put && !runs.contains_key(&place);
+    if new && runs.len() >= MOST_RUNS && !make_room(runs, now) {
+        return Err("too_many_runs");
+    }
     match (kind, runs.get_mut(&place)) {
-        (SampleKind::Put, None) if count >= MOST_RUNS => Err("too_many_runs"),
         (SampleKind::Put, None) => {
             info!(%run, incarnation, "found a run");
-            runs.insert(place, Found { session: session.clone(), lives: BTreeSet::from([incarnation]) });
+            let (session, lives) = (session.clone(), BTreeSet::from([incarnation]));
+            runs.insert(place, Found { session, lives, since: now, proven: Arc::default() });
             Ok(true)
         }
         (SampleKind::Put, Some(found)) if found.lives.contains(&incarnation) => Ok(false),
@@ -189,8 +215,10 @@ mod tests {
         let endpoints = Endpoints { listen: vec!["tcp/127.0.0.1:0".to_owned()], ..Endpoints::default() };
         let session = open_session(&endpoints).await.unwrap();
         let mut runs = Runs::new();
+        let start = Instant::now();
         let mut tell = |kind, run: usize, life: usize| {
-            let result = follow(&mut runs, 0, &session, kind, &format!("quad/run-{run}/live/learner/{life}"));
+            let key = format!("quad/run-{run}/live/learner/{life}");
+            let result = follow(&mut runs, (0, &session), kind, &key, start);
             (result, runs.len())
         };
         for run in 0..MOST_RUNS {
@@ -207,5 +235,16 @@ mod tests {
         }
         assert_eq!(tell(SampleKind::Delete, MOST_RUNS, 1), (Ok(false), MOST_RUNS - 1));
         assert_eq!(tell(SampleKind::Put, MOST_RUNS, 1), (Ok(true), MOST_RUNS), "there is room again");
+
+        // Later, whoever has come to nothing gives way, and nobody else.
+        runs.values().skip(3).for_each(|run| run.proven.store(true, Relaxed));
+        let kept = Vec::from_iter(runs.keys().skip(3).cloned());
+        let mut tell = |run: usize, seconds| {
+            let (key, now) = (format!("quad/late-{run}/live/learner/1"), start + Duration::from_secs(seconds));
+            follow(&mut runs, (0, &session), SampleKind::Put, &key, now)
+        };
+        assert_eq!(tell(0, CHANCE.as_secs() - 1), Err("too_many_runs"));
+        assert_eq!([1, 2, 3, 4].map(|run| tell(run, CHANCE.as_secs()).is_ok()), [true, true, true, false]);
+        assert!(kept.iter().all(|place| runs.contains_key(place)));
     }
 }

@@ -38,6 +38,7 @@ use quad_service::{
     Certificates, CertificatesError, Endpoints, Health, Hint, Role, SessionError, default_endpoint, parse_endpoint,
 };
 use rand::Rng;
+use tokio::task::JoinSet;
 use tracing::{info, warn};
 
 use crate::metrics::Metrics;
@@ -82,7 +83,7 @@ pub struct ServeArgs {
 /// Where a learner of this machine listens by default.
 pub(crate) const DEFAULT_PORT: u16 = 7447;
 /// When it is told to stop, it hands its job back within this time.
-const HAND_BACK: Duration = Duration::from_secs(1);
+const HAND_BACK: Duration = Duration::from_secs(2);
 /// Then the process waits this long for its threads and for the session to close.
 const LEAVE: Duration = Duration::from_secs(1);
 
@@ -137,10 +138,9 @@ async fn serve_until_stopped(args: ServeArgs) -> anyhow::Result<()> {
         error = &mut work => Err(error),
     };
     // While the worker still is there, and with it what announces this evaluator: without, the job would count as lost.
-    let job = held.lock().unwrap_or_else(PoisonError::into_inner).take();
-    if let Some(job) = job {
-        job.send(HAND_BACK).await;
-    }
+    let jobs = std::mem::take(&mut *held.lock().unwrap_or_else(PoisonError::into_inner));
+    let ends = JoinSet::from_iter(jobs.into_values().map(|job| job.send(HAND_BACK)));
+    ends.join_all().await;
     let (episodes, steps) = (metrics.episodes.get(), metrics.environment_steps.get());
     info!(episodes, steps, "leaving");
     result

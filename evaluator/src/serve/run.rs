@@ -1,6 +1,7 @@
 //! Everything that is exchanged with the learner of one run: jobs, snapshots, progress, scores.
 
 use std::collections::BTreeSet;
+use std::sync::atomic::{AtomicBool, Ordering::Relaxed};
 use std::sync::{Arc, Mutex, PoisonError};
 use std::time::{Duration, Instant};
 
@@ -54,6 +55,8 @@ pub struct RunClient {
     told: Mutex<Option<Instant>>,
     /// Scores that the learner has not acknowledged. While there are some, nothing new is asked for.
     undelivered: Option<ScoreReport>,
+    /// Set when its learner has accepted scores.
+    proven: Arc<AtomicBool>,
     /// Its claim to this evaluator's time.
     pub standing: Standing,
     /// What was last complained about, so that it is not said again and again.
@@ -92,6 +95,7 @@ impl RunClient {
             attempt: None,
             told: Mutex::default(),
             undelivered: None,
+            proven: found.proven.clone(),
             standing: Standing::new(Instant::now()),
             complaint: String::new(),
             _token: token,
@@ -264,6 +268,7 @@ impl RunClient {
         self.undelivered = None;
         self.complaint.clear();
         self.standing.delivered(accepted);
+        self.proven.fetch_or(accepted, Relaxed);
         Ok(())
     }
 

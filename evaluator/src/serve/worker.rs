@@ -29,10 +29,10 @@ const KEEP_SCORES: Duration = Duration::from_secs(600);
 /// Memory for the snapshots that were published, of all runs together, bytes; the largest that there may be fits.
 const SNAPSHOTS: usize = 256 << 20;
 /// How long it may take to hand back a job that could not be done; other runs wait meanwhile.
-const HAND_BACK: Duration = Duration::from_secs(1);
+const HAND_BACK: Duration = Duration::from_secs(2);
 
-/// The job that is being done, for whoever has to hand it back when the worker is to end.
-pub type Held = Arc<Mutex<Option<HandBack>>>;
+/// The jobs that are being done, or whose scores were not acknowledged, for whoever has to end them when the worker is to end.
+pub type Held = Arc<Mutex<BTreeMap<RunKey, HandBack>>>;
 
 /// Serves every run that is found, one job at a time.
 pub struct Worker {
@@ -82,7 +82,7 @@ impl Worker {
         })
     }
 
-    /// Where the job is that it does.
+    /// Where the jobs are that it has not ended.
     pub fn held(&self) -> Held {
         self.held.clone()
     }
@@ -138,6 +138,7 @@ impl Worker {
             let kept = self.runs.get(&key).is_some_and(RunClient::has_undelivered) && now - since < KEEP_SCORES;
             if !kept {
                 self.gone.remove(&key);
+                self.hold(&key, None);
                 if let Some(run) = self.runs.remove(&key) {
                     run.give_up();
                 }
@@ -170,7 +171,7 @@ impl Worker {
     async fn turn(&mut self, key: RunKey) {
         let Some(mut run) = self.runs.remove(&key) else { return };
         let started = Instant::now();
-        if let Err(error) = self.serve(&key.1, &mut run).await {
+        if let Err(error) = self.serve(&key, &mut run).await {
             run.back_off(&error);
             if let Some(learner) = self.found.borrow().get(&key) {
                 run.follow_next(&learner.lives);
@@ -180,15 +181,15 @@ impl Worker {
         self.runs.insert(key, run);
     }
 
-    async fn serve(&mut self, name: &Name, run: &mut RunClient) -> anyhow::Result<()> {
+    async fn serve(&mut self, key: &RunKey, run: &mut RunClient) -> anyhow::Result<()> {
         if run.has_undelivered() {
-            return run.deliver().await;
+            return self.deliver(key, run).await;
         }
+        let name = &key.1;
         let environments = environment::simulated().map(|spec| spec.name.clone()).collect();
         let Some(job) = run.claim(environments).await? else { return Ok(()) };
-        self.hold(Some(run.hand_back(&job)));
+        self.hold(key, Some(run.hand_back(&job)));
         let measured = self.measure(name, &job, run).await;
-        self.hold(None);
         let (episodes, cannot_act) = match measured {
             Ok(episodes) => (episodes, None),
             Err(error) => {
@@ -196,6 +197,7 @@ impl Worker {
                 let broken = matches!(error.downcast_ref(), Some(PolicyError::NotANumber(_)));
                 let error = error.context(format!("a job of step {} failed", job.step));
                 if !broken {
+                    self.hold(key, None);
                     run.hand_back(&job).send(HAND_BACK).await;
                     return Err(error);
                 }
@@ -206,12 +208,24 @@ impl Worker {
             }
         };
         let Identity { evaluator, precision } = self.identity.clone();
-        run.keep(ScoreReport { cannot_act, ..ScoreReport::of(&job, evaluator, precision, episodes) });
-        run.deliver().await
+        let report = ScoreReport { cannot_act, ..ScoreReport::of(&job, evaluator, precision, episodes) };
+        self.hold(key, Some(run.hand_back(&job).with_scores(report.clone())));
+        run.keep(report);
+        self.deliver(key, run).await
     }
 
-    fn hold(&self, job: Option<HandBack>) {
-        *self.held.lock().unwrap_or_else(PoisonError::into_inner) = job;
+    async fn deliver(&self, key: &RunKey, run: &mut RunClient) -> anyhow::Result<()> {
+        run.deliver().await?;
+        self.hold(key, None);
+        Ok(())
+    }
+
+    fn hold(&self, key: &RunKey, job: Option<HandBack>) {
+        let mut held = self.held.lock().unwrap_or_else(PoisonError::into_inner);
+        match job {
+            Some(job) => drop(held.insert(key.clone(), job)),
+            None => drop(held.remove(key)),
+        }
     }
 
     async fn measure(&mut self, name: &Name, job: &Job, run: &RunClient) -> anyhow::Result<Vec<EpisodeScore>> {

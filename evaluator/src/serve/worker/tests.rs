@@ -82,7 +82,8 @@ async fn a_long_job_is_well_and_a_stuck_one_is_not() {
     for (stuck_at, expected) in [(u32::MAX, false), (3, true)] {
         let (health, (_keep, found)) = (Health::default(), watch::channel(Runs::new()));
         let worker = worker(&health, found);
-        let found = Found { session: session.clone(), lives: [1].into() };
+        let found =
+            Found { session: session.clone(), lives: [1].into(), since: Instant::now(), proven: Arc::default() };
         let (metrics, shared) = (worker.metrics.clone(), (worker.snapshot_arrived.clone(), worker.budget.clone()));
         let client = RunClient::attach(run.clone(), &found, worker.identity.clone(), metrics, shared).await;
         let job = Job {
