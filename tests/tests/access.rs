@@ -196,7 +196,7 @@ async fn each_role_may_do_what_it_is_for_and_nothing_else() {
     evaluator.put("quad/run/progress/e", vec![0; 5000]).await.unwrap();
     evaluator.delete("quad/run/progress/e").await.unwrap();
     // More than 25 a second are not passed on.
-    tokio::time::sleep(Duration::from_millis(100)).await;
+    tokio::time::sleep(LULL).await;
     evaluator.put("quad/run/progress/last", "words").await.unwrap();
     learner.put("quad/run/scores/2", "words").await.unwrap();
     let mut keys = until(&heard, "quad/run/progress/last").await;

@@ -115,6 +115,7 @@ async fn a_flood_ends_at_the_router_and_an_evaluator_of_many_runs_is_none() {
                 stranger.get(key).timeout(Duration::from_secs(1)).callback(drop).await.unwrap();
             }
             stranger.put(&keys[3], "words").await.unwrap();
+            stranger.delete(&keys[3]).await.unwrap();
             tokio::time::sleep(Duration::from_millis(1)).await;
         }
         tokio::time::sleep(Duration::from_millis(200)).await;
