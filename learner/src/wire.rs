@@ -27,6 +27,9 @@ use crate::{hub, publisher};
 
 /// How long the last answers may take, and then the session to close.
 const LAST_ANSWERS: Duration = Duration::from_secs(1);
+/// To send megabytes of weights takes as long as to read so many messages, or longer. So a connection gets ten at once, and in
+/// the long run five a second; an evaluator needs one for each job at most.
+const WEIGHTS: u32 = 40;
 
 /// Which life of which run's learner this is.
 #[derive(Clone, Debug)]
@@ -79,9 +82,9 @@ impl Wire {
 
         let server = Server { session: &session, metrics, replies: &replies, flood: &flood };
         let queryables = [
-            server.serve(keys::weights_at_any_step(run), publisher, publisher::Event::Query).await?,
-            server.serve(keys::jobs(run), hub, hub::Event::Job).await?,
-            server.serve(keys::scores(run), hub, hub::Event::Report).await?,
+            server.serve(keys::weights_at_any_step(run), WEIGHTS, publisher, publisher::Event::Query).await?,
+            server.serve(keys::jobs(run), 1, hub, hub::Event::Job).await?,
+            server.serve(keys::scores(run), 1, hub, hub::Event::Report).await?,
         ];
 
         let (inbox, counted, guard) = (hub.clone(), metrics.clone(), flood.clone());
@@ -134,16 +137,18 @@ struct Server<'a> {
 }
 
 impl Server<'_> {
+    /// Takes in questions, each of which counts as so many messages.
     async fn serve<E: Send + 'static>(
         &self,
         key: String,
+        counts: u32,
         inbox: &Inbox<E>,
         event: fn(Question) -> E,
     ) -> anyhow::Result<Queryable<()>> {
         let (inbox, metrics, replies) = (inbox.clone(), self.metrics.clone(), self.replies.clone());
         let guard = self.flood.clone();
         let callback = move |query: Query| {
-            guard.message();
+            guard.messages(counts);
             let question = Question::new(query, &replies);
             let bytes = question.bytes();
             if bytes > MOST_BYTES {

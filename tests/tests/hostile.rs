@@ -38,7 +38,13 @@ enum Attack {
     Garbage,
     Elsewhere,
     QuestionsElsewhere,
+    /// Under keys that no pattern fits, not even a learner's own for what is none of its business.
+    Unseen,
+    /// Of what evaluators tell.
+    Deletions,
     Subscriptions,
+    /// Of weights, under several names, and he reads them.
+    Downloads,
     /// Of evaluators, of learners, and others.
     Tokens,
     /// Made-up ones, with tokens, that ask for work and leave.
@@ -47,7 +53,7 @@ enum Attack {
     ReadsNothing,
 }
 
-const ATTACKS: [Attack; 12] = [
+const ATTACKS: [Attack; 15] = [
     Attack::Nothing,
     Attack::Progress,
     Attack::Claims,
@@ -55,6 +61,9 @@ const ATTACKS: [Attack; 12] = [
     Attack::Garbage,
     Attack::Elsewhere,
     Attack::QuestionsElsewhere,
+    Attack::Unseen,
+    Attack::Deletions,
+    Attack::Downloads,
     Attack::Subscriptions,
     Attack::Connections,
     Attack::ReadsNothing,
@@ -116,7 +125,7 @@ async fn flood(attack: Attack, endpoint: &str) {
     let mut noise: Vec<u8> = (0..1000u32).map(|i| (i.wrapping_mul(2_654_435_761) >> 24) as u8).collect();
     let mut newer = claim.clone();
     newer[4] ^= 0xff;
-    let (mut tokens, mut subscriptions) = (Vec::new(), Vec::new());
+    let (mut tokens, mut subscriptions, mut number) = (Vec::new(), Vec::new(), 0);
     loop {
         match attack {
             Attack::Progress => session.put(keys::progress(&run, &name("flood")), progress.clone()).await.unwrap(),
@@ -132,6 +141,13 @@ async fn flood(attack: Attack, endpoint: &str) {
             Attack::Nothing => {}
             Attack::Elsewhere => session.put("somewhere/else", progress.clone()).await.unwrap(),
             Attack::QuestionsElsewhere => ask("somewhere/else".to_owned(), claim.clone()).await,
+            Attack::Unseen => session.put("@somewhere/else", progress.clone()).await.unwrap(),
+            Attack::Deletions => session.delete(keys::progress(&run, &name("flood"))).await.unwrap(),
+            Attack::Downloads => {
+                number += 1;
+                let question = encode(&WeightsRequest { evaluator: name(&format!("flood-{}", number % 10)) }).unwrap();
+                ask(keys::weights_at(&run, ENDLESS.eval_interval), question).await;
+            }
             Attack::Subscriptions => {
                 let number = subscriptions.len();
                 for key in [format!("somewhere/{number}"), matches_weights(number)] {
@@ -228,7 +244,10 @@ impl Scene {
                 let claims = self.crowd.measured().claims;
                 (!claims.is_empty()).then_some(claims)
             });
-            let slowest = claims.iter().max().unwrap();
+            let slowest = *claims.iter().max().unwrap();
+            // Where no firewall is loaded, new connections are before everybody.
+            let bearable = slowest < Duration::from_secs(4) || matches!(attack, Attack::Connections);
+            assert!(bearable, "{attack:?}: a claim waited {slowest:.1?}");
             let share = loud.steps_per_second / quiet.steps_per_second;
             let threads = loud.other_threads - quiet.other_threads;
             eprintln!("{attack:?}: training at {share:.3}, {threads:.3} s/s besides, slowest claim {slowest:.1?}");

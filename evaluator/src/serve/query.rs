@@ -43,6 +43,8 @@ pub enum AskError {
 /// together (`downsampling` in its configuration, deploy/zenoh/router.json5): those of a stranger's flood, and it would drop
 /// those of an evaluator of many runs.
 const APART: Duration = Duration::from_millis(50);
+/// The same for weights, of which it lets fewer through.
+const WEIGHTS_APART: Duration = Duration::from_millis(250);
 
 /// When the last question of each kind was asked or, later, over.
 static LAST: Mutex<BTreeMap<String, Instant>> = Mutex::new(BTreeMap::new());
@@ -58,7 +60,8 @@ pub struct Turn(String);
 /// Waits until this process may ask its next question of the kind of `key`.
 pub async fn take_turn(key: &str) -> Turn {
     let turn = Turn(kind(key).to_owned());
-    tokio::time::sleep_until(turn.note(APART).into()).await;
+    let apart = if turn.0 == "weights" { WEIGHTS_APART } else { APART };
+    tokio::time::sleep_until(turn.note(apart).into()).await;
     turn
 }
 

@@ -39,6 +39,11 @@ impl FloodGuard {
         Self { accounts: Mutex::default(), held_back: AtomicUsize::new(0), seconds, ended: AtomicBool::new(false) }
     }
 
+    /// Counts one that makes as much work as so many messages.
+    pub fn messages(&self, count: u32) {
+        (0..count).for_each(|_| self.message());
+    }
+
     /// Counts a message of the connection whose task this is called in, and waits if there were too many.
     pub fn message(&self) {
         if self.ended.load(Ordering::Relaxed) {
