@@ -1,5 +1,7 @@
 #!/usr/bin/env bash
-# Sets up what is missing, builds and runs every test; none is skipped for want of a peer. Arguments go to `cargo test`.
+# Sets up what is missing, builds and runs every test. None is skipped for want of a program to compare with; those that
+# need rights (mounts, network namespaces), systemd-analyze or recorded files say so where they are skipped, and those of
+# Docker run only when asked for (docs/deployment.md). Arguments go to `cargo test`.
 set -euo pipefail
 cd "$(dirname "$0")/.."
 

@@ -38,7 +38,7 @@ fn compose_with_certificates_works_and_lets_in_nobody_else() {
     };
     let begin = Instant::now();
     compose.set("COMPOSE_FILE", "docker-compose.yml:docker-compose.tls.yml");
-    compose.set("QUAD_CERTIFICATES", ours.path().to_str().unwrap());
+    compose.set("QUAD_CERTIFICATES_ROOT", ours.path().to_str().unwrap());
     compose.run(&["up", "--detach", "learner"]);
     let (learner, router) = (compose.container("learner"), compose.container("router"));
     wait_for_log(&learner, "snapshot handed to evaluation", 1);
