@@ -7,7 +7,7 @@ use std::io::{ErrorKind, Write};
 use quad_dataset::{DatasetError, environment};
 use quad_service::Hint;
 use toml::Table;
-use tracing::info;
+use tracing::{info, warn};
 
 use crate::cli::{Cli, Command, DatasetsCommand, DoctorArgs, InspectArgs, PresetsArgs, ReportArgs, VerifyArgs};
 use crate::config::{self, Experiment};
@@ -16,6 +16,7 @@ use crate::doctor;
 use crate::plot;
 use crate::presets;
 use crate::report::Report;
+use crate::run_dir::RunDir;
 use crate::verify;
 
 /// Does what the command line says.
@@ -46,7 +47,13 @@ fn resolve(preset: &str, changes: &Table) -> anyhow::Result<Experiment> {
 }
 
 fn report(args: &ReportArgs) -> anyhow::Result<()> {
-    let report = Report::read(&args.dirs).hint("DIR is a folder that `learner train` has written")?;
+    // What else lies beside runs, where somebody writes `runs/*`, does not keep them from being read.
+    let (runs, others): (Vec<_>, Vec<_>) = args.dirs.iter().cloned().partition(|dir| RunDir::is_occupied(dir));
+    let dirs = if runs.is_empty() { &args.dirs } else { &runs };
+    let report = Report::read(dirs).hint("DIR is a folder that `learner train` has written")?;
+    for other in &others {
+        warn!("there is no run in {}", other.display());
+    }
     if let Some(path) = &args.plot {
         plot::learning_curves(path, &report.runs)?;
         info!("learning curves: {}", path.display());

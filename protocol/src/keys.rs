@@ -75,23 +75,10 @@ pub fn live_evaluator(run: &Name, evaluator: &Name) -> String {
     format!("quad/{run}/live/evaluator/{evaluator}")
 }
 
-/// Key expression of the tokens of all evaluators of a run.
-pub fn all_evaluators(run: &Name) -> String {
-    format!("quad/{run}/live/evaluator/*")
-}
-
 /// The run that `key` belongs to; `None` if it is no key of ours.
 pub fn run_of(key: &str) -> Option<Name> {
     let (run, _) = key.strip_prefix("quad/")?.split_once('/')?;
     Name::new(run).ok()
-}
-
-/// The evaluator that a progress or liveliness `key` belongs to.
-pub fn evaluator_of(key: &str) -> Option<Name> {
-    let run = run_of(key)?;
-    let rest = key.strip_prefix("quad/")?.strip_prefix(run.as_str())?;
-    let evaluator = rest.strip_prefix("/progress/").or_else(|| rest.strip_prefix("/live/evaluator/"))?;
-    Name::new(evaluator).ok()
 }
 
 /// The incarnation that a key of [`live_learner`] names.
@@ -121,13 +108,13 @@ mod tests {
         assert_eq!(incarnation_of(&learner), Some(77));
         for key in [weights(&run), jobs(&run), scores(&run), learner] {
             assert_eq!(run_of(&key), Some(run.clone()), "{key}");
-            assert_eq!((evaluator_of(&key), step_of(&key)), (None, None), "{key}");
+            assert_eq!(step_of(&key), None, "{key}");
         }
         for key in [weights_at(&run, 10_000), scores_at(&run, 10_000)] {
             assert_eq!((run_of(&key), step_of(&key)), (Some(run.clone()), Some(10_000)), "{key}");
         }
         for key in [progress(&run, &evaluator), live_evaluator(&run, &evaluator)] {
-            assert_eq!((run_of(&key), evaluator_of(&key)), (Some(run.clone()), Some(evaluator.clone())), "{key}");
+            assert_eq!((run_of(&key), step_of(&key)), (Some(run.clone()), None), "{key}");
         }
     }
 
@@ -137,9 +124,6 @@ mod tests {
             ["", "quad", "quad/", "quad//live", "quad/a b/live/learner/1", "quad/*/live/learner/1", "other/run/jobs"]
         {
             assert_eq!(run_of(key), None, "{key}");
-        }
-        for key in ["quad/run/live/evaluator/", "quad/run/live/evaluator/a/b", "quad/run/progress/*", "quad/run/x/e"] {
-            assert_eq!(evaluator_of(key), None, "{key}");
         }
         for key in
             ["quad/run/live/learner", "quad/run/live/learner/x", "quad/run/live/learner/01", "quad/run/live/learner/+1"]

@@ -141,4 +141,14 @@ fn a_learner_without_evaluations_waits_for_nobody() {
     assert!(status.success(), "the learner ended with {status}");
     assert!(learner.scores().is_empty());
     assert!(learner.snapshot(Setting::default().steps).exists(), "the last snapshot is kept");
+
+    // What lies beside it is named and passed over, and is an error by itself.
+    let other = scratch.path().join("other");
+    let [folder, other] = [&learner.run_dir, &other].map(|path| path.to_str().unwrap());
+    for (folders, code) in [(&[other, folder][..], 0), (&[other], 1)] {
+        let output = run("learner", &[&["report"], folders].concat());
+        let (text, said) = (String::from_utf8(output.stdout).unwrap(), String::from_utf8(output.stderr).unwrap());
+        assert_eq!(output.status.code(), Some(code), "{folders:?}: {said}");
+        assert!(said.contains(other) && text.contains("alone") == (code == 0), "{folders:?}: {said}{text}");
+    }
 }

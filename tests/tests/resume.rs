@@ -13,6 +13,8 @@ use rand_chacha::ChaCha8Rng;
 
 /// A few seconds of training with evaluations all along.
 const LONG: Setting = Setting { steps: 3000, eval_interval: 300, episodes: 4, candidates: 2, hidden: 64, seed: 5 };
+/// More of it than ten lives of a second need.
+const LONGER: Setting = Setting { steps: 30_000, eval_interval: 3000, ..LONG };
 const CHECKPOINTS: [&str; 2] = ["--checkpoint-seconds", "0"];
 
 /// The scores of a run, whoever measured them: (step, seed) to (weights, return as bits).
@@ -35,17 +37,17 @@ fn files(folder: &Path) -> BTreeMap<String, Vec<u8>> {
 
 /// A run that nothing happens to.
 fn undisturbed(scratch: &Scratch) -> Learner {
-    let mut learner = scratch.learner("undisturbed", LONG);
+    let mut learner = scratch.learner("undisturbed", LONGER);
     let _evaluator = scratch.evaluator("calm", &learner.endpoint());
     let status = learner.process.wait(PATIENCE);
     assert!(status.success(), "the learner ended with {status}");
-    learner.assert_complete(&LONG);
+    learner.assert_complete(&LONGER);
     learner
 }
 
 /// That the last snapshot, the last checkpoint and all scores are those of another run of the same seed.
 fn assert_same(learner: &Learner, other: &Learner) {
-    learner.assert_complete(&LONG);
+    learner.assert_complete(&LONGER);
     assert!(files(&learner.run_dir.join("snapshots")) == files(&other.run_dir.join("snapshots")), "snapshots differ");
     let last = |learner: &Learner| files(&learner.run_dir.join("checkpoints")).pop_last().unwrap();
     assert!(last(learner) == last(other), "the last checkpoints differ");
@@ -60,22 +62,28 @@ fn a_learner_killed_at_any_moment_ends_with_the_weights_and_scores_of_one_left_a
     let _evaluator = scratch.evaluator("loyal", &endpoint);
     let mut moments = ChaCha8Rng::seed_from_u64(1);
     let arguments = [&["--listen", &endpoint][..], &CHECKPOINTS].concat();
-    let mut gone_on = 0;
-    for _ in 0..10 {
-        let mut learner = scratch.learner_with("run", LONG, &arguments);
-        std::thread::sleep(Duration::from_millis(moments.random_range(50..1500)));
+    let mut training = 0;
+    for life in 0..10 {
+        let mut learner = scratch.learner_with("run", LONGER, &arguments);
+        // Every other one is killed while it starts, or soon after, the others while they train.
+        match life {
+            0 => drop(learner.process.wait_for_log("snapshot handed to evaluation", PATIENCE)),
+            1 | 3 | 5 | 7 | 9 => drop(learner.process.wait_for_log("goes on after step", PATIENCE)),
+            _ => {}
+        }
+        std::thread::sleep(Duration::from_millis(moments.random_range(50..800)));
         learner.process.kill();
-        gone_on += usize::from(learner.process.log().contains("goes on after step"));
+        training += usize::from(!learner.process.log().contains("training is done"));
         scores(&learner);
     }
-    assert!(gone_on > 5, "only {gone_on} of ten lives went on from another one");
-    let mut learner = scratch.learner_with("run", LONG, &arguments);
+    assert_eq!(training, 10, "training was over too soon");
+    let mut learner = scratch.learner_with("run", LONGER, &arguments);
     let status = learner.process.wait(PATIENCE);
     assert!(status.success(), "the learner ended with {status}");
     assert_same(&learner, &calm);
 
     // A run that is complete is so at once.
-    let mut again = scratch.learner_with("run", LONG, &arguments);
+    let mut again = scratch.learner_with("run", LONGER, &arguments);
     assert!(again.process.wait(PATIENCE).success());
     assert!(again.process.out().contains("mean score of the last 3 evaluations"), "{}", again.process.out());
     assert_same(&again, &calm);

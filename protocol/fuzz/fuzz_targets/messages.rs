@@ -38,6 +38,6 @@ fuzz_target!(init: write_seeds(), |bytes: &[u8]| {
     read::<WeightsRequest>(bytes);
     // A key is text from the wire, too.
     if let Ok(key) = std::str::from_utf8(bytes) {
-        let _ = (keys::run_of(key), keys::evaluator_of(key), keys::incarnation_of(key), keys::step_of(key));
+        let _ = (keys::run_of(key), keys::incarnation_of(key), keys::step_of(key));
     }
 });
