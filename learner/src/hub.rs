@@ -4,6 +4,7 @@
 
 mod announcer;
 mod evaluators;
+mod event;
 mod followed;
 mod rejection;
 mod scores;
@@ -14,9 +15,7 @@ use std::sync::mpsc::Sender;
 use std::thread;
 use std::time::{Duration, Instant};
 
-use quad_protocol::{
-    Hash, JobReply, JobRequest, Message, Name, Progress, ScoreReply, decode, encode, episode_seeds, keys,
-};
+use quad_protocol::{JobReply, JobRequest, Message, Name, Progress, ScoreReply, decode, encode, episode_seeds, keys};
 use quad_service::{Beat, hinted, stay_in_background};
 use tokio::sync::mpsc::UnboundedSender;
 use tracing::{debug, info, warn};
@@ -33,6 +32,7 @@ use evaluators::Evaluators;
 use rejection::Rejection;
 use scores::Delivered;
 
+pub use event::Event;
 pub use followed::Follow;
 
 /// How often expired leases are looked for.
@@ -42,46 +42,8 @@ const MOST_TOGETHER: usize = 256;
 /// After some messages, the next ones are left to gather for so long. To wake this thread, and those that its answers wake,
 /// takes more of a processor that training needs than what they then do.
 const GATHER: Duration = Duration::from_millis(20);
-
 /// When all scores are there, those that could be scored a second time wait so long for somebody who can do it.
 const LAST_AUDITS: Duration = Duration::from_secs(30);
-
-/// Messages to the thread.
-#[derive(Debug)]
-pub enum Event {
-    /// A snapshot is ready to be evaluated.
-    Evaluate {
-        /// After which gradient step.
-        step: u64,
-        /// Its hash.
-        weights: Hash,
-    },
-    /// All gradient steps are done; no further evaluation will follow.
-    TrainingCompleted,
-    /// The Zenoh session is open.
-    Online {
-        /// The session.
-        session: Session,
-        /// Who sees to it that evaluators' tokens are followed.
-        follower: Sender<Follow>,
-    },
-    /// An evaluator asks for a job, or hands one back.
-    Job(Question),
-    /// An evaluator delivers scores.
-    Report(Question),
-    /// An evaluator reports a job's progress.
-    Progress(Vec<u8>),
-    /// An evaluator is there.
-    Joined(Name),
-    /// An evaluator is gone.
-    Left(Name),
-    /// The run cannot go on, and why.
-    Failed(anyhow::Error),
-    /// The scores that the scribe had were written, or why not.
-    Written(Result<(), String>),
-    /// End, after the messages sent before this one are handled.
-    Stop,
-}
 
 /// Which episodes each evaluation of a run has.
 #[derive(Clone, Copy, Debug)]
