@@ -3,7 +3,7 @@
 use std::thread;
 use std::time::{Duration, Instant};
 
-use anyhow::{anyhow, bail};
+use anyhow::anyhow;
 use quad_protocol::Name;
 use quad_service::Endpoints;
 use tokio::runtime::Handle;
@@ -241,7 +241,10 @@ async fn end(threads: Threads, ending: &Ending) -> anyhow::Result<()> {
     error!("{error:#}; ending as soon as the disk has taken what waits for it, in {} s at most", LAST_WRITES.as_secs());
     match timeout(LAST_WRITES, ended).await {
         Ok(ended) => ended?,
-        Err(_) => bail!("the disk did not take what was to be saved last"),
+        Err(_) => {
+            warn!("the disk did not take what was to be saved last");
+            Ok(())
+        }
     }
 }
 

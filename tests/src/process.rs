@@ -2,7 +2,7 @@
 
 use std::fs::{self, File};
 use std::path::{Path, PathBuf};
-use std::process::{Child, Command, ExitStatus, Stdio};
+use std::process::{Child, Command, ExitStatus, Output, Stdio};
 use std::time::{Duration, Instant};
 
 use crate::eventually;
@@ -15,6 +15,15 @@ pub fn binary(name: &str) -> PathBuf {
     let path = folder.join(name);
     assert!(path.exists(), "{} is missing; build it with: cargo build --release --bins", path.display());
     path
+}
+
+/// That a program ended with exit code 1, an error that has this sentence, and a hint that has that.
+pub fn assert_refused(output: &Output, sentence: &str, hint: &str) {
+    let text = String::from_utf8_lossy(&output.stderr);
+    assert_eq!(output.status.code(), Some(1), "{sentence}: {text}");
+    let advice = text.split_once("hint: ").map(|(_, advice)| advice).unwrap_or_default();
+    assert!(text.contains(sentence), "`{sentence}` is not in\n{text}");
+    assert!(advice.contains(hint), "`{hint}` is not in the hint of\n{text}");
 }
 
 /// A running program, killed when dropped. Its output goes to files; a failing test prints their ends.

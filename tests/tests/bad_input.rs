@@ -8,7 +8,7 @@ use std::process::{Command, Output};
 
 use ndarray::{Array1, Array2};
 use quad_dataset::{D4rlWriter, Metadata, Row, environment};
-use quad_tests::process::binary;
+use quad_tests::process::{assert_refused, binary};
 use tempfile::{TempDir, tempdir};
 
 /// Arrays of Hopper's sizes in D4RL's layout, to be spoiled in one place.
@@ -80,14 +80,6 @@ impl Subject {
         assert_refused(&output, sentence, hint);
         assert!(!run_dir.exists(), "{sentence}: a refused start leaves a folder behind");
     }
-}
-
-fn assert_refused(output: &Output, sentence: &str, hint: &str) {
-    let text = String::from_utf8_lossy(&output.stderr);
-    assert_eq!(output.status.code(), Some(1), "{sentence}: {text}");
-    let advice = text.split_once("hint: ").map(|(_, advice)| advice).unwrap_or_default();
-    assert!(text.contains(sentence), "`{sentence}` is not in\n{text}");
-    assert!(advice.contains(hint), "`{hint}` is not in the hint of\n{text}");
 }
 
 #[test]

@@ -3,11 +3,11 @@
 
 use std::fs;
 use std::path::Path;
-use std::process::{Command, Output};
+use std::process::Command;
 
 use quad_tests::PATIENCE;
 use quad_tests::certificates::Certificates;
-use quad_tests::process::binary;
+use quad_tests::process::{assert_refused, binary};
 use quad_tests::system::{Scratch, Setting, free_port};
 
 #[test]
@@ -57,12 +57,4 @@ fn what_cannot_be_safe_is_refused_before_anything_starts() {
     let mut command = start("evaluator");
     command.arg("serve").env("QUAD_CERTIFICATES", certificates.of("nowhere"));
     assert_refused(&command.output().unwrap(), "nowhere/ca.pem", "certificates.sh");
-}
-
-fn assert_refused(output: &Output, sentence: &str, hint: &str) {
-    let text = String::from_utf8_lossy(&output.stderr);
-    assert_eq!(output.status.code(), Some(1), "{sentence}: {text}");
-    let advice = text.split_once("hint: ").map(|(_, advice)| advice).unwrap_or_default();
-    assert!(text.contains(sentence), "`{sentence}` is not in\n{text}");
-    assert!(advice.contains(hint), "`{hint}` is not in the hint of\n{text}");
 }

@@ -130,6 +130,7 @@ async fn a_run_that_fails_while_the_disk_hangs_says_why_and_ends() {
     assert!(!learner.snapshot(next).exists(), "the disk did not hang");
     assert_eq!(status.code(), Some(1), "{}", learner.process.log());
     assert!((10..25).contains(&took.as_secs()), "it took {took:?} to give the disk up");
+    assert!(learner.process.log().contains("the disk did not take"), "{}", learner.process.log());
 }
 
 #[test]
