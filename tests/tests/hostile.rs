@@ -196,12 +196,12 @@ async fn read_nothing(endpoint: &str) {
 
 /// A learner on one core, and five evaluators that work for it.
 struct Scene {
-    scratch: Scratch,
     learner: Learner,
     endpoint: String,
     crowd: Crowd,
     _runtime: Runtime,
     _router: Option<Session>,
+    scratch: Scratch,
 }
 
 impl Scene {
@@ -225,7 +225,7 @@ impl Scene {
         learner.process.wait_for_log("snapshot handed to evaluation", PATIENCE);
         let crowd = runtime.block_on(Crowd::connect(HONEST, &run(), &endpoint));
         crowd.set(Pace::Quick);
-        Scene { scratch, learner, endpoint, crowd, _runtime: runtime, _router: router }
+        Scene { learner, endpoint, crowd, _runtime: runtime, _router: router, scratch }
     }
 
     /// Lets the stranger try one after the other.
