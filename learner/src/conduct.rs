@@ -14,6 +14,7 @@ use tracing::{error, warn};
 use zenoh::Session;
 
 use crate::display::{Display, evaluators};
+use crate::keeper::RETRY;
 use crate::metrics::Metrics;
 use crate::notice::Notice;
 use crate::report::Spread;
@@ -32,8 +33,6 @@ const DISK_PATIENCE: Duration = Duration::from_secs(30);
 const CLOSE_PATIENCE: Duration = Duration::from_secs(5);
 /// When a run has failed, what still waits for the disk is given up after this time: the disk may be in trouble, too.
 const LAST_WRITES: Duration = Duration::from_secs(15);
-/// How long a file is left alone that the disk did not take.
-const RETRY: Duration = Duration::from_secs(2);
 
 /// A Zenoh session that may still wait for a router.
 pub type Opening = oneshot::Receiver<anyhow::Result<Session>>;

@@ -26,7 +26,7 @@ use crate::train::TrainedPolicy;
 /// Most bytes of snapshots that wait for the disk: forty of the paper's size.
 const MOST_WAITING: usize = 256 << 20;
 /// How long the disk is left alone after it has refused something.
-const RETRY: Duration = Duration::from_secs(2);
+pub(crate) const RETRY: Duration = Duration::from_secs(2);
 /// A disk that stays in trouble is spoken of this often.
 const REMIND: Duration = Duration::from_secs(60);
 /// How often a training that waits for the disk looks whether it is to stop.

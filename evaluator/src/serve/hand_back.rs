@@ -10,7 +10,6 @@ use super::query::ask;
 use crate::metrics::Metrics;
 
 /// A job that is to be handed back, so that it need not wait for the end of its lease.
-#[derive(Clone)]
 pub struct HandBack {
     session: Session,
     metrics: Metrics,
