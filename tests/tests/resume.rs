@@ -4,16 +4,17 @@
 use std::collections::BTreeMap;
 use std::fs;
 use std::path::Path;
-use std::time::Duration;
+use std::thread::sleep;
+use std::time::{Duration, Instant};
 
 use quad_tests::system::{Learner, Scratch, Setting, free_port};
-use quad_tests::{PATIENCE, eventually};
+use quad_tests::{PATIENCE, eventually, http};
 use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 
 /// A few seconds of training with evaluations all along.
 const LONG: Setting = Setting { steps: 3000, eval_interval: 300, episodes: 4, candidates: 2, hidden: 64, seed: 5 };
-/// More of it than ten lives of a second need.
+/// More of it than ten lives need.
 const LONGER: Setting = Setting { steps: 30_000, eval_interval: 3000, ..LONG };
 const CHECKPOINTS: [&str; 2] = ["--checkpoint-seconds", "0"];
 
@@ -62,16 +63,23 @@ fn a_learner_killed_at_any_moment_ends_with_the_weights_and_scores_of_one_left_a
     let _evaluator = scratch.evaluator("loyal", &endpoint);
     let mut moments = ChaCha8Rng::seed_from_u64(1);
     let arguments = [&["--listen", &endpoint][..], &CHECKPOINTS].concat();
-    let mut training = 0;
+    let (mut start, mut training) = (Duration::ZERO, 0);
     for life in 0..10 {
+        let begin = Instant::now();
         let mut learner = scratch.learner_with("run", LONGER, &arguments);
-        // Every other one is killed while it starts, or soon after, the others while they train.
-        match life {
-            0 => drop(learner.process.wait_for_log("snapshot handed to evaluation", PATIENCE)),
-            1 | 3 | 5 | 7 | 9 => drop(learner.process.wait_for_log("goes on after step", PATIENCE)),
-            _ => {}
+        // The moments go by what this machine has done, not by the clock: it may be a fast or a slow one. Every other one
+        // is while the learner trains, the others are while it starts, or soon after.
+        if life % 2 == 0 {
+            learner.process.wait_for_log("run run is at", PATIENCE);
+            start = start.max(begin.elapsed());
+            let step = 2000 * life + moments.random_range(1..4000);
+            eventually("it trains", PATIENCE, || {
+                let page = http::metrics(&learner.metrics())?;
+                (http::sum(&page, "quad_learner_gradient_steps_total", "") >= step as f64).then_some(())
+            });
+        } else {
+            sleep(start.mul_f64(moments.random_range(0.0..2.0)));
         }
-        std::thread::sleep(Duration::from_millis(moments.random_range(50..800)));
         learner.process.kill();
         training += usize::from(!learner.process.log().contains("training is done"));
         scores(&learner);
