@@ -54,6 +54,7 @@ impl HandBack {
     async fn deliver(&self, patience: Duration) -> bool {
         let Some(Ok(message)) = self.scores.as_ref().map(encode) else { return false };
         let key = keys::scores(&self.job.run);
+        // Anybody's answer will do, also that of a learner that was started again: the scores have gone out to everyone.
         let answer = ask(&self.session, key, message, patience, &self.metrics, |_: &ScoreReply| Ok(())).await;
         let delivered = matches!(answer, Ok(ScoreReply::Recorded { .. }));
         info!(run = %self.job.run, delivered, "scores that were not acknowledged before");
