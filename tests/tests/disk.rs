@@ -11,7 +11,9 @@ use quad_tests::router::router;
 use quad_tests::system::{Learner, Scratch, Setting, free_port};
 use quad_tests::{PATIENCE, eventually, http};
 
-const SETTING: Setting = Setting { steps: 4000, eval_interval: 500, episodes: 4, candidates: 2, hidden: 32, seed: 2 };
+/// Seconds of training, also where a step takes 50 µs: things happen in the middle of it.
+const SETTING: Setting =
+    Setting { steps: 40_000, eval_interval: 5_000, episodes: 4, candidates: 2, hidden: 32, seed: 2 };
 const LISTEN: [&str; 4] = ["--listen", "tcp/127.0.0.1:0", "--checkpoint-seconds", "0"];
 
 /// A disk of a few megabytes, unmounted when dropped.
@@ -56,7 +58,7 @@ fn a_full_disk_delays_scores_and_checkpoints_until_there_is_room() {
         return;
     };
     // Long enough for the disk to be full in the middle of it.
-    let setting = Setting { steps: 20_000, eval_interval: 2_000, hidden: 64, ..SETTING };
+    let setting = Setting { hidden: 64, ..SETTING };
     let mut learner = scratch.learner_with("run", setting, &LISTEN);
     let _evaluator = scratch.evaluator("one", &learner.endpoint());
     eventually("there are scores", PATIENCE, || (!learner.scores().is_empty()).then_some(()));

@@ -20,7 +20,8 @@ use rand_chacha::ChaCha8Rng;
 use tokio::runtime::Runtime;
 use zenoh::{Session, Wait};
 
-const SETTING: Setting = Setting { steps: 24_000, eval_interval: 600, episodes: 4, candidates: 2, hidden: 64, seed: 5 };
+const SETTING: Setting =
+    Setting { steps: 48_000, eval_interval: 1200, episodes: 4, candidates: 2, hidden: 64, seed: 5 };
 const CUTS: usize = 8;
 
 /// A score: step, seed, weights.
