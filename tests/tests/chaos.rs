@@ -29,7 +29,7 @@ use zenoh::{Session, Wait};
 
 const EVALUATORS: usize = 3;
 /// Gradient steps for each fault, so that training goes on until the last of them.
-const STEPS_PER_FAULT: u64 = 8000;
+const STEPS_PER_FAULT: u64 = 12_000;
 
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
 enum Fault {
@@ -277,7 +277,7 @@ fn endure(faults: &[Fault], short: usize, endpoint: &str, lines: Vec<impl Line>)
         system.inject(round.pop().expect("it was filled"), &mut random);
         injected += 1;
     }
-    let patience = PATIENCE + begin.elapsed();
+    let patience = 2 * PATIENCE + begin.elapsed();
     eventually("the run is over", patience, || system.is_over().then_some(()));
     let status = calm.process.wait(patience);
     assert!(status.success(), "the run that nothing happens to ended with {status}");

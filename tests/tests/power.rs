@@ -114,12 +114,12 @@ impl System {
     /// Lets the run end, and compares it with one that nothing happened to.
     fn finish(&self) {
         let mut learner = self.learner();
-        let status = learner.process.wait(PATIENCE);
+        let status = learner.process.wait(3 * PATIENCE);
         assert!(status.success(), "the learner ended with {status}");
         learner.assert_complete(&SETTING);
         let mut calm = self.scratch.learner("calm", SETTING);
         let _evaluator = self.scratch.evaluator("three", &calm.endpoint());
-        assert!(calm.process.wait(PATIENCE).success());
+        assert!(calm.process.wait(3 * PATIENCE).success());
         let mut verify = Command::new(binary("learner"));
         let output = verify.arg("verify").arg(&learner.run_dir).arg("--same-as").arg(&calm.run_dir).output().unwrap();
         assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stdout));

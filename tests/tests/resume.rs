@@ -63,7 +63,7 @@ fn a_learner_killed_at_any_moment_ends_with_the_weights_and_scores_of_one_left_a
     let _evaluator = scratch.evaluator("loyal", &endpoint);
     let mut moments = ChaCha8Rng::seed_from_u64(1);
     let arguments = [&["--listen", &endpoint][..], &CHECKPOINTS].concat();
-    let (mut start, mut training) = (Duration::ZERO, 0);
+    let (mut start, mut training) = (Duration::MAX, 0);
     for life in 0..10 {
         let begin = Instant::now();
         let mut learner = scratch.learner_with("run", LONGER, &arguments);
@@ -71,7 +71,7 @@ fn a_learner_killed_at_any_moment_ends_with_the_weights_and_scores_of_one_left_a
         // is while the learner trains, the others are while it starts, or soon after.
         if life % 2 == 0 {
             learner.process.wait_for_log("run run is at", PATIENCE);
-            start = start.max(begin.elapsed());
+            start = start.min(begin.elapsed());
             let step = 2000 * life + moments.random_range(1..4000);
             eventually("it trains", PATIENCE, || {
                 let page = http::metrics(&learner.metrics())?;
