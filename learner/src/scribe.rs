@@ -45,9 +45,11 @@ impl Scribe {
             match self.lines.recv_timeout(beat.interval()) {
                 Ok(Lines::Scores(lines)) => {
                     let written = self.scores.append(&lines);
-                    if let Err(error) = &written {
-                        error!(%error, "scores could not be saved");
+                    let trouble = written.as_ref().err().map(|error| format!("scores cannot be saved: {error}"));
+                    if let Some(trouble) = &trouble {
+                        error!("{trouble}");
                     }
+                    beat.set_trouble(trouble);
                     self.hub.send(Event::Written(written.map_err(|error| error.to_string())));
                     thread::sleep(GATHER);
                 }

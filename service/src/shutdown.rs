@@ -1,6 +1,7 @@
 //! The signals that end a process.
 
 use std::pin::pin;
+use std::thread;
 use std::time::Duration;
 
 use tokio::signal::unix::{Signal, SignalKind, signal};
@@ -9,6 +10,8 @@ use tracing::{info, warn};
 
 /// A process that was told to end has so long for it: less than the 10 s after which Docker kills.
 const LEAVE_WITHIN: Duration = Duration::from_secs(9);
+/// What is said last gets so long to be read.
+const LAST_WORDS: Duration = Duration::from_millis(100);
 /// What a shell reports of a process that SIGINT has ended.
 const ENDED_AT_ONCE: i32 = 130;
 
@@ -22,12 +25,15 @@ pub fn shutdown_signal() -> impl Future<Output = ()> + Send {
     let (tell, told) = oneshot::channel();
     tokio::spawn(async move {
         let name = either(&mut interrupt, &mut terminate).await;
-        info!("received {name}");
         tell.send(()).ok();
+        aside(move || info!("received {name}"));
         match tokio::time::timeout(LEAVE_WITHIN, either(&mut interrupt, &mut terminate)).await {
-            Ok(again) => warn!("received {again} after {name}: ending at once"),
-            Err(_) => warn!("{} s after {name} something still hangs: ending at once", LEAVE_WITHIN.as_secs()),
+            Ok(again) => aside(move || warn!("received {again} after {name}: ending at once")),
+            Err(_) => {
+                aside(move || warn!("{} s after {name} something still hangs: ending at once", LEAVE_WITHIN.as_secs()))
+            }
         }
+        tokio::time::sleep(LAST_WORDS).await;
         std::process::exit(ENDED_AT_ONCE);
     });
     async move {
@@ -36,6 +42,12 @@ pub fn shutdown_signal() -> impl Future<Output = ()> + Send {
             std::future::pending::<()>().await;
         }
     }
+}
+
+/// Says something in a thread of its own: nobody may read what this process says, and then whoever says it waits for ever.
+fn aside(say: impl FnOnce() + Send + 'static) {
+    // Without a thread for it, it is not said.
+    thread::Builder::new().spawn(say).ok();
 }
 
 async fn either(interrupt: &mut Option<Signal>, terminate: &mut Option<Signal>) -> &'static str {

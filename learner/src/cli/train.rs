@@ -3,7 +3,7 @@
 use std::net::SocketAddr;
 use std::path::PathBuf;
 
-use clap::Args;
+use clap::{Args, value_parser};
 use quad_policy::Precision;
 use quad_service::parse_endpoint;
 use toml::{Table, Value};
@@ -42,7 +42,7 @@ pub struct TrainArgs {
     #[arg(long, value_name = "DIR")]
     pub run_dir: Option<PathBuf>,
     /// Seconds between two checkpoints, so many of which a crash may cost; longer where saving would take 1 % of the time
-    #[arg(long, value_name = "N", default_value_t = 30)]
+    #[arg(long, value_name = "N", default_value_t = 30, value_parser = value_parser!(u64).range(..=31_536_000))]
     pub checkpoint_seconds: u64,
     /// Share of the episodes, 0 to 1, that another evaluator scores a second time: a score that differs in a bit is reported
     #[arg(long, value_name = "SHARE", default_value_t = 0.0, value_parser = parse_share)]

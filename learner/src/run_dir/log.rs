@@ -89,19 +89,21 @@ impl Log {
 
     /// Cuts off every line from the first one on that is not to be kept.
     pub(super) fn keep_while(&mut self, mut keep: impl FnMut(&str) -> bool) -> Result<(), RunDirError> {
-        let text = self.text()?;
-        let kept = text.split_inclusive('\n').take_while(|line| keep(line));
+        // A power cut may leave anything in a file that was not synchronised; what is no text is not kept either.
+        let bytes = self.bytes()?;
+        let lines = bytes.split_inclusive(|&byte| byte == b'\n');
+        let kept = lines.take_while(|line| std::str::from_utf8(line).is_ok_and(&mut keep));
         self.length = kept.map(|line| line.len() as u64).sum();
         self.torn = true;
         self.mend().map_err(io_error("write", &self.path))
     }
 
     /// The whole lines.
-    pub(super) fn text(&mut self) -> Result<String, RunDirError> {
-        let mut text = String::new();
-        let read = self.file.seek(SeekFrom::Start(0)).and_then(|_| self.file.read_to_string(&mut text));
+    fn bytes(&mut self) -> Result<Vec<u8>, RunDirError> {
+        let mut bytes = Vec::new();
+        let read = self.file.seek(SeekFrom::Start(0)).and_then(|_| self.file.read_to_end(&mut bytes));
         read.map_err(io_error("read", &self.path))?;
-        Ok(text)
+        Ok(bytes)
     }
 }
 

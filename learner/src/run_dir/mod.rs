@@ -224,9 +224,16 @@ impl RunDir {
         self.read_lines("scores.jsonl")
     }
 
-    /// The lines of `audits.jsonl`, likewise.
+    /// The lines of `audits.jsonl`, likewise. The file is not synchronised, so a power cut may leave anything in it: what is
+    /// no such line is left out.
     pub fn read_audits(&self) -> Result<Vec<AuditLine>, RunDirError> {
-        self.read_lines("audits.jsonl")
+        let path = self.path.join("audits.jsonl");
+        let bytes = match fs::read(&path) {
+            Err(error) if error.kind() == io::ErrorKind::NotFound => return Ok(Vec::new()),
+            other => other.map_err(io_error("read", &path))?,
+        };
+        let lines = bytes.split_inclusive(|&byte| byte == b'\n').filter(|line| line.ends_with(b"\n"));
+        Ok(lines.filter_map(|line| serde_json::from_slice(line).ok()).collect())
     }
 
     fn read_lines<T: DeserializeOwned>(&self, name: &str) -> Result<Vec<T>, RunDirError> {

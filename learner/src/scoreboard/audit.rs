@@ -22,7 +22,13 @@ struct Waiting {
     precision: Name,
     /// The job that it is handed out with.
     job: Option<u64>,
+    /// How many such jobs have ended without its score.
+    lost: u32,
 }
+
+/// An episode is not checked any more after so many jobs that ended without its score: an audit must not keep a run from
+/// its end.
+const MOST_LOST: u32 = 5;
 
 /// An episode that was scored twice.
 #[derive(Clone, Debug, PartialEq)]
@@ -60,7 +66,7 @@ impl Audits {
     /// The same for one that may be of an earlier life.
     pub fn add_one(&mut self, step: u64, Unchecked { score: first, evaluator, precision }: Unchecked) {
         if is_chosen(self.share, step, first.seed) {
-            self.waiting.insert((step, first.seed), Waiting { first, evaluator, precision, job: None });
+            self.waiting.insert((step, first.seed), Waiting { first, evaluator, precision, job: None, lost: 0 });
         }
     }
 
@@ -86,9 +92,15 @@ impl Audits {
         Some((step, seeds))
     }
 
-    /// Lets the episodes of a job that has ended wait for another evaluator.
+    /// Lets the episodes of a job that has ended wait for another evaluator, unless that was so too often.
     pub fn release(&mut self, job: u64) {
-        self.waiting.values_mut().filter(|waiting| waiting.job == Some(job)).for_each(|waiting| waiting.job = None);
+        self.waiting.retain(|_, waiting| {
+            if waiting.job == Some(job) {
+                waiting.job = None;
+                waiting.lost += 1;
+            }
+            waiting.lost < MOST_LOST
+        });
     }
 
     /// Whether a job still has episodes to score again.
@@ -123,8 +135,22 @@ fn is_chosen(share: f64, step: u64, seed: u64) -> bool {
 }
 
 #[cfg(test)]
+#[allow(clippy::unwrap_used)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn an_episode_that_nobody_checks_is_not_waited_for() {
+        let [one, other] = ["one", "other"].map(|name| Name::new(name).unwrap());
+        let score = EpisodeScore { seed: 7, episode_return: 1.0, length: 1, score: 1.0 };
+        let mut audits = Audits::new(1.0);
+        audits.add_one(10, Unchecked { score, evaluator: one, precision: Name::new("f32").unwrap() });
+        for job in 0..u64::from(MOST_LOST) {
+            assert_eq!(audits.hand_out(job, &other, &Name::new("f32").unwrap(), 4), Some((10, vec![7])));
+            audits.release(job);
+        }
+        assert_eq!(audits.count(), [0, 0]);
+    }
 
     #[test]
     fn the_share_is_chosen() {
