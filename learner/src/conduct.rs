@@ -21,6 +21,7 @@ use crate::report::Spread;
 use crate::run_dir::{RunDir, RunEndpoints};
 use crate::threads::Threads;
 use crate::train::Outcome;
+use crate::trouble::Saved;
 use crate::wire::{Life, Wire};
 
 /// Listening takes milliseconds. A session that takes longer waits for a router; training starts without it.
@@ -28,7 +29,7 @@ const SESSION_PATIENCE: Duration = Duration::from_secs(1);
 /// When no evaluator has been connected for this long after training, the user is told what to do.
 const EVALUATOR_PATIENCE: Duration = Duration::from_secs(10);
 /// The disk hangs if it takes longer than this for one file.
-const DISK_PATIENCE: Duration = Duration::from_secs(30);
+pub(crate) const DISK_PATIENCE: Duration = Duration::from_secs(30);
 /// Longest time to close the session in, should the network hang.
 const CLOSE_PATIENCE: Duration = Duration::from_secs(5);
 /// When a run has failed, what still waits for the disk is given up after this time: the disk may be in trouble, too.
@@ -146,7 +147,7 @@ impl Conductor {
                     let busy_for = self.threads.desk.busy_for();
                     if busy_for > DISK_PATIENCE && !hangs {
                         self.display.say("the disk hangs: snapshots and checkpoints wait for it; training goes on");
-                        self.metrics.disk.trouble.set(1);
+                        self.metrics.disk.trouble(Saved::Run).set(1);
                     }
                     hangs = busy_for > DISK_PATIENCE;
                     if !training && waiting.is_too_long(self.metrics.evaluators.present.get() > 0) {
@@ -193,7 +194,13 @@ impl Conductor {
             }
             Notice::EvaluatorsChanged { joined, left } => format!("{joined} more evaluators came and {left} left"),
             Notice::GivenUp(episodes) => {
-                format!("{} episodes are given up: each took too many evaluators with it", episodes.len())
+                let episodes = episodes.len();
+                format!(
+                    "{episodes} episodes are given up: too many evaluators were lost with them or could not do them"
+                )
+            }
+            Notice::JobFailed { step, evaluator, reason } => {
+                format!("evaluator {evaluator} could not do a job of step {step}, which goes to others: {reason}")
             }
             Notice::JobsExpired(jobs) => format!("{jobs} jobs made no progress; they go to others"),
             Notice::Evaluated { step, scores } => {
@@ -211,10 +218,11 @@ impl Conductor {
             Notice::ScoresDiffer([first, second]) => {
                 format!("evaluators {first} and {second} differ in the score of an episode: see audits.jsonl")
             }
-            Notice::DiskTrouble(error) => format!(
-                "the run cannot be saved: {error}; training goes on, and it is tried again until the disk takes it"
+            Notice::DiskTrouble(what, error) => format!(
+                "{} cannot be saved: {error}; training goes on, and it is tried again until the disk takes it",
+                what.name()
             ),
-            Notice::DiskWell => "the disk takes what is saved again".to_owned(),
+            Notice::DiskWell(what) => format!("{} can be saved again", what.name()),
             Notice::Settled | Notice::Failed(_) => return,
         };
         self.display.say(&text);

@@ -6,9 +6,11 @@ mod announcer;
 mod evaluators;
 mod event;
 mod followed;
+mod losses;
 mod rejection;
 mod scores;
 
+use std::collections::BTreeSet;
 use std::iter;
 use std::ops::ControlFlow;
 use std::sync::mpsc::Sender;
@@ -18,15 +20,16 @@ use std::time::{Duration, Instant};
 use quad_protocol::{JobReply, JobRequest, Message, Name, Progress, ScoreReply, decode, encode, episode_seeds, keys};
 use quad_service::{Beat, hinted, stay_in_background};
 use tokio::sync::mpsc::UnboundedSender;
-use tracing::{debug, info, warn};
+use tracing::{debug, info};
 use zenoh::Session;
 
 use crate::inbox::Messages;
 use crate::metrics::Metrics;
 use crate::notice::Notice;
 use crate::replies::{Asker, Question};
-use crate::scoreboard::{Claim, Lost, OtherWeights, Scoreboard};
+use crate::scoreboard::{Claim, HandedBack, OtherWeights, Scoreboard};
 use crate::scribe::Lines;
+use crate::trouble::Saved;
 
 use evaluators::Evaluators;
 use rejection::Rejection;
@@ -66,6 +69,8 @@ pub struct Hub {
     session: Option<Session>,
     delivered: Delivered,
     training_completed: bool,
+    /// Steps of which it was told that a job failed.
+    failures_told: BTreeSet<u64>,
     /// After all scores were there: since when nobody has scored any a second time.
     audited_last: Option<Instant>,
 }
@@ -91,6 +96,7 @@ impl Hub {
             session: None,
             delivered: Delivered::default(),
             training_completed: false,
+            failures_told: BTreeSet::new(),
             audited_last: None,
         }
     }
@@ -210,9 +216,17 @@ impl Hub {
                 self.metrics.evaluation.jobs_handed_out.inc_by(new);
                 (reply, evaluator)
             }
-            JobRequest::HandBack { evaluator, job, lease } => {
-                let accepted = self.scoreboard.hand_back(&evaluator, job, &lease);
-                self.metrics.evaluation.jobs_handed_back.inc_by(accepted.into());
+            JobRequest::HandBack { evaluator, job, lease, failed } => {
+                let when = failed.is_some().then(Instant::now);
+                let handed_back = self.scoreboard.hand_back(&evaluator, job, &lease, when);
+                let accepted = handed_back.is_some();
+                if let Some(HandedBack { step, given_up }) = handed_back {
+                    match failed {
+                        Some(reason) => self.failed(step, &evaluator, &reason),
+                        None => self.metrics.evaluation.jobs_handed_back.inc(),
+                    }
+                    self.give_up(given_up);
+                }
                 (JobReply::HandedBack { incarnation: self.scoreboard.incarnation(), accepted }, evaluator)
             }
         }
@@ -225,14 +239,6 @@ impl Hub {
         self.evaluators.heard(progress, now)
     }
 
-    fn left(&mut self, evaluator: Name) {
-        if self.evaluators.remove(&evaluator) {
-            let lost = self.scoreboard.evaluator_gone(&evaluator, Instant::now());
-            self.evaluators.left(evaluator, lost.jobs);
-            self.lost(lost);
-        }
-    }
-
     fn tick(&mut self, now: Instant) {
         for evaluator in self.evaluators.tick(now) {
             self.left(evaluator);
@@ -242,18 +248,10 @@ impl Hub {
             self.notices.send(Notice::JobsExpired(expired.jobs)).ok();
         }
         self.lost(expired);
-        self.settle();
-    }
-
-    fn lost(&mut self, lost: Lost) {
-        self.metrics.evaluation.jobs_expired.inc_by(lost.jobs as u64);
-        if !lost.given_up.is_empty() {
-            for (step, seed) in &lost.given_up {
-                warn!(step, seed, "an episode is given up: too many evaluators were lost with it");
-            }
-            self.notices.send(Notice::GivenUp(lost.given_up)).ok();
-            self.settle();
+        if self.delivered.hangs(now) {
+            self.metrics.disk.trouble(Saved::Scores).set(1);
         }
+        self.settle();
     }
 
     fn settle(&mut self) {
@@ -261,10 +259,12 @@ impl Hub {
             return;
         }
         let [waiting, open] = self.scoreboard.audits();
-        if waiting + open > 0 && self.evaluators.count() > 1 {
+        if waiting + open > 0 {
             let now = Instant::now();
+            // Also if nobody is there who could: after a restart of this learner or its router they are about to come back.
             let since = *self.audited_last.get_or_insert_with(|| {
-                info!(episodes = waiting + open, "every score is there; some are checked by another evaluator");
+                let (episodes, patience) = (waiting + open, LAST_AUDITS);
+                info!(episodes, ?patience, "every score is there; some wait for another evaluator to check them");
                 now
             });
             if open > 0 {

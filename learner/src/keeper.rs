@@ -13,7 +13,7 @@ use quad_dataset::Task;
 use quad_protocol::{Hash, Origin};
 use quad_service::Beat;
 use tokio::sync::mpsc::UnboundedSender;
-use tracing::{debug, warn};
+use tracing::debug;
 
 use crate::hub::EvaluationPlan;
 use crate::inbox::Inbox;
@@ -22,13 +22,12 @@ use crate::notice::Notice;
 use crate::publisher::{self, Kept};
 use crate::run_dir::{Checkpoint, RunDir};
 use crate::train::TrainedPolicy;
+use crate::trouble::{Saved, Trouble};
 
 /// Most bytes of snapshots that wait for the disk: forty of the paper's size.
 const MOST_WAITING: usize = 256 << 20;
 /// How long the disk is left alone after it has refused something.
 pub(crate) const RETRY: Duration = Duration::from_secs(2);
-/// A disk that stays in trouble is spoken of this often.
-const REMIND: Duration = Duration::from_secs(60);
 /// How often a training that waits for the disk looks whether it is to stop.
 const GLANCE: Duration = Duration::from_millis(100);
 
@@ -159,16 +158,9 @@ pub struct Keeper {
     run_dir: RunDir,
     metrics: Metrics,
     publisher: Inbox<publisher::Event>,
-    notices: UnboundedSender<Notice>,
     /// Snapshots of an earlier life, by step: training may come by them again.
     known: BTreeMap<u64, Hash>,
-    trouble: Option<Trouble>,
-}
-
-/// A disk that does not take anything.
-struct Trouble {
-    since: Instant,
-    said: Instant,
+    trouble: Trouble,
 }
 
 impl Keeper {
@@ -182,7 +174,8 @@ impl Keeper {
         notices: UnboundedSender<Notice>,
         known: BTreeMap<u64, Hash>,
     ) -> Self {
-        Self { desk, provenance, run_dir, metrics, publisher, notices, known, trouble: None }
+        let trouble = Trouble::new(Saved::Run, &metrics.disk, notices);
+        Self { desk, provenance, run_dir, metrics, publisher, known, trouble }
     }
 
     /// The thread's work, until the desk is closed and empty.
@@ -198,13 +191,11 @@ impl Keeper {
             };
             match kept {
                 Ok(bytes) => {
-                    beat.set_trouble(None);
-                    self.over();
+                    self.trouble.over(beat);
                     self.desk.done(bytes);
                 }
                 Err(error) => {
-                    beat.set_trouble(Some(format!("the run cannot be saved: {error:#}")));
-                    self.say(&error);
+                    self.trouble.refused(beat, &format!("{error:#}"));
                     self.desk.put_back(work);
                     std::thread::sleep(RETRY);
                 }
@@ -241,26 +232,5 @@ impl Keeper {
         let now = SystemTime::now().duration_since(UNIX_EPOCH).unwrap_or_default();
         disk.checkpoint_timestamp.set(now.as_secs_f64());
         Ok(0)
-    }
-
-    fn say(&mut self, error: &anyhow::Error) {
-        let now = Instant::now();
-        self.metrics.disk.trouble.set(1);
-        let trouble = self.trouble.get_or_insert_with(|| {
-            self.notices.send(Notice::DiskTrouble(format!("{error:#}"))).ok();
-            Trouble { since: now, said: now }
-        });
-        if now - trouble.said >= REMIND {
-            trouble.said = now;
-            warn!("for {} s the run cannot be saved: {error:#}", (now - trouble.since).as_secs());
-        }
-    }
-
-    fn over(&mut self) {
-        // Also set by whoever sees that this thread hangs.
-        self.metrics.disk.trouble.set(0);
-        if self.trouble.take().is_some() {
-            self.notices.send(Notice::DiskWell).ok();
-        }
     }
 }

@@ -54,5 +54,6 @@ pub mod settings;
 pub mod threads;
 pub mod train;
 pub mod trainer;
+pub mod trouble;
 pub mod verify;
 pub mod wire;

@@ -12,6 +12,7 @@ use prometheus::{
 use quad_protocol::{Name, Progress};
 
 use crate::algorithms::Metric;
+use crate::trouble::Saved;
 
 /// Shortest gradient step that the histogram tells apart, and how many doublings follow it: 1 ms to 2 s.
 const SHORTEST_STEP: f64 = 1e-3;
@@ -57,6 +58,7 @@ pub struct EvaluationMetrics {
     pub jobs_completed: IntCounter,
     pub jobs_expired: IntCounter,
     pub jobs_handed_back: IntCounter,
+    pub jobs_failed: IntCounter,
     pub episodes_pending: IntGauge,
     pub episodes_missing: IntGauge,
     audits: IntCounterVec,
@@ -73,7 +75,7 @@ pub struct DiskMetrics {
     pub checkpoint_step: IntGauge,
     pub checkpoint_timestamp: Gauge,
     pub checkpoint_bytes: IntGauge,
-    pub trouble: IntGauge,
+    trouble: IntGaugeVec,
 }
 
 /// What the evaluators' progress messages say, labelled by evaluator.
@@ -149,13 +151,14 @@ impl Metrics {
             jobs_completed: jobs.get_metric_with_label_values(&["completed"])?,
             jobs_expired: jobs.get_metric_with_label_values(&["expired"])?,
             jobs_handed_back: jobs.get_metric_with_label_values(&["handed_back"])?,
+            jobs_failed: jobs.get_metric_with_label_values(&["failed"])?,
             audits: make.add(IntCounterVec::new(
                 Opts::new(full("audits_total"), "Episodes that were scored a second time, by outcome"),
                 &["outcome"],
             ))?,
             episodes_missing: make.count(
                 "episodes_missing",
-                "Episodes that are not handed out any more, after too many lost evaluators",
+                "Episodes that are not handed out any more, after too many failed attempts",
             )?,
             episodes_pending: make.count("episodes_pending", "Episodes of evaluations that have no score yet")?,
             scores_recorded: make.counter("scores_recorded_total", "Episodes scored, each counted once")?,
@@ -168,8 +171,14 @@ impl Metrics {
             checkpoint_timestamp: make
                 .gauge("checkpoint_timestamp_seconds", "When the newest checkpoint was written")?,
             checkpoint_bytes: make.count("checkpoint_bytes", "Size of the newest checkpoint")?,
-            trouble: make.count("disk_trouble", "1 while the disk does not take what is to be kept, else 0")?,
+            trouble: make.add(IntGaugeVec::new(
+                Opts::new(full("disk_trouble"), "1 while the disk does not take what is to be kept, else 0"),
+                &["what"],
+            ))?,
         };
+        for what in [Saved::Run, Saved::Scores] {
+            disk.trouble(what);
+        }
         // From the beginning, so that the first of them is an increase.
         for agree in [true, false] {
             evaluation.audits(agree);
@@ -223,6 +232,13 @@ impl EvaluationMetrics {
     /// Episodes whose two scores agree, or differ.
     pub fn audits(&self, agree: bool) -> IntCounter {
         self.audits.with_label_values(&[if agree { "agree" } else { "differ" }])
+    }
+}
+
+impl DiskMetrics {
+    /// Whether the disk does not take that.
+    pub fn trouble(&self, what: Saved) -> IntGauge {
+        self.trouble.with_label_values(&[what.label()])
     }
 }
 

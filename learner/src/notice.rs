@@ -2,6 +2,8 @@
 
 use quad_protocol::{EpisodeScore, Name};
 
+use crate::trouble::Saved;
+
 /// Something that happened.
 #[derive(Debug)]
 pub enum Notice {
@@ -21,7 +23,17 @@ pub enum Notice {
         /// How many left.
         left: usize,
     },
-    /// Episodes, by step and seed, that are not handed out any more: too many evaluators were lost with them.
+    /// An evaluator could not do a job; told once for each step.
+    JobFailed {
+        /// Gradient step of its snapshot.
+        step: u64,
+        /// Who.
+        evaluator: Name,
+        /// Why, in its words.
+        reason: String,
+    },
+    /// Episodes, by step and seed, that are not handed out any more: too many evaluators were lost with them or could not do
+    /// them.
     GivenUp(Vec<(u64, u64)>),
     /// This many jobs were taken back because their leases ran out.
     JobsExpired(usize),
@@ -41,10 +53,10 @@ pub enum Notice {
     Settled,
     /// These two evaluators have different scores of the same episode.
     ScoresDiffer([Name; 2]),
-    /// The disk does not take what is to be kept; what it says.
-    DiskTrouble(String),
+    /// The disk does not take that; what it says.
+    DiskTrouble(Saved, String),
     /// The disk takes it again.
-    DiskWell,
+    DiskWell(Saved),
     /// The run cannot go on.
     Failed(anyhow::Error),
 }

@@ -1,11 +1,11 @@
 //! A run folder that is there already: whether this learner may go on in it, and what an earlier one left.
 
 use std::collections::{BTreeMap, BTreeSet};
-use std::path::PathBuf;
+use std::path::Path;
 
-use anyhow::{anyhow, bail};
+use anyhow::anyhow;
 use quad_protocol::{EpisodeScore, Hash, Name};
-use quad_service::{Hint, hinted};
+use quad_service::hinted;
 use tracing::{info, warn};
 
 use crate::config::{Experiment, RunConfig};
@@ -15,7 +15,8 @@ use crate::settings;
 /// The folder of a run that has begun, locked.
 pub struct Begun {
     dir: RunDir,
-    config: RunConfig,
+    /// None if the run is to be set aside: then it need not be readable.
+    config: Option<RunConfig>,
     scores: Log,
 }
 
@@ -52,26 +53,28 @@ pub struct Unchecked {
     pub precision: Name,
 }
 
-/// Opens and locks the folder if there is a run in it.
+/// Opens and locks the folder if there is a run in it, to go on with it or, for a `fresh` one, to set it aside.
 ///
 /// # Errors
 /// Another learner is at work there, or a file is not what a learner writes.
-pub fn open(path: PathBuf) -> anyhow::Result<Option<Begun>> {
-    if !RunDir::is_occupied(&path) {
+pub fn open(path: &Path, fresh: bool) -> Result<Option<Begun>, RunDirError> {
+    if !RunDir::is_occupied(path) {
         return Ok(None);
     }
-    let (dir, config) = RunDir::open(&path)?;
-    let scores = dir.score_log().hint("wait for its end, or choose another --run-dir")?;
+    let dir = RunDir::at(path);
+    let scores = dir.score_log()?;
+    let config = if fresh { None } else { Some(dir.read_config()?) };
     Ok(Some(Begun { dir, config, scores }))
 }
 
 impl Begun {
-    /// That the run is the one that `config` describes.
+    /// That the run is the one that `config` describes, unless it is to be set aside.
     ///
     /// # Errors
     /// Every setting that differs.
     pub fn check_same(&self, config: &RunConfig) -> anyhow::Result<()> {
-        let (old, new) = (settings::of_run(&self.config), settings::of_run(config));
+        let Some(begun) = &self.config else { return Ok(()) };
+        let (old, new) = (settings::of_run(begun), settings::of_run(config));
         let value = |settings: &settings::Settings, key: &String| settings.get(key).cloned();
         let line = |key: &String| {
             let [old, new] = [&old, &new].map(|side| value(side, key).unwrap_or_else(|| "not set".to_owned()));
@@ -86,8 +89,8 @@ impl Begun {
                 "choose another --run-dir; or --fresh, which renames that folder and begins anew",
             ));
         }
-        if self.config.run.version != config.run.version {
-            let (old, new) = (&self.config.run.version, &config.run.version);
+        if begun.run.version != config.run.version {
+            let (old, new) = (&begun.run.version, &config.run.version);
             warn!("the run was begun by version {old}, this is {new}: its numbers may go on differently");
         }
         Ok(())
@@ -118,18 +121,21 @@ impl Past {
         let checkpoint = dir.newest_checkpoint()?;
         let step = checkpoint.as_ref().map_or(0, |checkpoint| checkpoint.step);
         let audited = dir.read_audits()?.into_iter().map(|line| (line.step, line.seed)).collect();
-        let scores = by_step(dir.read_scores()?, &audited)?;
+        let scores = by_step(dir.read_scores()?, &audited).map_err(|reason| dir.broken_scores(reason))?;
         let (schedule, mut snapshots) = (experiment.schedule(), BTreeMap::new());
         for of in dir.snapshots()?.into_iter().filter(|of| schedule.is_evaluated(*of)) {
             // One that the training comes by again, and that nobody has looked at, will be made again.
             if of <= step || scores.contains_key(&of) {
-                snapshots.insert(of, Hash::of(&dir.read_snapshot(of)?));
+                match dir.read_snapshot(of) {
+                    Ok(tensors) => drop(snapshots.insert(of, Hash::of(&tensors))),
+                    Err(error) => warn!("{:#}", anyhow::Error::from(error)),
+                }
             }
         }
         for (of, earlier) in &scores {
             let missing = !snapshots.contains_key(of) && *of <= step;
             if missing && earlier.episodes.len() < experiment.episodes as usize {
-                warn!("the snapshot of step {of} is gone: its evaluation stays incomplete");
+                warn!("without the snapshot of step {of} its evaluation stays incomplete");
             }
         }
         Ok(Self { checkpoint, snapshots, scores })
@@ -142,8 +148,8 @@ impl Past {
     }
 }
 
-/// The scores of each step, which all are of the same weights, with each seed once.
-fn by_step(lines: Vec<ScoreLine>, audited: &BTreeSet<(u64, u64)>) -> anyhow::Result<BTreeMap<u64, Earlier>> {
+/// The scores of each step, which all are of the same weights, with each seed once; or what is wrong with them.
+fn by_step(lines: Vec<ScoreLine>, audited: &BTreeSet<(u64, u64)>) -> Result<BTreeMap<u64, Earlier>, String> {
     let mut scores: BTreeMap<u64, Earlier> = BTreeMap::new();
     let mut seen = BTreeSet::new();
     for line in lines {
@@ -151,10 +157,10 @@ fn by_step(lines: Vec<ScoreLine>, audited: &BTreeSet<(u64, u64)>) -> anyhow::Res
         let none = || Earlier { weights: line.weights.clone(), episodes: Vec::new(), unchecked: Vec::new() };
         let earlier = scores.entry(step).or_insert_with(none);
         if earlier.weights != line.weights {
-            bail!("scores.jsonl has scores of two different snapshots of step {step}");
+            return Err(format!("it has scores of two different snapshots of step {step}"));
         }
         if !seen.insert((step, seed)) {
-            bail!("scores.jsonl has two scores of step {step}, seed {seed}");
+            return Err(format!("it has two scores of step {step}, seed {seed}"));
         }
         let score = line.episode();
         earlier.episodes.push(score);

@@ -5,7 +5,7 @@ mod train;
 use std::io::{ErrorKind, Write};
 
 use quad_dataset::{DatasetError, environment};
-use quad_service::Hint;
+use quad_service::{Hint, hinted};
 use toml::Table;
 use tracing::{info, warn};
 
@@ -16,12 +16,19 @@ use crate::doctor;
 use crate::plot;
 use crate::presets;
 use crate::report::Report;
-use crate::run_dir::RunDir;
+use crate::run_dir::{RunDir, RunDirError};
 use crate::verify;
 
 /// Does what the command line says.
 pub fn run(cli: &Cli) -> anyhow::Result<()> {
-    match &cli.command {
+    carry_out(&cli.command).map_err(|error| match error.downcast_ref().map(RunDirError::hint) {
+        Some(hint) => hinted(error, hint),
+        None => error,
+    })
+}
+
+fn carry_out(command: &Command) -> anyhow::Result<()> {
+    match command {
         Command::Train(args) => train::train(args),
         Command::Presets(args) => list_presets(args),
         Command::Datasets(command) => datasets(command),
@@ -50,7 +57,7 @@ fn report(args: &ReportArgs) -> anyhow::Result<()> {
     // What else lies beside runs, where somebody writes `runs/*`, does not keep them from being read.
     let (runs, others): (Vec<_>, Vec<_>) = args.dirs.iter().cloned().partition(|dir| RunDir::is_occupied(dir));
     let dirs = if runs.is_empty() { &args.dirs } else { &runs };
-    let report = Report::read(dirs).hint("DIR is a folder that `learner train` has written")?;
+    let report = Report::read(dirs)?;
     for other in &others {
         warn!("there is no run in {}", other.display());
     }

@@ -4,9 +4,10 @@
 //! lease that progress extends; when the lease runs out or the evaluator leaves, they are handed out again, unless that has
 //! happened too often. For each (step, seed) the first score that is delivered counts, and no other, whoever delivers it. The
 //! current time is an argument, for tests. `job` has the rules of a lease, `jobs` who has which,
-//! `screen` which reports are accepted, `refusal` why a message is not.
+//! `ending` what becomes of a job that is not done, `screen` which reports are accepted, `refusal` why a message is not.
 
 mod audit;
+mod ending;
 mod evaluation;
 mod job;
 mod jobs;
@@ -17,10 +18,11 @@ use std::collections::{BTreeMap, BTreeSet};
 use std::time::{Duration, Instant};
 
 use quad_dataset::Task;
-use quad_protocol::{EpisodeScore, Hash, Job, JobReply, Lease, Name, Progress, ScoreReport};
+use quad_protocol::{EpisodeScore, Hash, Job, JobReply, Name, Progress, ScoreReport};
 
 pub use audit::Audited;
 use audit::Audits;
+pub use ending::{HandedBack, Lost};
 use evaluation::Evaluation;
 use job::OpenJob;
 use jobs::OpenJobs;
@@ -96,15 +98,6 @@ pub struct Recorded {
     pub evaluation_completed: Option<Vec<EpisodeScore>>,
     /// Episodes that were scored a second time.
     pub audited: Vec<Audited>,
-}
-
-/// Jobs that were taken back.
-#[derive(Clone, Debug, Default, PartialEq)]
-pub struct Lost {
-    /// How many.
-    pub jobs: usize,
-    /// Step and seed of the episodes that are not handed out any more, because they were lost too often.
-    pub given_up: Vec<(u64, u64)>,
 }
 
 /// Who wants a job: the fields of a claim, and how many others may.
@@ -212,8 +205,8 @@ impl Scoreboard {
         let id = self.next_job;
         let most = self.job_episodes(claim.present);
         let audit = self.audits.hand_out(id, claim.evaluator, claim.precision, most);
-        let newcomer = (!self.proven.contains(claim.evaluator)).then_some(now);
-        let Some(episodes) = audit.or_else(|| self.hand_out(id, most, newcomer)) else { return later };
+        let proven = self.proven.contains(claim.evaluator);
+        let Some(episodes) = audit.or_else(|| self.hand_out(id, most, proven, now)) else { return later };
         let job = OpenJob::new(claim.evaluator.clone(), claim.attempt, episodes, self.lease(claim.present), now);
         let message = self.message(id, &job, claim.present);
         self.jobs.insert(id, job);
@@ -235,10 +228,10 @@ impl Scoreboard {
     }
 
     /// Waiting episodes of the oldest step that has any.
-    fn hand_out(&mut self, job: u64, most: usize, newcomer: Option<Instant>) -> Option<(u64, Vec<u64>)> {
+    fn hand_out(&mut self, job: u64, most: usize, proven: bool, now: Instant) -> Option<(u64, Vec<u64>)> {
         let few = self.rules.job_episodes[0];
         self.evaluations.iter_mut().find_map(|(&step, evaluation)| {
-            let seeds = evaluation.hand_out(job, [few, most], newcomer);
+            let seeds = evaluation.hand_out(job, [few, most], proven, now);
             (!seeds.is_empty()).then_some((step, seeds))
         })
     }
@@ -260,15 +253,6 @@ impl Scoreboard {
             // Often enough to keep the lease.
             progress_milliseconds: among(present, TELL_PROGRESS).min(job.patience / 3).as_millis() as u64,
         })
-    }
-
-    /// Takes a job back from an evaluator that will not do it; says whether it had it.
-    pub fn hand_back(&mut self, evaluator: &Name, id: u64, lease: &Lease) -> bool {
-        let has = self.jobs.get(id).is_some_and(|job| job.evaluator == *evaluator && job.lease == *lease);
-        if has {
-            self.release(id, None);
-        }
-        has
     }
 
     /// Extends the lease of the job that an evaluator is at, if the job is further than before.
@@ -298,29 +282,6 @@ impl Scoreboard {
         });
         let evaluation_completed = if new.is_empty() { None } else { evaluation.scores() };
         Recorded { jobs_completed: jobs.len(), evaluation_completed, audited }
-    }
-
-    /// Takes back the jobs whose lease has run out.
-    pub fn expire(&mut self, now: Instant) -> Lost {
-        self.take_back(self.jobs.lost(now), now)
-    }
-
-    /// Takes back the job of an evaluator that is gone.
-    pub fn evaluator_gone(&mut self, evaluator: &Name, now: Instant) -> Lost {
-        self.proven.remove(evaluator);
-        self.take_back(self.jobs.of(evaluator).map(|(id, _)| id).into_iter().collect(), now)
-    }
-
-    fn take_back(&mut self, jobs: Vec<u64>, now: Instant) -> Lost {
-        Lost { jobs: jobs.len(), given_up: jobs.into_iter().flat_map(|id| self.release(id, Some(now))).collect() }
-    }
-
-    /// Ends a job, and lets its episodes wait for the next one; gives those that were lost too often.
-    fn release(&mut self, id: u64, lost: Option<Instant>) -> Vec<(u64, u64)> {
-        self.audits.release(id);
-        let Some(OpenJob { step, seeds, .. }) = self.jobs.remove(id) else { return Vec::new() };
-        let given_up = self.evaluations.get_mut(&step).map(|evaluation| evaluation.take_back(id, &seeds, lost));
-        given_up.unwrap_or_default().into_iter().map(|seed| (step, seed)).collect()
     }
 }
 

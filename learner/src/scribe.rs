@@ -1,6 +1,7 @@
 //! The thread that writes scores to the disk. All that came while it was at the last ones go together, in one write and one
 //! synchronisation. A slow disk delays the thanks for scores, and nothing else: jobs go out meanwhile.
 
+use std::error::Error;
 use std::sync::mpsc::{Receiver, RecvTimeoutError};
 use std::thread;
 use std::time::Duration;
@@ -10,7 +11,8 @@ use tracing::error;
 
 use crate::hub::Event;
 use crate::inbox::Inbox;
-use crate::run_dir::{AuditLine, Log, ScoreLine};
+use crate::run_dir::{AuditLine, Log, RunDirError, ScoreLine};
+use crate::trouble::Trouble;
 
 /// After a write, scores are left to gather for so long: to synchronise a file takes much of a processor, too.
 const GATHER: Duration = Duration::from_millis(50);
@@ -35,6 +37,8 @@ pub struct Scribe {
     pub lines: Receiver<Lines>,
     /// Who is told.
     pub hub: Inbox<Event>,
+    /// How the disk takes the scores.
+    pub trouble: Trouble,
 }
 
 impl Scribe {
@@ -45,12 +49,11 @@ impl Scribe {
             match self.lines.recv_timeout(beat.interval()) {
                 Ok(Lines::Scores(lines)) => {
                     let written = self.scores.append(&lines);
-                    let trouble = written.as_ref().err().map(|error| format!("scores cannot be saved: {error}"));
-                    if let Some(trouble) = &trouble {
-                        error!("{trouble}");
+                    match &written {
+                        Ok(()) => self.trouble.over(beat),
+                        Err(error) => self.trouble.refused(beat, &said(error)),
                     }
-                    beat.set_trouble(trouble);
-                    self.hub.send(Event::Written(written.map_err(|error| error.to_string())));
+                    self.hub.send(Event::Written(written.map_err(|error| said(&error))));
                     thread::sleep(GATHER);
                 }
                 Ok(Lines::Audits(lines)) => {
@@ -62,5 +65,13 @@ impl Scribe {
                 Err(RecvTimeoutError::Disconnected) => return,
             }
         }
+    }
+}
+
+/// With what the system says of it.
+fn said(error: &RunDirError) -> String {
+    match error.source() {
+        Some(cause) => format!("{error}: {cause}"),
+        None => error.to_string(),
     }
 }

@@ -29,6 +29,7 @@ use crate::scoreboard::{Rules, Scoreboard};
 use crate::scribe::Scribe;
 use crate::train::Row;
 use crate::trainer::{Trainer, TrainingResult};
+use crate::trouble::{Saved, Trouble};
 
 /// Most episodes in one job: two evaluators share an evaluation of ten. And most if hundreds wait.
 const JOB_EPISODES: [usize; 2] = [5, 40];
@@ -109,7 +110,8 @@ impl Threads {
         let audits = if audit > 0.0 { Some(dir.audit_log()?) } else { None };
         let (hub, hub_messages) = inbox();
         let (sender, lines) = channel();
-        let scribe = Scribe { scores, audits, lines, hub: hub.clone() };
+        let trouble = Trouble::new(Saved::Scores, &metrics.disk, notices.clone());
+        let scribe = Scribe { scores, audits, lines, hub: hub.clone(), trouble };
         let scribe = spawn("scribe", notices, with(health.part("scribe", STUCK), move |beat| scribe.run(beat)))?;
         let state = Hub::new(name.clone(), plan, scoreboard, sender, metrics.clone(), notices.clone());
         let hub_thread =

@@ -58,8 +58,7 @@ fn write_changed_run(path: &Path, seed: u64, shift: f64, change: impl Fn(&mut Ru
     let name = path.file_name().unwrap().to_str().unwrap();
     let mut config = config(name, seed);
     change(&mut config);
-    let run = RunDir::create(path, &config).unwrap();
-    let mut log = run.score_log().unwrap();
+    let mut log = RunDir::create(path, &config).unwrap().1;
     for n in 1..=5 {
         let mean = 2.0 * n as f64 + shift;
         log.append(&[line(1000 * n, 1, mean - 1.0), line(1000 * n, 2, mean + 1.0)]).unwrap();
@@ -190,8 +189,7 @@ fn write_paper_run(path: &Path, seed: u64, first: u64, score: impl Fn(u64) -> f6
     config.run.preset = "hopper-medium-replay-v2".into();
     config.experiment = resolve("hopper-medium-replay-v2", &Table::new()).unwrap();
     config.experiment.seed = seed;
-    let run = RunDir::create(path, &config).unwrap();
-    let mut log = run.score_log().unwrap();
+    let mut log = RunDir::create(path, &config).unwrap().1;
     for step in (first..=2_000_000).step_by(20_000) {
         let lines: Vec<_> = (0..10).map(|episode| line(step, episode, score(step) + seed as f64)).collect();
         log.append(&lines).unwrap();
@@ -317,11 +315,34 @@ fn a_folder_with_a_run_in_it_is_not_overwritten() {
     drop(run);
 }
 
+/// Both saw that it was empty.
+#[test]
+fn of_two_learners_that_begin_at_once_one_is_refused_and_changes_nothing() {
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("a");
+    std::fs::create_dir_all(&path).unwrap();
+    // What the first one does before it writes the configuration.
+    let first = RunDir::create(&path, &config("a", 0)).unwrap();
+    std::fs::remove_file(path.join("config.toml")).unwrap();
+    assert!(matches!(RunDir::create(&path, &config("a", 1)), Err(RunDirError::InUse(_))));
+    assert!(!RunDir::is_occupied(&path));
+    drop(first);
+    RunDir::create(&path, &config("a", 1)).unwrap();
+}
+
+#[test]
+fn a_new_run_does_not_take_over_scores_of_unknown_origin() {
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("a");
+    write_run(&path, 0, 0.0);
+    std::fs::remove_file(path.join("config.toml")).unwrap();
+    assert!(matches!(RunDir::create(&path, &config("a", 1)), Err(RunDirError::Occupied(_))));
+}
+
 #[test]
 fn one_learner_at_a_time_works_in_a_folder() {
     let folder = tempfile::tempdir().unwrap();
-    let run = RunDir::create(&folder.path().join("a"), &config("a", 0)).unwrap();
-    let log = run.score_log().unwrap();
+    let (run, log) = RunDir::create(&folder.path().join("a"), &config("a", 0)).unwrap();
     assert!(matches!(run.score_log(), Err(RunDirError::InUse(path)) if path == run.path()));
     drop(log);
     run.score_log().unwrap();
@@ -330,7 +351,7 @@ fn one_learner_at_a_time_works_in_a_folder() {
 #[test]
 fn metrics_of_steps_that_come_again_are_cut_off() {
     let folder = tempfile::tempdir().unwrap();
-    let run = RunDir::create(&folder.path().join("a"), &config("a", 0)).unwrap();
+    let run = RunDir::create(&folder.path().join("a"), &config("a", 0)).unwrap().0;
     let row = |step: u64| serde_json::json!({ "step": step, "seconds": step as f64 / 10.0, "eta": 1.0 });
     let (mut log, seconds) = run.metrics_log(0).unwrap();
     assert_eq!(seconds, 0.0);
@@ -348,7 +369,7 @@ fn metrics_of_steps_that_come_again_are_cut_off() {
 #[test]
 fn scores_survive_a_reopened_log_and_an_unfinished_line_is_left_out() {
     let folder = tempfile::tempdir().unwrap();
-    let run = RunDir::create(&folder.path().join("a"), &config("a", 0)).unwrap();
+    let run = RunDir::create(&folder.path().join("a"), &config("a", 0)).unwrap().0;
     run.score_log().unwrap().append(&[line(1, 1, 0.1)]).unwrap();
     run.score_log().unwrap().append(&[line(1, 2, 0.2)]).unwrap();
     let path = run.path().join("scores.jsonl");

@@ -35,7 +35,7 @@ fn config() -> RunConfig {
 
 /// A run that is as it should be, but for what is done to its lines.
 fn write(path: &Path, change: impl FnOnce(&mut Vec<ScoreLine>)) {
-    let run = RunDir::create(path, &config()).unwrap();
+    let (run, mut log) = RunDir::create(path, &config()).unwrap();
     let mut lines = Vec::new();
     for step in [10, 15] {
         let tensors = [step as u8; 100];
@@ -52,7 +52,7 @@ fn write(path: &Path, change: impl FnOnce(&mut Vec<ScoreLine>)) {
         }));
     }
     change(&mut lines);
-    run.score_log().unwrap().append(&lines).unwrap();
+    log.append(&lines).unwrap();
 }
 
 #[test]

@@ -20,7 +20,7 @@ pub enum JobRequest {
         /// The arithmetic that it computes policies in, e.g. `f32` or `bf16`.
         precision: Name,
     },
-    /// It will not do the one that it has: it is leaving, or could not do it.
+    /// It will not do the one that it has.
     HandBack {
         /// Who hands it back.
         evaluator: Name,
@@ -28,6 +28,8 @@ pub enum JobRequest {
         job: u64,
         /// [`Job::lease`].
         lease: Lease,
+        /// Why it could not do it, for people; nothing if it only leaves.
+        failed: Option<String>,
     },
 }
 

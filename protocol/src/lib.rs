@@ -36,6 +36,6 @@ pub use lease::Lease;
 pub use name::{InvalidName, Name};
 pub use origin::{Origin, OriginError};
 pub use progress::Progress;
-pub use score::{CannotAct, EpisodeScore, RecordedScores, ScoreReply, ScoreReport};
+pub use score::{EpisodeScore, RecordedScores, ScoreReply, ScoreReport};
 pub use seeds::episode_seeds;
 pub use snapshot::{Schema, Snapshot, WeightsRequest};

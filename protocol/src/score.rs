@@ -1,7 +1,7 @@
 //! Scores: an evaluator delivers them, the learner acknowledges them and publishes what it has recorded.
 
 use crate::codec::{Decode, Encode};
-use crate::{Hash, Job, Lease, Name};
+use crate::{Hash, Job, Name};
 
 /// The result of one episode.
 #[derive(Clone, Copy, Debug, PartialEq, Encode, Decode)]
@@ -36,38 +36,13 @@ pub struct ScoreReport {
     pub precision: Name,
     /// The episodes.
     pub episodes: Vec<EpisodeScore>,
-    /// Why there are none.
-    pub cannot_act: Option<CannotAct>,
 }
 
 impl ScoreReport {
     /// What `evaluator` has measured in `job`.
     pub fn of(job: &Job, evaluator: Name, precision: Name, episodes: Vec<EpisodeScore>) -> Self {
         let Job { run, incarnation, id, step, weights, .. } = job.clone();
-        Self { evaluator, run, incarnation, job: id, step, weights, precision, episodes, cannot_act: None }
-    }
-}
-
-/// The policy cannot act, because something on the way to an action is not a number. No other evaluator would fare better,
-/// so this ends the run; therefore it has to be proved that it comes from whoever had the job.
-#[derive(Clone, Debug, PartialEq, Eq, Encode, Decode)]
-pub struct CannotAct {
-    /// What is not a number.
-    pub reason: String,
-    /// Of the reason and the weights, under the job's lease.
-    pub proof: Hash,
-}
-
-impl CannotAct {
-    /// Makes the proof.
-    pub fn signed(reason: String, weights: Hash, lease: &Lease) -> Self {
-        let proof = lease.proof(&("cannot act", &reason, weights));
-        Self { reason, proof }
-    }
-
-    /// Whether the sender has the lease.
-    pub fn is_signed(&self, weights: Hash, lease: &Lease) -> bool {
-        self.proof.is(&lease.proof(&("cannot act", &self.reason, weights)))
+        Self { evaluator, run, incarnation, job: id, step, weights, precision, episodes }
     }
 }
 

@@ -82,6 +82,8 @@ fn claimed_lengths_are_not_believed() {
     claim_too_much(&Snapshot { run: name(), incarnation: 1, step: 2, schema, hash, tensors });
     let environments = vec![environment(); 3];
     claim_too_much(&JobRequest::Claim { evaluator: name(), attempt: 1, environments, precision: name() });
+    let failed = Some(environment());
+    claim_too_much(&JobRequest::HandBack { evaluator: name(), job: 1, lease: Lease::random(), failed });
     claim_too_much(&WeightsRequest { evaluator: name() });
     claim_too_much(&JobReply::Job(job));
     claim_too_much(&ScoreReport {
@@ -93,7 +95,6 @@ fn claimed_lengths_are_not_believed() {
         weights: hash,
         precision: name(),
         episodes: episodes.clone(),
-        cannot_act: Some(CannotAct { reason: environment(), proof: hash }),
     });
     claim_too_much(&ScoreReply::Refused { incarnation: 1, reason: environment() });
     claim_too_much(&RecordedScores { run: name(), step: 1, weights: hash, evaluator: name(), episodes });

@@ -73,11 +73,8 @@ fn job_request() -> impl Strategy<Value = JobRequest> {
         (name(), any::<u64>(), vec(text(), 0..5), name()).prop_map(|(evaluator, attempt, environments, precision)| {
             JobRequest::Claim { evaluator, attempt, environments, precision }
         });
-    let hand_back = (name(), any::<u64>(), lease()).prop_map(|(evaluator, job, lease)| JobRequest::HandBack {
-        evaluator,
-        job,
-        lease,
-    });
+    let hand_back = (name(), any::<u64>(), lease(), prop::option::of(text()))
+        .prop_map(|(evaluator, job, lease, failed)| JobRequest::HandBack { evaluator, job, lease, failed });
     prop_oneof![claim, hand_back]
 }
 
@@ -113,13 +110,9 @@ fn job_reply() -> impl Strategy<Value = JobReply> {
     prop_oneof![job, wait, handed_back]
 }
 
-fn cannot_act() -> impl Strategy<Value = CannotAct> {
-    (text(), hash()).prop_map(|(reason, proof)| CannotAct { reason, proof })
-}
-
 fn score_report() -> impl Strategy<Value = ScoreReport> {
-    (name(), name(), any::<[u64; 3]>(), hash(), name(), episodes(), prop::option::of(cannot_act())).prop_map(
-        |(evaluator, run, [incarnation, job, step], weights, precision, episodes, cannot_act)| ScoreReport {
+    (name(), name(), any::<[u64; 3]>(), hash(), name(), episodes()).prop_map(
+        |(evaluator, run, [incarnation, job, step], weights, precision, episodes)| ScoreReport {
             evaluator,
             run,
             incarnation,
@@ -128,7 +121,6 @@ fn score_report() -> impl Strategy<Value = ScoreReport> {
             weights,
             precision,
             episodes,
-            cannot_act,
         },
     )
 }
@@ -229,7 +221,7 @@ proptest! {
     fn progress_messages(message in progress()) { withstands_the_wire(&message)?; }
 
     #[test]
-    fn what_is_signed_is_signed_as_a_whole(message in progress(), reason in text(), other in progress()) {
+    fn what_is_signed_is_signed_as_a_whole(message in progress(), other in progress()) {
         let (mine, another) = (Lease::random(), Lease::random());
         let signed = message.clone().signed(&mine);
         prop_assert!(signed.is_signed(&mine) && !signed.is_signed(&another) && !message.is_signed(&mine));
@@ -242,10 +234,6 @@ proptest! {
         ] {
             prop_assert!(changed == signed || !changed.is_signed(&mine), "{:?}", changed);
         }
-        let weights = Hash::of(b"weights");
-        let complaint = CannotAct::signed(reason, weights, &mine);
-        prop_assert!(complaint.is_signed(weights, &mine) && !complaint.is_signed(weights, &another));
-        prop_assert!(!complaint.is_signed(Hash::of(b"others"), &mine));
     }
 
     #[test]

@@ -41,6 +41,5 @@ pub fn report(run: &Name, step: u64, seed: u64) -> ScoreReport {
         weights: Hash::of(b"guessed"),
         precision: name("f32"),
         episodes: vec![EpisodeScore { seed, episode_return: f64::NAN, length: 0, score: f64::NAN }],
-        cannot_act: None,
     }
 }

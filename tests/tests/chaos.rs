@@ -216,7 +216,6 @@ impl<L: Line> System<L> {
             weights: Hash::of(&tensors),
             precision: name(of_step[0].text("precision")),
             episodes: episodes.collect(),
-            cannot_act: None,
         };
         let query = self.router.as_ref().expect("it is there").get(keys::scores(&report.run));
         let query = query.payload(encode(&report).unwrap()).consolidation(ConsolidationMode::None);

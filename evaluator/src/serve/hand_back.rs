@@ -15,6 +15,8 @@ pub struct HandBack {
     metrics: Metrics,
     evaluator: Name,
     job: Job,
+    /// Why it could not be done, if so.
+    failed: Option<String>,
     /// Its scores, if the learner has not acknowledged them.
     scores: Option<ScoreReport>,
 }
@@ -22,7 +24,12 @@ pub struct HandBack {
 impl HandBack {
     /// Of `evaluator`'s `job`.
     pub fn new(session: Session, metrics: Metrics, evaluator: Name, job: Job) -> HandBack {
-        HandBack { session, metrics, evaluator, job, scores: None }
+        HandBack { session, metrics, evaluator, job, failed: None, scores: None }
+    }
+
+    /// The job could not be done, and why.
+    pub fn because(self, reason: String) -> HandBack {
+        HandBack { failed: Some(reason), ..self }
     }
 
     /// The job is done, and only to be handed back if these cannot be delivered.
@@ -43,7 +50,8 @@ impl HandBack {
             JobReply::HandedBack { .. } => Err("other_incarnation"),
             _ => Err("unexpected"),
         };
-        let Ok(request) = encode(&JobRequest::HandBack { evaluator: self.evaluator, job: id, lease }) else { return };
+        let (evaluator, failed) = (self.evaluator, self.failed);
+        let Ok(request) = encode(&JobRequest::HandBack { evaluator, job: id, lease, failed }) else { return };
         match ask(&self.session, keys::jobs(&run), request, patience, &self.metrics, fitting).await {
             Ok(JobReply::HandedBack { accepted: true, .. }) => info!(%run, "a job was handed back"),
             Ok(_) => debug!(%run, "a job that was to be handed back had been taken away"),

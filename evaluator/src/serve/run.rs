@@ -250,9 +250,8 @@ impl RunClient {
         let key = keys::scores(&self.run);
         let answer = ask(&self.session, key, encode(report)?, ANSWER_TIMEOUT, &self.metrics, fitting).await?;
         let (run, step) = (&self.run, report.step);
-        let accepted = matches!(answer, ScoreReply::Recorded { .. }) && report.cannot_act.is_none();
+        let accepted = matches!(answer, ScoreReply::Recorded { .. });
         match answer {
-            ScoreReply::Recorded { .. } if report.cannot_act.is_some() => {}
             ScoreReply::Recorded { new, duplicates, .. } => {
                 let scores = report.episodes.iter().map(|episode| episode.score);
                 let mean = scores.clone().sum::<f64>() / report.episodes.len().max(1) as f64;

@@ -6,8 +6,8 @@ use std::time::{Duration, Instant};
 
 use anyhow::Context;
 use quad_dataset::environment::EnvironmentSpec;
-use quad_policy::{Policy, PolicyError, Precision};
-use quad_protocol::{CannotAct, EpisodeScore, Hash, Job, Name, ScoreReport};
+use quad_policy::{Policy, Precision};
+use quad_protocol::{EpisodeScore, Hash, Job, Name, ScoreReport};
 use quad_service::Beat;
 use tokio::sync::{Notify, watch};
 use tracing::{info, warn};
@@ -189,26 +189,17 @@ impl Worker {
         let environments = environment::simulated().map(|spec| spec.name.clone()).collect();
         let Some(job) = run.claim(environments).await? else { return Ok(()) };
         self.hold(key, Some(run.hand_back(&job)));
-        let measured = self.measure(name, &job, run).await;
-        let (episodes, cannot_act) = match measured {
-            Ok(episodes) => (episodes, None),
+        let episodes = match self.measure(name, &job, run).await {
+            Ok(episodes) => episodes,
             Err(error) => {
                 self.metrics.job(JobOutcome::Failed);
-                let broken = matches!(error.downcast_ref(), Some(PolicyError::NotANumber(_)));
-                let error = error.context(format!("a job of step {} failed", job.step));
-                if !broken {
-                    self.hold(key, None);
-                    run.hand_back(&job).send(HAND_BACK).await;
-                    return Err(error);
-                }
-                // The learner must know, or it would hand the job out again and again.
-                warn!(run = %name, "{error:#}");
-                let reason = format!("{:#}", error.root_cause());
-                (Vec::new(), Some(CannotAct::signed(reason, job.weights, &job.lease)))
+                self.hold(key, None);
+                run.hand_back(&job).because(format!("{error:#}")).send(HAND_BACK).await;
+                return Err(error.context(format!("a job of step {} failed", job.step)));
             }
         };
         let Identity { evaluator, precision } = self.identity.clone();
-        let report = ScoreReport { cannot_act, ..ScoreReport::of(&job, evaluator, precision, episodes) };
+        let report = ScoreReport::of(&job, evaluator, precision, episodes);
         self.hold(key, Some(run.hand_back(&job).with_scores(report.clone())));
         run.keep(report);
         self.deliver(key, run).await

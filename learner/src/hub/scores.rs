@@ -2,8 +2,8 @@
 
 use std::collections::BTreeSet;
 use std::mem;
+use std::time::Instant;
 
-use anyhow::anyhow;
 use quad_protocol::{EpisodeScore, Name, RecordedScores, ScoreReply, ScoreReport, encode, keys};
 use tracing::{debug, error};
 use zenoh::Wait;
@@ -11,6 +11,7 @@ use zenoh::qos::CongestionControl;
 
 use super::Hub;
 use super::rejection::Rejection;
+use crate::conduct::DISK_PATIENCE;
 use crate::notice::Notice;
 use crate::replies::Question;
 use crate::run_dir::{AuditLine, ScoreLine};
@@ -24,6 +25,8 @@ pub(super) struct Delivered {
     staged: Vec<(Question, ScoreReport, Screened)>,
     /// In the write that goes on now.
     in_writing: Vec<(Question, ScoreReport, Screened)>,
+    /// Since when.
+    since: Option<Instant>,
     /// Step and seed of the new scores of both.
     keys: BTreeSet<(u64, u64)>,
 }
@@ -33,23 +36,22 @@ impl Delivered {
     pub fn is_waiting(&self) -> bool {
         !self.staged.is_empty() || !self.in_writing.is_empty()
     }
+
+    /// Whether the write takes longer than a disk that works.
+    pub fn hangs(&self, now: Instant) -> bool {
+        !self.in_writing.is_empty() && self.since.is_some_and(|since| now - since > DISK_PATIENCE)
+    }
 }
 
 impl Hub {
     /// Checks a report. New scores wait for [`commit`](Self::commit); everything else is answered at once.
     pub(super) fn report(&mut self, question: Question, report: ScoreReport) {
         let reply = match self.screen(&report) {
-            Ok(Some(screened)) if screened.new.is_empty() => Ok(self.record(&report, screened, &mut None)),
-            Ok(Some(screened)) => {
+            Ok(screened) if screened.new.is_empty() => Ok(self.record(&report, screened, &mut None)),
+            Ok(screened) => {
+                self.scoreboard.keep(&report, Instant::now());
                 self.delivered.keys.extend(screened.new.iter().map(|score| (report.step, score.seed)));
                 return self.delivered.staged.push((question, report, screened));
-            }
-            Ok(None) => {
-                let reason = report.cannot_act.as_ref().map(|complaint| complaint.reason.as_str()).unwrap_or_default();
-                let (step, evaluator) = (report.step, &report.evaluator);
-                let broken = anyhow!("the policy of step {step} cannot act: {reason} (evaluator {evaluator})");
-                self.notices.send(Notice::Failed(broken)).ok();
-                Ok(ScoreReply::Recorded { incarnation: self.scoreboard.incarnation(), new: 0, duplicates: 0 })
             }
             Err(Rejection::Refused(refusal)) => {
                 self.reject(&Rejection::Refused(refusal));
@@ -60,26 +62,24 @@ impl Hub {
         self.answer(question, keys::scores(&self.run), reply.map(|reply| (reply, report.evaluator)));
     }
 
-    /// What is new in a report; nothing if it says why there are no scores.
-    fn screen(&self, report: &ScoreReport) -> Result<Option<Screened>, Rejection> {
-        if report.cannot_act.is_some() {
-            self.scoreboard.screen_complaint(report)?;
-            return Ok(None);
-        }
-        // Whether these count is decided when the others are on the disk.
+    /// What is new in a report.
+    fn screen(&mut self, report: &ScoreReport) -> Result<Screened, Rejection> {
+        let screened = self.scoreboard.screen(report)?;
+        // Whether these count is decided when the others are on the disk. The others may be the same, delivered before.
         if report.episodes.iter().any(|score| self.delivered.keys.contains(&(report.step, score.seed))) {
+            self.scoreboard.keep(report, Instant::now());
             return Err(Rejection::InWriting);
         }
-        Ok(Some(self.scoreboard.screen(report)?))
+        Ok(screened)
     }
 
     /// Has the new scores that came meanwhile written to the disk, all together, unless others are being written now.
     pub(super) fn commit(&mut self) {
-        let Delivered { staged, in_writing, .. } = &mut self.delivered;
+        let Delivered { staged, in_writing, since, .. } = &mut self.delivered;
         if staged.is_empty() || !in_writing.is_empty() {
             return;
         }
-        *in_writing = mem::take(staged);
+        (*in_writing, *since) = (mem::take(staged), Some(Instant::now()));
         let of = |(_, report, screened): &(_, ScoreReport, Screened)| {
             screened.new.iter().map(|score| ScoreLine::new(report, score)).collect::<Vec<_>>()
         };
@@ -98,7 +98,10 @@ impl Hub {
             let reply = match written {
                 Ok(()) => Ok(self.record(&report, screened, &mut completed)),
                 // Nothing is counted, so the scores are new again when the evaluator delivers them once more.
-                Err(error) => Err(Rejection::NotSaved(error.clone())),
+                Err(error) => {
+                    self.scoreboard.keep(&report, Instant::now());
+                    Err(Rejection::NotSaved(error.clone()))
+                }
             };
             self.answer(question, keys::scores(&self.run), reply.map(|reply| (reply, report.evaluator)));
             if let Some(notice) = completed {

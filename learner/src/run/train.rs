@@ -44,7 +44,7 @@ pub fn train(args: &TrainArgs) -> anyhow::Result<()> {
         None => default_run_dir(&args.preset, &experiment)?,
     };
     let name = run_name(&path)?;
-    let begun = resume::open(path.clone())?;
+    let begun = resume::open(&path, args.fresh)?;
     let endpoints = endpoints(args, experiment.eval_interval)?;
 
     args.device.check(experiment.precision)?;
@@ -55,7 +55,7 @@ pub fn train(args: &TrainArgs) -> anyhow::Result<()> {
     let transitions = read_dataset(&dataset.path, &options)?;
     check_batch(&transitions, &experiment).hint("record more data, or ask for less with --set batch_size=N")?;
     let config = run_config(args, &name, experiment, dataset, &transitions)?;
-    if let Some(begun) = begun.as_ref().filter(|_| !args.fresh) {
+    if let Some(begun) = &begun {
         begun.check_same(&config)?;
     }
     info!("{}", config.dataset.summary());
@@ -144,8 +144,7 @@ fn take_up(path: &Path, begun: Option<Begun>, fresh: bool, config: &RunConfig) -
         Some(begun) => begun.set_aside()?,
         None => {}
     }
-    let run_dir = RunDir::create(path, config).hint("choose a folder that you may write to with --run-dir DIR")?;
-    let scores = run_dir.score_log()?;
+    let (run_dir, scores) = RunDir::create(path, config)?;
     Ok((run_dir, scores, Past::default()))
 }
 

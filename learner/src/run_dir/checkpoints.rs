@@ -45,10 +45,22 @@ impl Checkpoints {
         Ok(())
     }
 
-    /// The newest that is whole. Those that are not get another ending, so that they do not count as checkpoints any more.
+    /// The newest that is whole. Those that are not get another ending, so that they do not count as checkpoints any more;
+    /// those that cannot be read stay as they are.
+    ///
+    /// # Errors
+    /// None is whole, and one cannot be read: it may be readable later, and a run should not begin anew before.
     pub fn newest(&self) -> Result<Option<Checkpoint>, RunDirError> {
+        let mut unreadable = None;
         for path in self.files()? {
-            let state = fs::read(&path).map_err(io_error("read", &path))?;
+            let state = match fs::read(&path) {
+                Ok(state) => state,
+                Err(error) => {
+                    warn!("{} cannot be read ({error}); the checkpoint before it is taken", path.display());
+                    unreadable.get_or_insert(io_error("read", &path)(error));
+                    continue;
+                }
+            };
             let found = step(&path).map(|step| Checkpoint { step, state });
             if let Some(whole) = found.filter(|found| path.ends_with(file_name(found))) {
                 return Ok(Some(whole));
@@ -56,7 +68,7 @@ impl Checkpoints {
             warn!("{} is damaged; the checkpoint before it is taken", path.display());
             fs::rename(&path, path.with_extension("damaged")).map_err(io_error("rename", &path))?;
         }
-        Ok(None)
+        unreadable.map_or(Ok(None), Err)
     }
 
     /// All of them, newest first.
@@ -115,5 +127,19 @@ mod tests {
         assert_eq!(checkpoints.files().unwrap(), files[2..], "damaged ones do not take the place of good ones");
         fs::remove_file(&files[2]).unwrap();
         assert_eq!(checkpoints.newest().unwrap(), None);
+    }
+
+    #[test]
+    fn one_that_cannot_be_read_falls_back_and_does_not_count_as_none() {
+        let folder = tempfile::tempdir().unwrap();
+        let checkpoints = Checkpoints::of_run(folder.path());
+        // A folder cannot be read as a file, not even by root.
+        let unreadable = checkpoints.folder.join("step_000000300_00.safetensors");
+        fs::create_dir_all(&unreadable).unwrap();
+        let error = checkpoints.newest().unwrap_err();
+        assert!(matches!(error, RunDirError::Io { action: "read", ref path, .. } if *path == unreadable), "{error}");
+        checkpoints.save(&checkpoint(200)).unwrap();
+        assert_eq!(checkpoints.newest().unwrap(), Some(checkpoint(200)));
+        assert!(unreadable.exists());
     }
 }

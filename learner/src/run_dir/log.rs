@@ -46,6 +46,11 @@ impl Log {
         Ok(log)
     }
 
+    /// Whether there is no whole line in it.
+    pub fn is_empty(&self) -> bool {
+        self.length == 0
+    }
+
     /// Appends lines: all of them, or none if it fails.
     pub fn append<T: Serialize>(&mut self, lines: &[T]) -> Result<(), RunDirError> {
         let mut text = Vec::new();

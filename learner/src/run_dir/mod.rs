@@ -15,6 +15,7 @@
 
 mod checkpoints;
 mod durable;
+mod error;
 mod lines;
 mod log;
 
@@ -29,39 +30,10 @@ use crate::config::RunConfig;
 pub use checkpoints::Checkpoint;
 use checkpoints::Checkpoints;
 use durable::replace;
+pub use error::RunDirError;
+use error::{content, io_error};
 pub use lines::{AuditLine, RunEndpoints, ScoreLine};
 pub use log::Log;
-
-/// A run folder that cannot be used.
-#[derive(Debug, thiserror::Error)]
-pub enum RunDirError {
-    /// There is a run in it.
-    #[error("there is already a run in {0}")]
-    Occupied(PathBuf),
-    /// Another learner works in it.
-    #[error("another learner is at work in {0}")]
-    InUse(PathBuf),
-    /// Reading or writing failed.
-    #[error("cannot {action} {path}")]
-    Io {
-        /// The operation: "read", "write" …
-        action: &'static str,
-        /// The file.
-        path: PathBuf,
-        /// The system's error.
-        source: io::Error,
-    },
-    /// A file of the run has contents that no learner writes.
-    #[error("{path}{} is not what a learner writes: {reason}", line.map(|n| format!(", line {n},")).unwrap_or_default())]
-    Content {
-        /// Which file.
-        path: PathBuf,
-        /// Which line, from 1.
-        line: Option<usize>,
-        /// What is wrong.
-        reason: String,
-    },
-}
 
 /// The folder of one run.
 #[derive(Clone, Debug)]
@@ -75,22 +47,33 @@ impl RunDir {
         path.join("config.toml").exists()
     }
 
-    /// Makes the folder and saves the configuration.
+    /// Makes the folder, locks it and saves the configuration; also gives `scores.jsonl`, which holds the lock.
     ///
     /// # Errors
-    /// There is a run in it, or it cannot be written to.
-    pub fn create(path: &Path, config: &RunConfig) -> Result<Self, RunDirError> {
+    /// There is a run in it, another learner is just making one, or it cannot be written to.
+    pub fn create(path: &Path, config: &RunConfig) -> Result<(Self, Log), RunDirError> {
+        let occupied = || RunDirError::Occupied(path.to_owned());
         if Self::is_occupied(path) {
-            return Err(RunDirError::Occupied(path.to_owned()));
+            return Err(occupied());
         }
-        let run = Self { path: path.to_owned() };
+        let run = Self::at(path);
         let snapshots = path.join("snapshots");
         durable::create_folder(&snapshots).map_err(io_error("create", &snapshots))?;
+        // Of two that begin at once, only one gets past this; and scores of unknown origin are not those of a new run.
+        let scores = run.score_log()?;
+        if Self::is_occupied(path) || !scores.is_empty() {
+            return Err(occupied());
+        }
         let target = path.join("config.toml");
         let text = toml::to_string(config).map_err(|error| content(&target, None, &error))?;
         replace(&target, text.as_bytes())?;
         durable::synchronise_folder(path).map_err(io_error("write", path))?;
-        Ok(run)
+        Ok((run, scores))
+    }
+
+    /// The folder, whatever is in it.
+    pub(crate) fn at(path: &Path) -> Self {
+        Self { path: path.to_owned() }
     }
 
     /// Renames the folder to one that says that it is older; gives the new path.
@@ -110,10 +93,16 @@ impl RunDir {
 
     /// A folder that a learner has written; reads its configuration.
     pub fn open(path: &Path) -> Result<(Self, RunConfig), RunDirError> {
-        let source = path.join("config.toml");
+        let run = Self::at(path);
+        let config = run.read_config()?;
+        Ok((run, config))
+    }
+
+    /// The configuration that the run began with.
+    pub(crate) fn read_config(&self) -> Result<RunConfig, RunDirError> {
+        let source = self.path.join("config.toml");
         let text = fs::read_to_string(&source).map_err(io_error("read", &source))?;
-        let config = toml::from_str(&text).map_err(|error| content(&source, None, &error))?;
-        Ok((Self { path: path.to_owned() }, config))
+        toml::from_str(&text).map_err(|error| content(&source, None, &error))
     }
 
     /// The folder's path.
@@ -224,6 +213,11 @@ impl RunDir {
         self.read_lines("scores.jsonl")
     }
 
+    /// The error for `scores.jsonl` whose lines do not go together.
+    pub(crate) fn broken_scores(&self, reason: String) -> RunDirError {
+        content(&self.path.join("scores.jsonl"), None, &reason)
+    }
+
     /// The lines of `audits.jsonl`, likewise. The file is not synchronised, so a power cut may leave anything in it: what is
     /// no such line is left out.
     pub fn read_audits(&self) -> Result<Vec<AuditLine>, RunDirError> {
@@ -248,13 +242,4 @@ impl RunDir {
         };
         complete.lines().enumerate().map(parse).collect()
     }
-}
-
-fn io_error(action: &'static str, path: &Path) -> impl FnOnce(io::Error) -> RunDirError {
-    let path = path.to_owned();
-    move |source| RunDirError::Io { action, path, source }
-}
-
-fn content(path: &Path, line: Option<usize>, error: &dyn std::fmt::Display) -> RunDirError {
-    RunDirError::Content { path: path.to_owned(), line, reason: error.to_string() }
 }

@@ -9,7 +9,8 @@ use quad_protocol::{EpisodeScore, Hash};
 /// An episode whose evaluator was lost so often is not handed out any more: it may be what they are lost of.
 const MOST_ATTEMPTS: u32 = 20;
 /// Lost more often than this, an episode rests before it goes to somebody who has scored nothing yet. Else one machine that
-/// fails again and again, under a new name each time, would soon have taken all attempts.
+/// fails again and again, under a new name each time, would soon have taken all attempts. It rests for all if somebody could
+/// not do it who has scored others: then something else may be wrong, which passes, like a disk that snapshots are read from.
 const ATTEMPTS_AT_ONCE: u32 = 3;
 const LONGEST_REST: Duration = Duration::from_secs(60);
 
@@ -29,18 +30,43 @@ pub(super) struct Evaluation {
 struct Episode {
     seed: u64,
     state: EpisodeState,
-    /// How often an evaluator that had it was lost.
+    /// How often an evaluator that had it was lost, or could not do it.
     lost: u32,
-    /// Until then, it rests.
-    rests_until: Option<Instant>,
+    /// Until then it rests, and whether for all.
+    rests: Option<(Instant, bool)>,
+}
+
+/// How a job ended that had episodes without a score.
+#[derive(Clone, Copy, Debug)]
+pub(super) enum Ended {
+    /// Its evaluator left in order.
+    HandedBack,
+    /// Its evaluator was lost.
+    Lost(Instant),
+    /// Its evaluator could not do it.
+    Failed {
+        /// When it said so.
+        now: Instant,
+        /// Whether it has scored others.
+        proven: bool,
+    },
 }
 
 impl Episode {
-    fn is_lost(&mut self, now: Instant) {
+    fn job_ended(&mut self, ended: Ended) {
+        let (now, for_all) = match ended {
+            Ended::HandedBack => return,
+            Ended::Lost(now) => (now, false),
+            Ended::Failed { now, proven } => (now, proven),
+        };
         self.lost += 1;
         let doublings = self.lost.saturating_sub(ATTEMPTS_AT_ONCE).min(16);
         let rest = (doublings > 0).then(|| Duration::from_secs(1 << doublings).min(LONGEST_REST));
-        self.rests_until = rest.map(|rest| now + rest);
+        self.rests = rest.map(|rest| (now + rest, for_all));
+    }
+
+    fn rests(&self, proven: bool, now: Instant) -> bool {
+        self.rests.is_some_and(|(until, for_all)| now < until && (for_all || !proven))
     }
 }
 
@@ -61,7 +87,7 @@ impl Evaluation {
         let episode = |&seed| {
             let score = scores.iter().find(|score| score.seed == seed);
             let state = score.map_or(EpisodeState::Waiting, |score| EpisodeState::Scored(*score));
-            Episode { seed, state, lost: 0, rests_until: None }
+            Episode { seed, state, lost: 0, rests: None }
         };
         let episodes: Vec<Episode> = seeds.iter().map(episode).collect();
         let places = seeds.iter().enumerate().map(|(place, &seed)| (seed, place)).collect();
@@ -100,14 +126,12 @@ impl Evaluation {
         self.given_up.iter().map(|&place| self.episodes[place].seed)
     }
 
-    /// Hands out some of the episodes that wait; none if there are none. A `few` at most, if an evaluator was lost with the
-    /// first of them: should it be what it was lost of, the fewer suffer. To somebody who has scored nothing yet, a
-    /// `newcomer` at this time, those that rest are not handed out.
-    pub fn hand_out(&mut self, job: u64, [few, most]: [usize; 2], newcomer: Option<Instant>) -> Vec<u64> {
-        let rests = |place: &usize| {
-            newcomer.is_some_and(|now| self.episodes[*place].rests_until.is_some_and(|rested| now < rested))
-        };
-        let mut ready = self.waiting.iter().copied().filter(|place| !rests(place)).peekable();
+    /// Hands out some of the episodes that wait, without those that rest; none if there are none. A `few` at most, if an
+    /// evaluator was lost with the first of them: should it be what it was lost of, the fewer suffer. `proven` is somebody who
+    /// has scored others.
+    pub fn hand_out(&mut self, job: u64, [few, most]: [usize; 2], proven: bool, now: Instant) -> Vec<u64> {
+        let ready = self.waiting.iter().copied().filter(|place| !self.episodes[*place].rests(proven, now));
+        let mut ready = ready.peekable();
         let lost = ready.peek().is_some_and(|&place| self.episodes[place].lost > 0);
         let places: Vec<usize> = ready.take(if lost { few } else { most }).collect();
         for &place in &places {
@@ -116,17 +140,14 @@ impl Evaluation {
         places.into_iter().map(|place| self.episodes[place].seed).collect()
     }
 
-    /// Takes those of a job's episodes back that have no score yet, from an evaluator that was `lost` with them at some time,
-    /// or was not. Gives the seeds of those that were lost too often.
-    pub fn take_back(&mut self, job: u64, seeds: &[u64], lost: Option<Instant>) -> Vec<u64> {
+    /// Takes those of a job's episodes back that have no score yet. Gives the seeds of those that were lost too often.
+    pub fn take_back(&mut self, job: u64, seeds: &[u64], ended: Ended) -> Vec<u64> {
         let mut given_up = Vec::new();
         for &seed in seeds {
             let Some(&place) = self.places.get(&seed) else { continue };
             let episode = &mut self.episodes[place];
             if matches!(episode.state, EpisodeState::HandedOut { job: of } if of == job) {
-                if let Some(now) = lost {
-                    episode.is_lost(now);
-                }
+                episode.job_ended(ended);
                 let hopeless = episode.lost >= MOST_ATTEMPTS;
                 given_up.extend(hopeless.then_some(seed));
                 self.change(place, if hopeless { EpisodeState::GivenUp } else { EpisodeState::Waiting });

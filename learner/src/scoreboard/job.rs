@@ -54,8 +54,12 @@ impl OpenJob {
         let begins = self.done == (0, 0) && steps == 0 && episodes == 0;
         require(begins || steps > self.done.0 || episodes > self.done.1, Refusal::NotAdvanced)?;
         self.done = (steps.max(self.done.0), episodes.max(self.done.1));
-        let longest = if begins { PREPARATION } else { Job::LONGEST };
-        self.lease_until = self.lease_until.max((now + self.patience).min(self.handed_out + longest));
+        self.extend(now, if begins { PREPARATION } else { Job::LONGEST });
         Ok(())
+    }
+
+    /// Extends the lease, until `longest` after the job was handed out.
+    pub fn extend(&mut self, now: Instant, longest: Duration) {
+        self.lease_until = self.lease_until.max((now + self.patience).min(self.handed_out + longest));
     }
 }

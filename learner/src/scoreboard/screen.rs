@@ -40,17 +40,6 @@ impl Scoreboard {
         Ok(screened)
     }
 
-    /// Checks a report that says why there are no scores. It ends the run, so only whoever has the job may send it.
-    pub fn screen_complaint(&self, report: &ScoreReport) -> Result<(), Refusal> {
-        self.screen(report)?;
-        require(report.incarnation == self.rules.incarnation, Refusal::Incarnation)?;
-        let job = self.jobs.get(report.job).ok_or(Refusal::Job)?;
-        require(job.evaluator == report.evaluator, Refusal::Evaluator)?;
-        require(job.step == report.step, Refusal::Step)?;
-        let signed = report.cannot_act.as_ref().is_some_and(|reason| reason.is_signed(report.weights, &job.lease));
-        require(signed, Refusal::Proof)
-    }
-
     fn is_possible(&self, score: &EpisodeScore) -> bool {
         let task = &self.rules.task;
         let expected = task.score(score.episode_return);

@@ -14,6 +14,7 @@ use quad_learner::publisher::{self, Identity, Kept, SnapshotPublisher};
 use quad_learner::run_dir::{Log, RunDir};
 use quad_learner::scoreboard::{Rules, Scoreboard};
 use quad_learner::scribe::{Lines, Scribe};
+use quad_learner::trouble::{Saved, Trouble};
 use quad_learner::wire::{Life, Wire};
 use quad_protocol::{
     Hash, Job, JobReply, JobRequest, Message, Name, Origin, ScoreReply, ScoreReport, decode, encode, keys,
@@ -65,10 +66,10 @@ pub fn file(step: u64) -> Vec<u8> {
 }
 
 /// Starts a scribe whose disk can hang.
-fn scribe(scores: Log, hub: Inbox<hub::Event>, disk: Arc<Mutex<usize>>) -> Sender<Lines> {
+fn scribe(scores: Log, hub: Inbox<hub::Event>, trouble: Trouble, disk: Arc<Mutex<usize>>) -> Sender<Lines> {
     let (sender, before) = channel();
     let (forward, lines) = channel();
-    std::thread::spawn(move || Scribe { scores, audits: None, lines, hub }.run(&beat()));
+    std::thread::spawn(move || Scribe { scores, audits: None, lines, hub, trouble }.run(&beat()));
     std::thread::spawn(move || {
         for lines in before {
             *disk.blocking_lock() += 1;
@@ -85,9 +86,14 @@ impl Bench {
     }
 
     pub async fn with_lease(lease: Duration) -> Self {
+        Self::with(lease, 0.0).await
+    }
+
+    /// With this share of the episodes scored twice.
+    pub async fn with(lease: Duration, audit: f64) -> Self {
         let folder = tempfile::tempdir().unwrap();
         let run = name("bench");
-        let run_dir = RunDir::create(&folder.path().join("bench"), &config()).unwrap();
+        let (run_dir, scores) = RunDir::create(&folder.path().join("bench"), &config()).unwrap();
         let (metrics, _) = Metrics::new(&run, 100, &[]).unwrap();
         let (notify, notices) = tokio::sync::mpsc::unbounded_channel();
         let task = quad_dataset::Task::from(quad_dataset::environment::find("hopper").unwrap());
@@ -99,12 +105,13 @@ impl Bench {
             candidates: 3,
             job_episodes: [2, 2],
             lease,
-            audit: 0.0,
+            audit,
         };
         let plan = EvaluationPlan { seed: 1, episodes: 4 };
         let (hub, messages) = inbox();
         let disk = Arc::new(Mutex::new(0));
-        let scribe = scribe(run_dir.score_log().unwrap(), hub.clone(), disk.clone());
+        let trouble = Trouble::new(Saved::Scores, &metrics.disk, notify.clone());
+        let scribe = scribe(scores, hub.clone(), trouble, disk.clone());
         let state = Hub::new(run.clone(), plan, Scoreboard::new(rules), scribe, metrics.clone(), notify.clone());
         std::thread::spawn(move || state.run(&messages, &beat()));
         let identity = Identity { run: run.clone(), incarnation: INCARNATION, task };

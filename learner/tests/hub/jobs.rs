@@ -4,7 +4,7 @@ use std::time::Instant;
 
 use quad_learner::hub;
 use quad_learner::notice::Notice;
-use quad_protocol::{JobReply, JobRequest, Lease, Progress, encode, keys};
+use quad_protocol::{Job, JobReply, JobRequest, Lease, Progress, encode, keys};
 
 use crate::bench::{Bench, INCARNATION, LEASE, PATIENCE, ask_for_job, claim, claim_eventually, claim_message, deliver};
 use crate::common::{full_report, name, progress};
@@ -64,13 +64,39 @@ async fn a_claim_is_answered_twice_with_one_job_which_can_be_handed_back() {
     let other = ask_for_job(&client, &bench.run, &claim_message("a", 2)).await;
     assert!(matches!(other, JobReply::Wait { incarnation: INCARNATION, .. }), "{other:?}");
 
-    let hand_back = |lease| JobRequest::HandBack { evaluator: name("a"), job: job.id, lease };
+    let hand_back = |lease| JobRequest::HandBack { evaluator: name("a"), job: job.id, lease, failed: None };
     for (lease, expected) in [(Lease::random(), false), (job.lease.clone(), true), (job.lease.clone(), false)] {
         let reply = ask_for_job(&client, &bench.run, &hand_back(lease)).await;
         assert!(matches!(reply, JobReply::HandedBack { accepted, .. } if accepted == expected), "{reply:?}");
     }
     assert_eq!(bench.metrics.evaluation.jobs_handed_back.get(), 1);
     assert_eq!(claim_eventually(&client, &bench.run, "b").await.seeds, job.seeds);
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn a_job_that_an_evaluator_could_not_do_goes_to_others_and_its_reason_is_told_once() {
+    let mut bench = Bench::with_lease(PATIENCE).await;
+    let client = bench.client().await;
+    bench.snapshot(10).await;
+    let mut seeds = Vec::new();
+    for evaluator in ["a", "b"] {
+        let Job { id: job, lease, seeds: of_job, .. } = claim_eventually(&client, &bench.run, evaluator).await;
+        seeds.push(of_job);
+        let reason = format!("the policy\u{1b}[2J cannot act, says {evaluator}\n{}", "x".repeat(10_000));
+        let request = JobRequest::HandBack { evaluator: name(evaluator), job, lease, failed: Some(reason) };
+        let reply = ask_for_job(&client, &bench.run, &request).await;
+        assert!(matches!(reply, JobReply::HandedBack { accepted: true, .. }), "{reply:?}");
+    }
+    let job = claim_eventually(&client, &bench.run, "c").await;
+    assert_eq!(seeds, [job.seeds.clone(), job.seeds]);
+    let told = bench.until(|notice| matches!(notice, Notice::JobFailed { .. } | Notice::Failed(_))).await;
+    let Notice::JobFailed { step: 10, evaluator, reason } = told else { panic!("{told:?}") };
+    assert_eq!(evaluator, name("a"));
+    assert!(reason.starts_with("the policy[2J cannot act, says axxx") && reason.len() == 300, "{reason}");
+    assert_eq!(bench.metrics.evaluation.jobs_failed.get(), 2);
+    bench.hub.send(hub::Event::TrainingCompleted);
+    let next = bench.until(|notice| !matches!(notice, Notice::EvaluatorJoined(_))).await;
+    assert!(matches!(next, Notice::Trained { pending: 4 }), "the second is not told, and the run goes on: {next:?}");
 }
 
 #[tokio::test(flavor = "multi_thread")]

@@ -1,12 +1,13 @@
 //! Reports are taken in, or refused and counted.
 
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
+use quad_learner::hub;
 use quad_learner::notice::Notice;
 use quad_learner::publisher;
-use quad_protocol::{CannotAct, Hash, JobReply, RecordedScores, ScoreReply, ScoreReport, decode, encode, keys};
+use quad_protocol::{Hash, JobReply, RecordedScores, ScoreReply, ScoreReport, decode, encode, keys};
 
-use crate::bench::{Bench, INCARNATION, PATIENCE, ask, claim_eventually, claim_message, deliver, file};
+use crate::bench::{Bench, INCARNATION, LEASE, PATIENCE, ask, claim_eventually, claim_message, deliver, file};
 use crate::common::{full_report, name};
 
 #[tokio::test(flavor = "multi_thread")]
@@ -41,24 +42,6 @@ async fn a_job_goes_out_and_its_scores_are_on_disk_before_the_thanks() {
     assert_eq!(bench.metrics.evaluation.step.get(), 10);
     bench.publisher.send(publisher::Event::TrainingCompleted);
     bench.until(|notice| matches!(notice, Notice::Settled)).await;
-}
-
-#[tokio::test(flavor = "multi_thread")]
-async fn a_policy_that_cannot_act_ends_the_run_with_the_reason() {
-    let mut bench = Bench::start().await;
-    let client = bench.client().await;
-    bench.snapshot(1000).await;
-    let job = claim_eventually(&client, &bench.run, "a").await;
-    let reason = "a value of a candidate is not a number (NaN)".to_owned();
-    let complaint = CannotAct::signed(reason, job.weights, &job.lease);
-    let forged = CannotAct { proof: Hash::of(b"guessed"), ..complaint.clone() };
-    let broken = ScoreReport { episodes: Vec::new(), cannot_act: Some(complaint), ..full_report(&job, "a") };
-    let stranger = ScoreReport { cannot_act: Some(forged), ..broken.clone() };
-    assert!(matches!(deliver(&client, &stranger).await, ScoreReply::Refused { .. }), "it has not the job's lease");
-    assert_eq!(bench.rejected("wrong_proof"), 1);
-    deliver(&client, &broken).await;
-    bench.until(|notice| matches!(notice, Notice::Failed(error) if error.to_string().contains("step 1000 cannot act: a value")))
-        .await;
 }
 
 #[tokio::test(flavor = "multi_thread")]
@@ -120,4 +103,52 @@ async fn while_the_disk_hangs_jobs_go_out_and_scores_wait_to_be_written_together
         assert!(matches!(delivered.await.unwrap(), ScoreReply::Recorded { new: 2, duplicates: 0, .. }));
     }
     assert_eq!((bench.lines(), *disk.lock().await), (8, 2), "lines, writes");
+}
+
+/// An evaluator that has done its job keeps it, for as long as it asks, though another one would be lost after this lease.
+#[tokio::test(flavor = "multi_thread")]
+async fn while_scores_cannot_be_saved_their_job_is_not_lost() {
+    let mut bench = Bench::start().await;
+    let client = bench.client().await;
+    bench.snapshot(10).await;
+    let job = claim_eventually(&client, &bench.run, "a").await;
+    let report = full_report(&job, "a");
+    let disk = bench.disk.clone();
+    let hanging = disk.lock().await;
+    let (asker, first) = (client.clone(), report.clone());
+    let delivered = tokio::spawn(async move { deliver(&asker, &first).await });
+    let begin = Instant::now();
+    while begin.elapsed() < 4 * LEASE {
+        let message = encode(&report).unwrap();
+        let again = ask::<ScoreReply>(&client, keys::scores(&bench.run), Some(message)).await.unwrap();
+        assert!(again.unwrap_err().contains("being written"));
+        tokio::time::sleep(LEASE / 8).await;
+    }
+    assert_eq!(bench.metrics.evaluation.jobs_expired.get(), 0);
+    drop(hanging);
+    assert!(matches!(delivered.await.unwrap(), ScoreReply::Recorded { new: 2, .. }));
+    assert_eq!(bench.metrics.evaluation.jobs_completed.get(), 1);
+}
+
+/// They come back in a moment, as after a restart of the learner or of its router.
+#[tokio::test(flavor = "multi_thread")]
+async fn the_last_audits_are_waited_for_though_nobody_is_there() {
+    let mut bench = Bench::with(PATIENCE, 1.0).await;
+    let client = bench.client().await;
+    bench.snapshot(10).await;
+    for _ in 0..2 {
+        let job = claim_eventually(&client, &bench.run, "a").await;
+        deliver(&client, &full_report(&job, "a")).await;
+    }
+    bench.hub.send(hub::Event::TrainingCompleted);
+    bench.until(|notice| matches!(notice, Notice::Trained { pending: 0 })).await;
+    assert_eq!(bench.metrics.evaluators.present.get(), 0, "without a token, nobody is seen");
+    let early = tokio::time::timeout(Duration::from_secs(1), bench.until(|notice| matches!(notice, Notice::Settled)));
+    assert!(early.await.is_err(), "the audits are not waited for");
+    for _ in 0..2 {
+        let job = claim_eventually(&client, &bench.run, "b").await;
+        deliver(&client, &full_report(&job, "b")).await;
+    }
+    bench.until(|notice| matches!(notice, Notice::Settled)).await;
+    assert_eq!(bench.metrics.evaluation.audits(true).get(), 4);
 }

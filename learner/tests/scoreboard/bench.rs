@@ -2,7 +2,7 @@
 
 use std::time::{Duration, Instant};
 
-use quad_learner::scoreboard::{Claim, Lost, Recorded, Refusal, Rules, Scoreboard, Screened};
+use quad_learner::scoreboard::{Claim, HandedBack, Lost, Recorded, Refusal, Rules, Scoreboard, Screened};
 use quad_protocol::{Hash, Job, JobReply, Progress, ScoreReport};
 
 use crate::common::name;
@@ -76,9 +76,20 @@ impl Bench {
         self.board.progress(progress, now)
     }
 
+    /// At some second, if the job failed.
+    pub fn hand_back(&mut self, evaluator: &str, job: &Job, failed: Option<u64>) -> Option<HandedBack> {
+        let failed = failed.map(|seconds| self.at(seconds));
+        self.board.hand_back(&name(evaluator), job.id, &job.lease, failed)
+    }
+
     pub fn gone(&mut self, evaluator: &str, seconds: u64) -> Lost {
         let now = self.at(seconds);
         self.board.evaluator_gone(&name(evaluator), now)
+    }
+
+    pub fn keep(&mut self, report: &ScoreReport, seconds: u64) {
+        let now = self.at(seconds);
+        self.board.keep(report, now);
     }
 
     pub fn expire(&mut self, seconds: u64) -> usize {

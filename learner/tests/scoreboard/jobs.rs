@@ -1,8 +1,8 @@
 //! Which episodes are handed out, to whom, how often.
 
 use quad_learner::resume::Earlier;
-use quad_learner::scoreboard::{Claim, Lost};
-use quad_protocol::{JobReply, Lease};
+use quad_learner::scoreboard::{Claim, HandedBack, Lost};
+use quad_protocol::{Job, JobReply, Lease};
 
 use crate::bench::{Bench, INCARNATION, LEASE, hash};
 use crate::common::{full_report, name, report, score};
@@ -85,7 +85,7 @@ fn the_more_episodes_wait_the_more_are_in_a_job() {
         bench.present = present;
         let jobs = ["a", "b", "c"].map(|evaluator| bench.job(evaluator, 0));
         for (evaluator, job) in ["a", "b", "c"].iter().zip(&jobs) {
-            assert!(bench.board.hand_back(&name(evaluator), job.id, &job.lease));
+            assert!(bench.hand_back(evaluator, job, None).is_some());
         }
         jobs.map(|job| job.seeds.len())
     };
@@ -114,12 +114,17 @@ fn an_evaluator_that_goes_loses_its_job_and_nobody_elses() {
 fn only_whoever_has_the_lease_hands_a_job_back() {
     let mut bench = Bench::new();
     let job = bench.job("a", 0);
-    assert!(!bench.board.hand_back(&name("a"), job.id, &Lease::random()), "guessed");
-    assert!(!bench.board.hand_back(&name("b"), job.id, &job.lease));
-    assert!(!bench.board.hand_back(&name("a"), job.id + 1, &job.lease));
+    let with = |change: fn(&mut Job)| {
+        let mut job = job.clone();
+        change(&mut job);
+        job
+    };
+    assert_eq!(bench.hand_back("a", &with(|job| job.lease = Lease::random()), None), None, "guessed");
+    assert_eq!(bench.hand_back("b", &job, None), None);
+    assert_eq!(bench.hand_back("a", &with(|job| job.id += 1), None), None);
     assert_eq!(bench.job("b", 0).seeds, [6, 7]);
-    assert!(bench.board.hand_back(&name("a"), job.id, &job.lease));
-    assert!(!bench.board.hand_back(&name("a"), job.id, &job.lease), "only once");
+    assert_eq!(bench.hand_back("a", &job, None), Some(HandedBack { step: 1000, given_up: vec![] }));
+    assert_eq!(bench.hand_back("a", &job, None), None, "only once");
     assert_eq!(bench.job("c", 0).seeds, job.seeds);
 }
 
@@ -128,7 +133,7 @@ fn episodes_that_take_every_evaluator_with_them_are_given_up() {
     let mut bench = Bench::new();
     for _ in 0..100 {
         let job = bench.job("a", 0);
-        assert!(bench.board.hand_back(&name("a"), job.id, &job.lease), "this does not count");
+        assert!(bench.hand_back("a", &job, None).is_some(), "this does not count");
     }
     let mut given_up = Vec::new();
     for attempt in 1..=20 {
@@ -173,6 +178,29 @@ fn an_evaluator_that_fails_again_and_again_takes_no_episode_from_those_that_work
     assert_eq!(bench.job("works", 31).seeds, [6, 7], "but not for who has shown that it works");
     bench.gone("works", 31);
     assert!(matches!(bench.claim("works", 32, 31), JobReply::Wait { .. }), "until it is lost itself");
+}
+
+/// A snapshot that is lost, or a policy that cannot act: nobody can do it, and the run does not wait for it for ever.
+#[test]
+fn a_job_that_nobody_can_do_is_given_up_but_not_soon() {
+    for proven in [false, true] {
+        let mut bench = Bench::new();
+        if proven {
+            let job = bench.job("a", 0);
+            bench.deliver(&full_report(&job, "a")).unwrap();
+        }
+        // However often it asks.
+        let (mut failed, mut seconds) = (0, 0);
+        while bench.board.missing().is_empty() {
+            seconds += 1;
+            if let JobReply::Job(job) = bench.claim("a", seconds, seconds) {
+                failed += 1;
+                let given_up = bench.hand_back("a", &job, Some(seconds)).unwrap().given_up;
+                assert_eq!(given_up, bench.board.missing());
+            }
+        }
+        assert!((600..1200).contains(&seconds), "proven: {proven}, given up after {seconds} s and {failed} failures");
+    }
 }
 
 #[test]

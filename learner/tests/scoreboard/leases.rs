@@ -1,10 +1,10 @@
 //! How long a job is whose.
 
 use quad_learner::scoreboard::Refusal;
-use quad_protocol::{Hash, Job, Progress};
+use quad_protocol::{Hash, Job, Progress, ScoreReport};
 
 use crate::bench::Bench;
-use crate::common::{name, progress, report, score};
+use crate::common::{full_report, name, progress, report, score};
 
 #[test]
 fn a_lease_that_runs_out_gives_the_unscored_episodes_to_the_next() {
@@ -67,6 +67,25 @@ fn a_job_has_a_longest_life() {
     for seconds in (5..longest).step_by(5) {
         bench.progress(&progress(&job, "a", seconds), seconds).unwrap();
     }
+    assert_eq!((bench.expire(longest - 1), bench.expire(longest)), (0, 1));
+}
+
+/// The disk is full: whoever has delivered its scores has done all that it can, and delivers them again.
+#[test]
+fn scores_that_cannot_be_saved_keep_their_job() {
+    let mut bench = Bench::new();
+    let (job, other) = (bench.job("a", 0), bench.job("b", 0));
+    let good = full_report(&job, "a");
+    for seconds in (5..60).step_by(5) {
+        bench.keep(&good, seconds);
+        bench.keep(&ScoreReport { incarnation: 1, ..full_report(&other, "b") }, seconds);
+        bench.keep(&ScoreReport { evaluator: name("b"), ..good.clone() }, seconds);
+    }
+    assert_eq!((bench.expire(9), bench.expire(10)), (0, 1), "b's, for which nothing was delivered");
+    assert_eq!((bench.expire(64), bench.expire(65)), (0, 1), "a's, which has stopped asking");
+    let job = bench.job("a", 70);
+    let longest = 70 + Job::LONGEST.as_secs();
+    (75..longest).step_by(5).for_each(|seconds| bench.keep(&full_report(&job, "a"), seconds));
     assert_eq!((bench.expire(longest - 1), bench.expire(longest)), (0, 1));
 }
 

@@ -1,7 +1,7 @@
 //! What becomes of a report.
 
 use quad_learner::scoreboard::{Recorded, Refusal};
-use quad_protocol::{CannotAct, EpisodeScore, Lease, ScoreReport};
+use quad_protocol::{EpisodeScore, ScoreReport};
 
 use crate::bench::{Bench, INCARNATION, hash};
 use crate::common::{full_report, name, report, score};
@@ -109,26 +109,4 @@ fn a_report_that_fits_no_evaluation_is_refused() {
     }
     assert_eq!(bench.board.pending(), 14);
     assert_eq!(bench.deliver(&good).unwrap().0.new.len(), 5);
-}
-
-/// Because that ends the run.
-#[test]
-fn only_whoever_has_the_job_may_say_that_a_policy_cannot_act() {
-    let mut bench = Bench::new();
-    let (job, other) = (bench.job("a", 0), bench.job("b", 0));
-    let signed = |lease: &Lease, weights| CannotAct::signed("NaN".to_owned(), weights, lease);
-    let good = ScoreReport { cannot_act: Some(signed(&job.lease, job.weights)), ..report(&job, "a", vec![]) };
-    let with = |complaint| ScoreReport { cannot_act: Some(complaint), ..good.clone() };
-    let cases = [
-        (with(signed(&other.lease, job.weights)), Refusal::Proof),
-        (with(signed(&job.lease, hash(2000))), Refusal::Proof),
-        (ScoreReport { evaluator: name("b"), ..good.clone() }, Refusal::Evaluator),
-        (ScoreReport { job: 99, ..good.clone() }, Refusal::Job),
-        (ScoreReport { incarnation: 1, ..good.clone() }, Refusal::Incarnation),
-        (ScoreReport { weights: hash(2000), ..good.clone() }, Refusal::Weights),
-    ];
-    for (report, refusal) in cases {
-        assert_eq!(bench.board.screen_complaint(&report), Err(refusal));
-    }
-    assert_eq!(bench.board.screen_complaint(&good), Ok(()));
 }

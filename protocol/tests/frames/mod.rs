@@ -41,11 +41,11 @@ pub fn frames() -> Vec<Vec<u8>> {
         proof: weights,
     };
     let environments = vec![text(), "walker2d".to_owned()];
-    let cannot_act = Some(CannotAct::signed("NaN".to_owned(), weights, &lease));
     vec![
         encode(&Snapshot { run: name(), incarnation: 1, step: 2, schema, hash: weights, tensors }).unwrap(),
         encode(&JobRequest::Claim { evaluator: name(), attempt: 9, environments, precision: name() }).unwrap(),
-        encode(&JobRequest::HandBack { evaluator: name(), job: 1, lease: lease.clone() }).unwrap(),
+        encode(&JobRequest::HandBack { evaluator: name(), job: 1, lease: lease.clone(), failed: Some(text()) })
+            .unwrap(),
         encode(&JobReply::Job(job)).unwrap(),
         encode(&JobReply::Wait { incarnation: 2, milliseconds: 10 }).unwrap(),
         encode(&JobReply::HandedBack { incarnation: 2, accepted: true }).unwrap(),
@@ -58,7 +58,6 @@ pub fn frames() -> Vec<Vec<u8>> {
             weights,
             precision: name(),
             episodes: episodes.clone(),
-            cannot_act,
         })
         .unwrap(),
         encode(&ScoreReply::Recorded { incarnation: 1, new: 2, duplicates: 3 }).unwrap(),

@@ -2,7 +2,7 @@
 
 use std::sync::atomic::{AtomicBool, AtomicU32, Ordering::Relaxed};
 
-use quad_policy::{ActionNoise, Cost};
+use quad_policy::{ActionNoise, Cost, PolicyError};
 use quad_protocol::Lease;
 use quad_service::{Endpoints, Health, open_session};
 
