@@ -106,7 +106,7 @@ async fn runs(findings: &mut Findings, session: &Session) -> anyhow::Result<()> 
 /// Asks the run's learner for work in no environment, so that there is none: the answer's version is what counts.
 async fn version(findings: &mut Findings, session: &Session, run: &Name) -> anyhow::Result<()> {
     let evaluator = Name::new(format!("doctor-{}", std::process::id()))?;
-    let precision = Name::new(Precision::Bf16.in_effect().name())?;
+    let precision = Name::new(Precision::Bf16.arithmetic())?;
     let claim = JobRequest::Claim { evaluator, attempt: rand::random(), environments: Vec::new(), precision };
     let question = encode(&claim)?;
     let key = keys::jobs(run);

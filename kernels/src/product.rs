@@ -62,6 +62,21 @@ pub fn rounding_is_faster() -> bool {
     available
 }
 
+/// The instructions that this CPU multiplies with, `rounded` operands or not. Other instructions add up in another order, and
+/// so to other last bits.
+pub fn instructions(rounded: bool) -> &'static str {
+    #[cfg(target_arch = "x86_64")]
+    let names = match rounded {
+        true => avx512::bf16::instructions(),
+        false if is_x86_feature_detected!("avx512f") => "avx512",
+        false if is_x86_feature_detected!("avx2") && is_x86_feature_detected!("fma") => "avx2",
+        false => "x86",
+    };
+    #[cfg(not(target_arch = "x86_64"))]
+    let names = if rounded { "none" } else { std::env::consts::ARCH };
+    names
+}
+
 /// `out[m × n] = x[m × k] · w[k × n]`.
 pub fn product(x: &[f32], w: &[f32], out: &mut [f32], k: usize, n: usize) {
     let m = x.len() / k;

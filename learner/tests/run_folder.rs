@@ -150,7 +150,7 @@ fn unlike_runs_are_no_seeds_of_each_other_and_the_report_says_what_differs() {
         assert_eq!(differs, keys);
         assert!(keys.iter().all(|key| report.text().contains(key)), "{}", report.text());
     }
-    let report = beside_a_plain_run(|_| (), |line| line.precision = "bf16".into());
+    let report = beside_a_plain_run(|_| (), |line| line.precision = "bf16-amx".into());
     let differs: Vec<_> = report.groups.iter().flat_map(|group| &group.differs).collect();
     assert_eq!(differs, ["scored in = f32", "scored in = bf16"]);
 

@@ -20,7 +20,7 @@ impl Precision {
     pub const UNAVAILABLE: &str =
         "this CPU is no faster in bf16, which takes AMX or AMD's AVX512-BF16: it computes in f32";
 
-    /// What it is called on command lines, in files and on the wire.
+    /// What it is called on command lines and in configurations.
     pub fn name(self) -> &'static str {
         match self {
             Precision::F32 => "f32",
@@ -31,6 +31,13 @@ impl Precision {
     /// What this CPU computes with where it is asked for.
     pub fn in_effect(self) -> Self {
         if self.is_available() { self } else { Precision::F32 }
+    }
+
+    /// How this CPU computes where it is asked for, as it is called on the wire and in `scores.jsonl`: what is in effect, and by
+    /// which instructions, e.g. `bf16-amx`. Two CPUs give the same bits only if this is the same.
+    pub fn arithmetic(self) -> String {
+        let precision = self.in_effect();
+        format!("{}-{}", precision.name(), quad_kernels::product::instructions(precision == Precision::Bf16))
     }
 
     /// Whether this CPU computes with it, rather than with f32 in its place.

@@ -17,7 +17,7 @@ pub enum JobRequest {
         attempt: u64,
         /// The environments it has.
         environments: Vec<String>,
-        /// The arithmetic that it computes policies in, e.g. `f32` or `bf16`.
+        /// The arithmetic that it computes policies in, e.g. `f32-avx2` or `bf16-amx`: those of one name compute the same bits.
         precision: Name,
     },
     /// It will not do the one that it has.

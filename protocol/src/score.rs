@@ -32,7 +32,7 @@ pub struct ScoreReport {
     pub step: u64,
     /// Hash of the snapshot's tensors.
     pub weights: Hash,
-    /// The arithmetic that the policy was computed in, e.g. `f32` or `bf16`.
+    /// The arithmetic that the policy was computed in, as in [`JobRequest::Claim`](crate::JobRequest::Claim).
     pub precision: Name,
     /// The episodes.
     pub episodes: Vec<EpisodeScore>,

@@ -5,6 +5,7 @@ use std::fs;
 use std::time::Duration;
 
 use quad_dataset::environment;
+use quad_policy::Precision;
 use quad_protocol::{EpisodeScore, JobReply, Message, ScoreReply, ScoreReport, decode, encode, keys};
 use quad_tests::made_up::{self, name};
 use quad_tests::router::router;
@@ -43,7 +44,8 @@ async fn scores_that_were_made_up_are_found_out_by_the_next_evaluator() {
     let hopper = environment::find("hopper").unwrap();
     let score =
         |&seed: &u64| EpisodeScore { seed, episode_return: 5.0, length: 10, score: hopper.normalised_score(5.0) };
-    let report = ScoreReport::of(&job, name("liar"), name("f32"), job.seeds.iter().map(score).collect());
+    let report =
+        ScoreReport::of(&job, name("liar"), name(&Precision::F32.arithmetic()), job.seeds.iter().map(score).collect());
     let reply: ScoreReply = ask(&session, keys::scores(&run), encode(&report).unwrap()).await;
     assert!(matches!(reply, ScoreReply::Recorded { new: 4, .. }), "{reply:?}");
 

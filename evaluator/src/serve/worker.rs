@@ -57,7 +57,7 @@ impl Worker {
     ///
     /// # Errors
     ///
-    /// The precision has no name that may cross the wire, which none of ours has not.
+    /// The arithmetic has no name that may cross the wire, which none of ours has not.
     pub fn new(
         evaluator: Name,
         precision: Precision,
@@ -65,7 +65,7 @@ impl Worker {
         found: watch::Receiver<Runs>,
         beat: Beat,
     ) -> anyhow::Result<Worker> {
-        let identity = Identity { evaluator, precision: Name::new(precision.in_effect().name())? };
+        let identity = Identity { evaluator, precision: Name::new(precision.arithmetic())? };
         Ok(Worker {
             identity,
             precision,

@@ -19,6 +19,11 @@ pub(crate) fn available() -> bool {
     amx::available() || has_registers() && [vendor.ebx, vendor.edx, vendor.ecx] != INTEL
 }
 
+/// Which of the two it takes.
+pub(crate) fn instructions() -> &'static str {
+    if amx::available() { "amx" } else { "avx512" }
+}
+
 /// Whether this CPU has AVX512-BF16.
 pub(super) fn has_registers() -> bool {
     is_x86_feature_detected!("avx512f")

@@ -206,9 +206,12 @@ fn evaluation(step: u64, episodes: &[&ScoreLine], expected: u32) -> Option<Evalu
     })
 }
 
-/// The precisions that scored, each once.
+/// The precisions that scored, each once, whatever instructions they were computed by.
 fn precisions(lines: &[ScoreLine]) -> String {
-    let said = |line: &ScoreLine| if line.precision.is_empty() { "unknown".to_owned() } else { line.precision.clone() };
+    let said = |line: &ScoreLine| match line.precision.split('-').next() {
+        None | Some("") => "unknown".to_owned(),
+        Some(precision) => precision.to_owned(),
+    };
     let precisions: BTreeSet<String> = lines.iter().map(said).collect();
     match precisions.is_empty() {
         true => "-".to_owned(),

@@ -30,7 +30,7 @@ pub struct ScoreLine {
     pub score: f64,
     /// BLAKE3 of the snapshot's file.
     pub weights: String,
-    /// Arithmetic that the policy was computed in; lines from before there was a choice do not say.
+    /// Arithmetic that the policy was computed in, e.g. `f32-avx2` or `bf16-amx`; lines from before there was a choice do not say.
     #[serde(default)]
     pub precision: String,
     /// Who measured it.
@@ -59,7 +59,7 @@ impl ScoreLine {
     }
 }
 
-/// A line of `audits.jsonl`: an episode that two evaluators of the same precision have scored.
+/// A line of `audits.jsonl`: an episode that two evaluators of the same arithmetic have scored.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct AuditLine {
     /// Gradient step of the snapshot.
