@@ -6,7 +6,6 @@ use clap::Parser;
 use quad_evaluator::cli::Cli;
 
 fn main() -> ExitCode {
-    quad_service::init_logging();
     let cli = Cli::parse();
-    quad_service::run_main(|| cli.run())
+    quad_service::run_main(quad_service::init_logging(), || cli.run())
 }

@@ -3,6 +3,11 @@
 use std::fmt;
 use std::io::{self, Write};
 use std::process::ExitCode;
+use std::sync::mpsc::channel;
+use std::thread;
+use std::time::Duration;
+
+use crate::logging::Logging;
 
 /// Adds advice to an error: what to do about it, on a line of its own.
 pub trait Hint<T> {
@@ -58,18 +63,25 @@ impl std::error::Error for Hinted {
     }
 }
 
-/// Runs `main`. An error is printed to stderr with its causes and hints; the exit code is then 1, otherwise 0.
+/// An error that nobody reads is given up after this time.
+const LAST_WORDS: Duration = Duration::from_secs(1);
+
+/// Runs `main`, and ends the logging. An error is printed to stderr with its causes and hints; the exit code is then 1,
+/// otherwise 0.
 ///
 /// (A wrong command line is 2, which clap sees to.)
-pub fn run_main(main: impl FnOnce() -> anyhow::Result<()>) -> ExitCode {
-    match main() {
-        Ok(()) => ExitCode::SUCCESS,
-        Err(error) => {
-            // With stderr closed, the exit code is all that can be said.
-            print(&error, &mut io::stderr().lock()).ok();
-            ExitCode::FAILURE
-        }
-    }
+pub fn run_main(logging: Logging, main: impl FnOnce() -> anyhow::Result<()>) -> ExitCode {
+    let result = main();
+    drop(logging);
+    let Err(error) = result else { return ExitCode::SUCCESS };
+    let (tell, told) = channel();
+    thread::spawn(move || {
+        // With stderr closed, the exit code is all that can be said.
+        print(&error, &mut io::stderr().lock()).ok();
+        tell.send(()).ok();
+    });
+    told.recv_timeout(LAST_WORDS).ok();
+    ExitCode::FAILURE
 }
 
 fn print(error: &anyhow::Error, to: &mut impl Write) -> io::Result<()> {
@@ -95,6 +107,7 @@ mod tests {
     use anyhow::{Context, anyhow};
 
     use super::*;
+    use crate::logging::init_logging;
 
     fn printed<T>(result: anyhow::Result<T>) -> String {
         let mut text = Vec::new();
@@ -120,7 +133,7 @@ mod tests {
 
     #[test]
     fn exit_codes() {
-        assert_eq!(run_main(|| Ok(())), ExitCode::SUCCESS);
-        assert_eq!(run_main(|| Err(anyhow!("an error that a test made"))), ExitCode::FAILURE);
+        assert_eq!(run_main(init_logging(), || Ok(())), ExitCode::SUCCESS);
+        assert_eq!(run_main(init_logging(), || Err(anyhow!("an error that a test made"))), ExitCode::FAILURE);
     }
 }

@@ -32,7 +32,7 @@ pub use certificates::{Certificates, CertificatesError, Role};
 pub use endpoints::{Endpoints, SessionError, default_endpoint, parse_endpoint};
 pub use exit::{Hint, hinted, run_main};
 pub use health::{Beat, Health};
-pub use logging::init_logging;
+pub use logging::{Logging, init_logging};
 pub use metrics_server::{BindError, MetricsServer, serve_metrics};
 pub use session::{open_session, reachable_at};
 pub use shutdown::shutdown_signal;
