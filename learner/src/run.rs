@@ -77,7 +77,7 @@ fn report(args: &ReportArgs) -> anyhow::Result<()> {
 fn verify(args: &VerifyArgs) -> anyhow::Result<()> {
     let mut findings = vec![(String::new(), verify::verify(&args.dir)?)];
     if let Some(other) = &args.same_as {
-        findings.push((format!("compared with {}: ", other.display()), verify::compare(&args.dir, other)?));
+        findings.push((format!("with {}: ", other.display()), verify::compare(&args.dir, other)?));
     }
     for (about, found) in &findings {
         print(&format!("{about}{found}"))?;

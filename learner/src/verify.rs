@@ -15,8 +15,10 @@ const LISTED: usize = 5;
 /// What was found in a folder.
 #[derive(Debug, Default, PartialEq)]
 pub struct Findings {
-    /// Episodes that have a score.
-    pub scored: usize,
+    /// What was looked for: `scored` or `compared`.
+    pub what: &'static str,
+    /// Episodes that are.
+    pub found: usize,
     /// Of how many.
     pub expected: usize,
     /// What is wrong, kind by kind.
@@ -36,7 +38,7 @@ impl Findings {
 
 impl fmt::Display for Findings {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        write!(f, "{} of {} episodes are scored", self.scored, self.expected)?;
+        write!(f, "{} of {} episodes are {}", self.found, self.expected, self.what)?;
         for (kind, found) in &self.wrong {
             let listed = found.iter().take(LISTED).cloned().collect::<Vec<_>>().join("; ");
             let more = if found.len() > LISTED { "; …" } else { "" };
@@ -58,7 +60,8 @@ pub fn verify(path: &Path) -> Result<Findings, RunDirError> {
         .evaluated_steps()
         .map(|step| (step, BTreeSet::from_iter(episode_seeds(experiment.seed, step, experiment.episodes))))
         .collect();
-    let mut found = Findings { expected: planned.values().map(BTreeSet::len).sum(), ..Findings::default() };
+    let expected = planned.values().map(BTreeSet::len).sum();
+    let mut found = Findings { what: "scored", expected, ..Findings::default() };
     let mut hashes: BTreeMap<u64, Option<String>> = BTreeMap::new();
     let mut seen = BTreeSet::new();
     for ScoreLine { step, seed, weights, episode_return, score, .. } in dir.read_scores()? {
@@ -77,7 +80,7 @@ pub fn verify(path: &Path) -> Result<Findings, RunDirError> {
         if !seen.insert((step, seed)) {
             found.add("scored twice", name);
         } else if planned.get_mut(&step).is_some_and(|seeds| seeds.remove(&seed)) {
-            found.scored += 1;
+            found.found += 1;
         } else {
             found.add("no episode of this run", name);
         }
@@ -90,13 +93,12 @@ pub fn verify(path: &Path) -> Result<Findings, RunDirError> {
     Ok(found)
 }
 
-/// Checks that two runs of one configuration have the same scores, bit for bit, of the same weights. What one of them does
-/// not have is not compared.
+/// Checks that each score of a run is in another run of the same configuration, too: bit for bit, of the same weights.
 ///
 /// # Errors
 /// As [`verify`].
 pub fn compare(path: &Path, other: &Path) -> Result<Findings, RunDirError> {
-    let mut found = Findings::default();
+    let mut found = Findings { what: "compared", ..Findings::default() };
     let [(dir, config), (other_dir, other_config)] = [RunDir::open(path)?, RunDir::open(other)?];
     let [a, b] = [&config, &other_config].map(settings::of_run);
     for key in settings::differences(&a, &b) {
@@ -108,14 +110,20 @@ pub fn compare(path: &Path, other: &Path) -> Result<Findings, RunDirError> {
     let [ours, theirs] = [by_key(dir.read_scores()?), by_key(other_dir.read_scores()?)];
     found.expected = ours.len();
     for (key @ (step, seed), line) in &ours {
-        let Some(same) = theirs.get(key) else { continue };
-        found.scored += 1;
         let name = format!("step {step}, seed {seed}");
+        let Some(same) = theirs.get(key) else {
+            found.add("not scored there", name);
+            continue;
+        };
         let bits = |line: &ScoreLine| (line.episode_return.to_bits(), line.length);
         if line.weights != same.weights {
             found.add("weights that differ", name);
-        } else if line.precision == same.precision && bits(line) != bits(same) {
+        } else if line.precision != same.precision {
+            found.add("not to be compared, because they were computed by other instructions", name);
+        } else if bits(line) != bits(same) {
             found.add("scores that differ", name);
+        } else {
+            found.found += 1;
         }
     }
     Ok(found)

@@ -80,14 +80,26 @@ fn each_broken_promise_is_found() {
 #[test]
 fn two_runs_are_compared_bit_for_bit() {
     let folder = tempfile::tempdir().unwrap();
-    let paths = ["a", "b", "c", "d"].map(|name| folder.path().join(name));
+    let paths = ["a", "b", "c", "d", "e", "f"].map(|name| folder.path().join(name));
     write(&paths[0], |_| ());
     write(&paths[1], |lines| lines[0].episode_return = lines[0].episode_return.next_up());
     write(&paths[2], |lines| lines.truncate(2));
     write(&paths[3], |lines| lines[5].weights = "00".into());
+    write(&paths[4], |lines| lines.clear());
+    write(&paths[5], |lines| lines[0].precision = "f32-avx2".into());
     let found = |other: usize| compare(&paths[0], &paths[other]).unwrap();
-    assert!(found(0).all_held() && found(0).scored == 6);
-    assert!(found(1).wrong.contains_key("scores that differ"));
-    assert!(found(2).all_held() && found(2).scored == 2);
-    assert!(found(3).wrong.contains_key("weights that differ"));
+    assert!(found(0).all_held() && found(0).found == 6);
+    let expected = [
+        (1, 5, "scores that differ"),
+        (2, 2, "not scored there"),
+        (3, 5, "weights that differ"),
+        (4, 0, "not scored there"),
+        (5, 5, "not to be compared, because they were computed by other instructions"),
+    ];
+    for (other, same, wrong) in expected {
+        let found = found(other);
+        assert!(found.found == same && found.wrong.keys().eq([&wrong]), "{other}: {found}");
+    }
+    // What only the other one has does not matter.
+    assert!(compare(&paths[2], &paths[0]).unwrap().all_held());
 }
