@@ -21,8 +21,8 @@ use quad_protocol::{JobReply, JobRequest, Message, Name, Progress, ScoreReply, d
 use quad_service::{Beat, hinted, stay_in_background};
 use tokio::sync::mpsc::UnboundedSender;
 use tracing::{debug, info};
-use zenoh::Session;
 
+use crate::herald::Herald;
 use crate::inbox::Messages;
 use crate::metrics::Metrics;
 use crate::notice::Notice;
@@ -66,7 +66,7 @@ pub struct Hub {
     metrics: Metrics,
     notices: UnboundedSender<Notice>,
     evaluators: Evaluators,
-    session: Option<Session>,
+    herald: Option<Herald>,
     delivered: Delivered,
     training_completed: bool,
     /// Steps of which it was told that a job failed.
@@ -93,7 +93,7 @@ impl Hub {
             evaluators: Evaluators::new(metrics.evaluators.clone(), notices.clone()),
             metrics,
             notices,
-            session: None,
+            herald: None,
             delivered: Delivered::default(),
             training_completed: false,
             failures_told: BTreeSet::new(),
@@ -164,8 +164,8 @@ impl Hub {
                 self.notices.send(Notice::Trained { pending: self.scoreboard.pending() }).ok();
                 self.settle();
             }
-            Event::Online { session, follower } => {
-                self.session = Some(session);
+            Event::Online { herald, follower } => {
+                self.herald = Some(herald);
                 self.evaluators.follow(follower);
             }
             Event::Job(question) => {
@@ -275,6 +275,11 @@ impl Hub {
                 return;
             }
         }
+        let unchecked = waiting as u64 + self.scoreboard.audits_given_up();
+        if unchecked > 0 {
+            self.notices.send(Notice::Unchecked(unchecked)).ok();
+        }
+        self.metrics.evaluation.audits_missed.inc_by(unchecked);
         self.training_completed = false; // said once
         self.notices.send(Notice::Settled).ok();
     }
@@ -296,7 +301,8 @@ impl Hub {
     }
 }
 
-fn other_weights(error: OtherWeights) -> anyhow::Error {
+/// With what to do about it.
+pub(crate) fn other_weights(error: OtherWeights) -> anyhow::Error {
     let hint = "another kind of processor, another number of threads or another version computes other bits: go on where the \
                 run was before, or begin anew with --fresh";
     hinted(error, hint)

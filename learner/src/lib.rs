@@ -14,9 +14,9 @@
 //! - [`agent`] runs one of the [`algorithms`], each a file to be read beside its paper, with an [`optimiser`] and the
 //!   [`random`] numbers of its seed, on a thread pool that is kept awake (`pool`).
 //! - [`scoreboard`] is the hub's state without any I/O.
-//! - [`wire`] declares everything on Zenoh; its callbacks fill an [`inbox`], and [`replies`] answers without anybody waiting
-//!   for a peer that does not read; [`notice`] is what threads tell the main loop.
-//! - [`run_dir`] is the folder of a run, [`metrics`] are for Prometheus, [`display`] shows progress on the terminal.
+//! - [`wire`] declares everything on Zenoh; its callbacks fill an [`inbox`], [`replies`] answers and a [`herald`] publishes, so
+//!   that nobody else waits for a peer that does not read; [`notice`] is what threads tell the main loop.
+//! - [`run_dir`] is the folder of a run, [`trouble`] what is told of a disk that takes nothing, [`metrics`] are for Prometheus, [`display`] shows progress on the terminal.
 //! - [`doctor`] checks a machine before a run is trusted to it.
 //! - [`report`] and [`plot`] summarise the scores as tables and as a picture; [`verify`] checks them against the folder.
 
@@ -31,6 +31,7 @@ pub mod datasets;
 pub mod device;
 pub mod display;
 pub mod doctor;
+pub mod herald;
 pub mod hub;
 pub mod inbox;
 pub mod keeper;

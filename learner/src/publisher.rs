@@ -9,11 +9,9 @@ use quad_policy::Description;
 use quad_protocol::{Hash, Name, Schema, Snapshot, WeightsRequest, decode, encode, keys};
 use quad_service::Beat;
 use tokio::sync::mpsc::UnboundedSender;
-use tracing::debug;
 use zenoh::bytes::ZBytes;
-use zenoh::qos::CongestionControl;
-use zenoh::{Session, Wait};
 
+use crate::herald::Herald;
 use crate::hub;
 use crate::inbox::{Inbox, Messages};
 use crate::metrics::Metrics;
@@ -29,7 +27,7 @@ pub enum Event {
     /// All gradient steps are done; no snapshot will follow.
     TrainingCompleted,
     /// The Zenoh session is open.
-    Online(Session),
+    Online(Herald),
     /// An evaluator asks for `weights/<step>`.
     Query(Question),
     /// End, after the messages sent before this one are handled.
@@ -67,7 +65,7 @@ pub struct SnapshotPublisher {
     metrics: Metrics,
     hub: Inbox<hub::Event>,
     notices: UnboundedSender<Notice>,
-    session: Option<Session>,
+    herald: Option<Herald>,
     /// Hash of every snapshot that may be asked for, by step.
     hashes: BTreeMap<u64, Hash>,
     /// The newest, ready to be sent; older ones are read from the disk.
@@ -84,7 +82,7 @@ impl SnapshotPublisher {
         notices: UnboundedSender<Notice>,
         hashes: BTreeMap<u64, Hash>,
     ) -> Self {
-        Self { identity, run_dir, metrics, hub, notices, session: None, hashes, newest: None }
+        Self { identity, run_dir, metrics, hub, notices, herald: None, hashes, newest: None }
     }
 
     /// The thread's work, until it is told to stop.
@@ -102,7 +100,7 @@ impl SnapshotPublisher {
                     }
                 }
                 Some(Event::TrainingCompleted) => self.hub.send(hub::Event::TrainingCompleted),
-                Some(Event::Online(session)) => self.session = Some(session),
+                Some(Event::Online(herald)) => self.herald = Some(herald),
                 Some(Event::Query(question)) => self.answer(question),
                 Some(Event::Stop) => return,
             }
@@ -116,13 +114,9 @@ impl SnapshotPublisher {
         self.newest = Some((step, bytes.clone()));
         // The jobs must exist first: evaluators ask for one as soon as the snapshot arrives.
         self.hub.send(hub::Event::Evaluate { step, weights: hash });
-        if let Some(session) = &self.session {
-            // Without a Zenoh publisher, which a router would tell of every subscription that fits: strangers can make up many.
-            // A slow subscriber loses the snapshot instead of delaying the others. It asks when it gets a job for it.
-            let put = session.put(keys::weights(&self.identity.run), bytes).congestion_control(CongestionControl::Drop);
-            if let Err(error) = put.wait() {
-                debug!(%error, step, "the snapshot could not be published");
-            }
+        // A slow subscriber loses the snapshot instead of delaying the others. It asks when it gets a job for it.
+        if let Some(herald) = &self.herald {
+            herald.weights(keys::weights(&self.identity.run), bytes);
         }
         self.metrics.evaluation.snapshots_published.inc();
         self.notices.send(Notice::Published { step }).ok();

@@ -20,6 +20,7 @@ use zenoh::query::{Query, Queryable};
 use zenoh::sample::{Locality, Sample, SampleKind};
 
 use self::flood::FloodGuard;
+use crate::herald::Herald;
 use crate::inbox::{Inbox, MOST_BYTES};
 use crate::metrics::Metrics;
 use crate::replies::{Asker, Question, Replies};
@@ -76,9 +77,10 @@ impl Wire {
         if life.behind_router {
             flood.end();
         }
-        publisher.send(publisher::Event::Online(session.clone()));
+        let herald = Herald::start(&session, hub)?;
+        publisher.send(publisher::Event::Online(herald.clone()));
         let follower = tokens::follower(&session, run, hub, metrics)?;
-        hub.send(hub::Event::Online { session: session.clone(), follower });
+        hub.send(hub::Event::Online { herald, follower });
 
         let server = Server { session: &session, metrics, replies: &replies, flood: &flood };
         let queryables = [

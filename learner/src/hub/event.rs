@@ -3,9 +3,9 @@
 use std::sync::mpsc::Sender;
 
 use quad_protocol::{Hash, Name};
-use zenoh::Session;
 
 use super::followed::Follow;
+use crate::herald::Herald;
 use crate::replies::Question;
 
 /// Messages to the thread.
@@ -22,8 +22,8 @@ pub enum Event {
     TrainingCompleted,
     /// The Zenoh session is open.
     Online {
-        /// The session.
-        session: Session,
+        /// Who publishes.
+        herald: Herald,
         /// Who sees to it that evaluators' tokens are followed.
         follower: Sender<Follow>,
     },

@@ -5,9 +5,7 @@ use std::mem;
 use std::time::Instant;
 
 use quad_protocol::{EpisodeScore, Name, RecordedScores, ScoreReply, ScoreReport, encode, keys};
-use tracing::{debug, error};
-use zenoh::Wait;
-use zenoh::qos::CongestionControl;
+use tracing::error;
 
 use super::Hub;
 use super::rejection::Rejection;
@@ -162,13 +160,10 @@ impl Hub {
 
     /// Publishes recorded scores for observers. The system works without any, so a failure does not matter.
     fn publish(&self, report: &ScoreReport, episodes: Vec<EpisodeScore>) {
-        let Some(session) = &self.session else { return };
+        let Some(herald) = &self.herald else { return };
         let ScoreReport { run, step, weights, evaluator, .. } = report.clone();
         let recorded = RecordedScores { run, step, weights, evaluator, episodes };
         let Ok(bytes) = encode(&recorded) else { return };
-        let put = session.put(keys::scores_at(&self.run, step), bytes);
-        if let Err(error) = put.congestion_control(CongestionControl::Drop).wait() {
-            debug!(%error, "recorded scores could not be published");
-        }
+        herald.scores(keys::scores_at(&self.run, step), bytes);
     }
 }

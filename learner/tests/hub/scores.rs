@@ -115,18 +115,19 @@ async fn while_scores_cannot_be_saved_their_job_is_not_lost() {
     let report = full_report(&job, "a");
     let disk = bench.disk.clone();
     let hanging = disk.lock().await;
-    let (asker, first) = (client.clone(), report.clone());
-    let delivered = tokio::spawn(async move { deliver(&asker, &first).await });
+    let message = encode(&report).unwrap();
+    let first = client.get(keys::scores(&bench.run)).payload(message.clone()).timeout(2 * PATIENCE).await.unwrap();
     let begin = Instant::now();
     while begin.elapsed() < 4 * LEASE {
-        let message = encode(&report).unwrap();
-        let again = ask::<ScoreReply>(&client, keys::scores(&bench.run), Some(message)).await.unwrap();
+        let again = ask::<ScoreReply>(&client, keys::scores(&bench.run), Some(message.clone())).await.unwrap();
         assert!(again.unwrap_err().contains("being written"));
         tokio::time::sleep(LEASE / 8).await;
     }
     assert_eq!(bench.metrics.evaluation.jobs_expired.get(), 0);
     drop(hanging);
-    assert!(matches!(delivered.await.unwrap(), ScoreReply::Recorded { new: 2, .. }));
+    let reply = first.recv_async().await.unwrap().into_result().unwrap();
+    let reply = decode::<ScoreReply>(&reply.payload().to_bytes()).unwrap();
+    assert!(matches!(reply, ScoreReply::Recorded { new: 2, .. }), "{reply:?}");
     assert_eq!(bench.metrics.evaluation.jobs_completed.get(), 1);
 }
 

@@ -8,10 +8,11 @@ use quad_service::{Endpoints, open_session};
 use crate::bench::{Bench, PATIENCE, ask, claim};
 use crate::common::name;
 
-/// Asks for weights again and again, and then reads nothing: the process stops itself.
+/// Asks for weights again and again, wants all that is published, and then reads nothing: the process stops itself.
 async fn reads_nothing(endpoint: String) {
     let endpoints = Endpoints { connect: vec![endpoint], ..Endpoints::default() };
     let session = open_session(&endpoints).await.unwrap();
+    let _all = session.declare_subscriber("quad/bench/**").callback(drop).await.unwrap();
     for _ in 0..150 {
         let key = keys::weights_at(&name("bench"), 10);
         session.get(key).timeout(PATIENCE).callback(drop).await.unwrap();
