@@ -62,6 +62,7 @@ pub struct EvaluationMetrics {
     pub episodes_pending: IntGauge,
     pub episodes_missing: IntGauge,
     audits: IntCounterVec,
+    pub audits_missed: IntCounter,
     pub scores_recorded: IntCounter,
     pub scores_duplicate: IntCounter,
     pub score: Gauge,
@@ -144,6 +145,10 @@ impl Metrics {
         training.gradient_steps_target.set(i64::try_from(target_steps).unwrap_or(i64::MAX));
         let outcomes = Opts::new(full("jobs_total"), "Evaluation jobs by outcome");
         let jobs = make.add(IntCounterVec::new(outcomes, &["outcome"]))?;
+        let audits = make.add(IntCounterVec::new(
+            Opts::new(full("audits_total"), "Episodes that were to be scored a second time, by outcome"),
+            &["outcome"],
+        ))?;
         let evaluation = EvaluationMetrics {
             snapshots_published: make.counter("snapshots_published_total", "Snapshots handed to evaluation")?,
             snapshot_bytes: make.count("snapshot_bytes", "Size of the newest snapshot")?,
@@ -152,10 +157,8 @@ impl Metrics {
             jobs_expired: jobs.get_metric_with_label_values(&["expired"])?,
             jobs_handed_back: jobs.get_metric_with_label_values(&["handed_back"])?,
             jobs_failed: jobs.get_metric_with_label_values(&["failed"])?,
-            audits: make.add(IntCounterVec::new(
-                Opts::new(full("audits_total"), "Episodes that were scored a second time, by outcome"),
-                &["outcome"],
-            ))?,
+            audits_missed: audits.get_metric_with_label_values(&["missed"])?,
+            audits,
             episodes_missing: make.count(
                 "episodes_missing",
                 "Episodes that are not handed out any more, after too many failed attempts",

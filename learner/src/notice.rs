@@ -51,6 +51,8 @@ pub enum Notice {
     },
     /// All gradient steps are done, and no score is outstanding that may still come.
     Settled,
+    /// All is settled, but so many episodes were to be scored a second time and were not.
+    Unchecked(u64),
     /// These two evaluators have different scores of the same episode.
     ScoresDiffer([Name; 2]),
     /// The disk does not take that; what it says.

@@ -179,6 +179,11 @@ impl Scoreboard {
         self.audits.count()
     }
 
+    /// Episodes that were to be scored a second time and are not handed out for it any more.
+    pub fn audits_given_up(&self) -> u64 {
+        self.audits.given_up()
+    }
+
     /// Step and seed of the episodes that have no score and are not handed out any more.
     pub fn missing(&self) -> Vec<(u64, u64)> {
         let of = |(&step, evaluation): (&u64, &Evaluation)| -> Vec<_> {

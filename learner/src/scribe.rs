@@ -7,7 +7,7 @@ use std::thread;
 use std::time::Duration;
 
 use quad_service::Beat;
-use tracing::error;
+use tracing::{debug, error};
 
 use crate::hub::Event;
 use crate::inbox::Inbox;
@@ -16,6 +16,9 @@ use crate::trouble::Trouble;
 
 /// After a write, scores are left to gather for so long: to synchronise a file takes much of a processor, too.
 const GATHER: Duration = Duration::from_millis(50);
+
+/// Most audits that are kept for a disk that does not take them.
+const MOST_UNWRITTEN: usize = 10_000;
 
 /// What is to be written.
 #[derive(Debug)]
@@ -39,6 +42,8 @@ pub struct Scribe {
     pub hub: Inbox<Event>,
     /// How the disk takes the scores.
     pub trouble: Trouble,
+    /// Audits that the disk has not taken.
+    pub unwritten: Vec<AuditLine>,
 }
 
 impl Scribe {
@@ -56,14 +61,24 @@ impl Scribe {
                     self.hub.send(Event::Written(written.map_err(|error| said(&error))));
                     thread::sleep(GATHER);
                 }
-                Ok(Lines::Audits(lines)) => {
-                    if let Some(Err(error)) = self.audits.as_mut().map(|log| log.append(&lines)) {
-                        error!(%error, "the audits could not be saved");
-                    }
-                }
+                Ok(Lines::Audits(lines)) => self.unwritten.extend(lines),
                 Err(RecvTimeoutError::Timeout) => {}
                 Err(RecvTimeoutError::Disconnected) => return,
             }
+            self.write_audits();
+        }
+    }
+
+    /// What the disk does not take is kept for the next time.
+    fn write_audits(&mut self) {
+        let Some(log) = self.audits.as_mut().filter(|_| !self.unwritten.is_empty()) else { return };
+        match log.append(&self.unwritten) {
+            Ok(()) => self.unwritten.clear(),
+            Err(error) if self.unwritten.len() > MOST_UNWRITTEN => {
+                error!("{} audits are not saved: {}", self.unwritten.len(), said(&error));
+                self.unwritten.clear();
+            }
+            Err(error) => debug!("the audits are saved later: {}", said(&error)),
         }
     }
 }

@@ -36,7 +36,7 @@ const JOB_EPISODES: [usize; 2] = [5, 40];
 /// An evaluator tells its progress three times meanwhile or more often, and Zenoh notices a lost one after about 5 s.
 const LEASE: Duration = Duration::from_secs(15);
 /// A thread that answers others, or writes to the disk, is stuck if it has said nothing for so long.
-const STUCK: Duration = Duration::from_secs(30);
+pub(crate) const STUCK: Duration = Duration::from_secs(30);
 /// So is training, whose slowest steps take seconds.
 const TRAINING_STUCK: Duration = Duration::from_secs(300);
 /// Lines of `metrics.jsonl` that may wait for the disk.
@@ -111,7 +111,7 @@ impl Threads {
         let (hub, hub_messages) = inbox();
         let (sender, lines) = channel();
         let trouble = Trouble::new(Saved::Scores, &metrics.disk, notices.clone());
-        let scribe = Scribe { scores, audits, lines, hub: hub.clone(), trouble };
+        let scribe = Scribe { scores, audits, lines, hub: hub.clone(), trouble, unwritten: Vec::new() };
         let scribe = spawn("scribe", notices, with(health.part("scribe", STUCK), move |beat| scribe.run(beat)))?;
         let state = Hub::new(name.clone(), plan, scoreboard, sender, metrics.clone(), notices.clone());
         let hub_thread =

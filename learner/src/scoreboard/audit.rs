@@ -1,10 +1,12 @@
-//! Audits: a share of the episodes is scored a second time, by another evaluator of the same precision. The same weights and
-//! seed give the same score, bit for bit, so a difference is a broken machine, another simulator, or a lie (BOINC's idea).
+//! Audits: a share of the episodes is scored a second time, by another evaluator that computes by the same instructions. The
+//! same weights and seed give it the same score, bit for bit, so a difference is a broken machine, another simulator, or a lie
+//! (BOINC's idea).
 
 use std::collections::{BTreeMap, BTreeSet};
 
 use quad_protocol::{EpisodeScore, Hash, Name, ScoreReport};
 
+use super::evaluation::Ended;
 use crate::resume::Unchecked;
 
 /// The episodes that are to be scored again.
@@ -12,6 +14,7 @@ use crate::resume::Unchecked;
 pub(super) struct Audits {
     /// Share of the episodes, 0 to 1.
     share: f64,
+    given_up: u64,
     waiting: BTreeMap<(u64, u64), Waiting>,
 }
 
@@ -22,12 +25,12 @@ struct Waiting {
     precision: Name,
     /// The job that it is handed out with.
     job: Option<u64>,
-    /// How many such jobs have ended without its score.
+    /// How many evaluators were lost with it, or could not do it.
     lost: u32,
 }
 
-/// An episode is not checked any more after so many jobs that ended without its score: an audit must not keep a run from
-/// its end.
+/// An episode is not checked any more after so many evaluators that were lost with it, or could not do it: an audit must not
+/// keep a run from its end.
 const MOST_LOST: u32 = 5;
 
 /// An episode that was scored twice.
@@ -52,7 +55,7 @@ impl Audited {
 impl Audits {
     /// Of that share of the episodes.
     pub fn new(share: f64) -> Self {
-        Self { share, waiting: BTreeMap::new() }
+        Self { share, given_up: 0, waiting: BTreeMap::new() }
     }
 
     /// Takes in scores that are new; the seed and the step decide which of them are scored again.
@@ -92,15 +95,22 @@ impl Audits {
         Some((step, seeds))
     }
 
-    /// Lets the episodes of a job that has ended wait for another evaluator, unless that was so too often.
-    pub fn release(&mut self, job: u64) {
+    /// Lets the episodes of a job that has ended wait for another evaluator, unless too many were lost with them.
+    pub fn release(&mut self, job: u64, ended: Ended) {
+        let before = self.waiting.len();
         self.waiting.retain(|_, waiting| {
             if waiting.job == Some(job) {
                 waiting.job = None;
-                waiting.lost += 1;
+                waiting.lost += u32::from(!matches!(ended, Ended::HandedBack));
             }
             waiting.lost < MOST_LOST
         });
+        self.given_up += (before - self.waiting.len()) as u64;
+    }
+
+    /// How many are not checked any more, after [`release`](Self::release).
+    pub fn given_up(&self) -> u64 {
+        self.given_up
     }
 
     /// Whether a job still has episodes to score again.
@@ -138,18 +148,24 @@ fn is_chosen(share: f64, step: u64, seed: u64) -> bool {
 #[allow(clippy::unwrap_used)]
 mod tests {
     use super::*;
+    use std::time::Instant;
 
     #[test]
     fn an_episode_that_nobody_checks_is_not_waited_for() {
         let [one, other] = ["one", "other"].map(|name| Name::new(name).unwrap());
         let score = EpisodeScore { seed: 7, episode_return: 1.0, length: 1, score: 1.0 };
         let mut audits = Audits::new(1.0);
-        audits.add_one(10, Unchecked { score, evaluator: one, precision: Name::new("f32").unwrap() });
-        for job in 0..u64::from(MOST_LOST) {
-            assert_eq!(audits.hand_out(job, &other, &Name::new("f32").unwrap(), 4), Some((10, vec![7])));
-            audits.release(job);
+        let f32 = Name::new("f32").unwrap();
+        audits.add_one(10, Unchecked { score, evaluator: one, precision: f32.clone() });
+        for job in 100..200 {
+            assert_eq!(audits.hand_out(job, &other, &f32, 4), Some((10, vec![7])));
+            audits.release(job, Ended::HandedBack);
         }
-        assert_eq!(audits.count(), [0, 0]);
+        for job in 0..u64::from(MOST_LOST) {
+            assert_eq!(audits.hand_out(job, &other, &f32, 4), Some((10, vec![7])));
+            audits.release(job, Ended::Lost(Instant::now()));
+        }
+        assert_eq!((audits.count(), audits.given_up()), ([0, 0], 1));
     }
 
     #[test]

@@ -72,7 +72,7 @@ impl Scoreboard {
 
     /// Ends a job, and lets its episodes wait for the next one; gives those that were lost too often.
     fn release(&mut self, id: u64, ended: Ended) -> Vec<(u64, u64)> {
-        self.audits.release(id);
+        self.audits.release(id, ended);
         let Some(OpenJob { step, seeds, .. }) = self.jobs.remove(id) else { return Vec::new() };
         let given_up = self.evaluations.get_mut(&step).map(|evaluation| evaluation.take_back(id, &seeds, ended));
         given_up.unwrap_or_default().into_iter().map(|seed| (step, seed)).collect()

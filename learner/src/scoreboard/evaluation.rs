@@ -6,7 +6,8 @@ use std::time::{Duration, Instant};
 
 use quad_protocol::{EpisodeScore, Hash};
 
-/// An episode whose evaluator was lost so often is not handed out any more: it may be what they are lost of.
+/// An episode whose evaluator was lost so often is given up: it may be what they are lost of. Somebody who has scored others
+/// still gets it, until it was lost twice as often: perhaps it was strangers who took all attempts.
 const MOST_ATTEMPTS: u32 = 20;
 /// Lost more often than this, an episode rests before it goes to somebody who has scored nothing yet. Else one machine that
 /// fails again and again, under a new name each time, would soon have taken all attempts. It rests for all if somebody could
@@ -76,7 +77,7 @@ enum EpisodeState {
     HandedOut {
         job: u64,
     },
-    /// Not handed out any more. Its score is still welcome.
+    /// Not waited for any more. Its score is still welcome.
     GivenUp,
     Scored(EpisodeScore),
 }
@@ -130,8 +131,9 @@ impl Evaluation {
     /// evaluator was lost with the first of them: should it be what it was lost of, the fewer suffer. `proven` is somebody who
     /// has scored others.
     pub fn hand_out(&mut self, job: u64, [few, most]: [usize; 2], proven: bool, now: Instant) -> Vec<u64> {
-        let ready = self.waiting.iter().copied().filter(|place| !self.episodes[*place].rests(proven, now));
-        let mut ready = ready.peekable();
+        let again = self.given_up.iter().filter(|place| proven && self.episodes[**place].lost < 2 * MOST_ATTEMPTS);
+        let ready = self.waiting.iter().chain(again).copied();
+        let mut ready = ready.filter(|place| !self.episodes[*place].rests(proven, now)).peekable();
         let lost = ready.peek().is_some_and(|&place| self.episodes[place].lost > 0);
         let places: Vec<usize> = ready.take(if lost { few } else { most }).collect();
         for &place in &places {

@@ -150,6 +150,18 @@ fn episodes_that_take_every_evaluator_with_them_are_given_up() {
     let late = report(&next, "b", vec![score(1, 0.0)]);
     assert_eq!(bench.deliver(&late).unwrap().0.new.len(), 1, "but is glad of them");
     assert_eq!(bench.board.missing(), expected[1..]);
+
+    // Whoever has shown that it works may try as often again.
+    bench.deliver(&full_report(&next, "a")).unwrap();
+    let mut tried = 0;
+    while let JobReply::Job(job) = bench.claim("b", tried, 2000 + tried)
+        && job.seeds[0] == 2
+    {
+        assert_eq!(job.seeds, [2, 3, 4, 5]);
+        tried += 1;
+        bench.expire(2000 + tried + LEASE.as_secs());
+    }
+    assert_eq!((tried, &bench.board.missing()[..]), (20, &expected[1..]));
 }
 
 #[test]
