@@ -5,7 +5,7 @@ use std::time::{Duration, Instant};
 
 use anyhow::anyhow;
 use quad_protocol::Name;
-use quad_service::Endpoints;
+use quad_service::{Beat, Endpoints};
 use tokio::runtime::Handle;
 use tokio::sync::mpsc::UnboundedReceiver;
 use tokio::sync::oneshot;
@@ -92,6 +92,8 @@ pub struct Conductor {
     pub threads: Threads,
     /// The progress display.
     pub display: Display,
+    /// Says that this loop is alive: it would not be if nobody took what it prints.
+    pub beat: Beat,
 }
 
 impl Conductor {
@@ -117,15 +119,28 @@ impl Conductor {
         let mut shutdown = std::pin::pin!(quad_service::shutdown_signal());
         let mut ticker = interval(self.display.interval());
         ticker.set_missed_tick_behavior(MissedTickBehavior::Skip);
-        let (mut training, mut settled, mut interrupted) = (true, false, false);
+        let (mut training, mut settled, mut interrupted, mut opened) = (true, false, false, false);
         let mut waiting = Waiting::default();
         let mut hangs = false;
         while training || !settled {
             tokio::select! {
-                session = &mut opening, if wire.is_none() => match self.go_online(session).await {
-                    Ok(online) => *wire = Some(online),
-                    Err(error) => return Ending::Failed(error),
-                },
+                session = &mut opening, if !opened => {
+                    opened = true;
+                    // To be sure that there is no other learner takes seconds.
+                    tokio::select! {
+                        online = self.go_online(session) => match online {
+                            Ok(online) => *wire = Some(online),
+                            Err(error) => return Ending::Failed(error),
+                        },
+                        () = &mut shutdown, if !interrupted => {
+                            interrupted = true;
+                            if !training {
+                                return Ending::Interrupted;
+                            }
+                            self.interrupt();
+                        }
+                    }
+                }
                 trained = &mut self.threads.trained, if training => {
                     training = false;
                     match trained {
@@ -143,6 +158,7 @@ impl Conductor {
                     notice => self.tell(notice),
                 },
                 _ = ticker.tick() => {
+                    self.beat.alive();
                     self.display.tick(Instant::now());
                     let busy_for = self.threads.desk.busy_for();
                     if busy_for > DISK_PATIENCE && !hangs {
@@ -159,12 +175,16 @@ impl Conductor {
                     if !training {
                         return Ending::Interrupted;
                     }
-                    self.display.say("stopping after this gradient step");
-                    self.threads.stop_training();
+                    self.interrupt();
                 }
             }
         }
         Ending::Complete
+    }
+
+    fn interrupt(&mut self) {
+        self.display.say("stopping after this gradient step");
+        self.threads.stop_training();
     }
 
     async fn go_online(&mut self, session: Opened) -> anyhow::Result<Wire> {
@@ -214,6 +234,11 @@ impl Conductor {
             Notice::Trained { pending } => {
                 let present = evaluators(self.metrics.evaluators.present.get());
                 format!("training is done; waiting for the scores of {pending} episodes ({present} here)")
+            }
+            Notice::Unchecked(episodes) => {
+                format!(
+                    "{episodes} episodes were not checked: no other evaluator of the same arithmetic was there for them"
+                )
             }
             Notice::ScoresDiffer([first, second]) => {
                 format!("evaluators {first} and {second} differ in the score of an episode: see audits.jsonl")

@@ -15,12 +15,13 @@ use quad_service::Beat;
 use tokio::sync::mpsc::UnboundedSender;
 use tracing::debug;
 
-use crate::hub::EvaluationPlan;
+use crate::hub::{EvaluationPlan, other_weights};
 use crate::inbox::Inbox;
 use crate::metrics::Metrics;
 use crate::notice::Notice;
 use crate::publisher::{self, Kept};
 use crate::run_dir::{Checkpoint, RunDir};
+use crate::scoreboard::OtherWeights;
 use crate::train::TrainedPolicy;
 use crate::trouble::{Saved, Trouble};
 
@@ -158,6 +159,7 @@ pub struct Keeper {
     run_dir: RunDir,
     metrics: Metrics,
     publisher: Inbox<publisher::Event>,
+    notices: UnboundedSender<Notice>,
     /// Snapshots of an earlier life, by step: training may come by them again.
     known: BTreeMap<u64, Hash>,
     trouble: Trouble,
@@ -174,8 +176,8 @@ impl Keeper {
         notices: UnboundedSender<Notice>,
         known: BTreeMap<u64, Hash>,
     ) -> Self {
-        let trouble = Trouble::new(Saved::Run, &metrics.disk, notices);
-        Self { desk, provenance, run_dir, metrics, publisher, known, trouble }
+        let trouble = Trouble::new(Saved::Run, &metrics.disk, notices.clone());
+        Self { desk, provenance, run_dir, metrics, publisher, notices, known, trouble }
     }
 
     /// The thread's work, until the desk is closed and empty.
@@ -211,9 +213,15 @@ impl Keeper {
             Origin { environment: task.environment, seed, step: *step, episodes, candidates }.attach(&policy.bytes)?;
         let hash = Hash::of(&tensors);
         self.metrics.evaluation.snapshot_bytes.set(tensors.len() as i64);
-        // One that has scores already and is another now must not be overwritten; the hub finds the difference.
-        if !self.known.contains_key(step) {
-            self.run_dir.write_snapshot(*step, &tensors)?;
+        match self.known.get(step) {
+            None => self.run_dir.write_snapshot(*step, &tensors)?,
+            Some(known) if *known == hash => {}
+            // It has scores already: neither overwritten nor published.
+            Some(known) => {
+                let error = OtherWeights { step: *step, found: hash, scored: known.to_string() };
+                self.notices.send(Notice::Failed(other_weights(error))).ok();
+                return Ok(policy.bytes.len());
+            }
         }
         if *evaluate {
             let kept = Kept { step: *step, kind: policy.kind, hash, tensors };

@@ -110,6 +110,7 @@ impl Begun {
     pub fn go_on(self, experiment: &Experiment) -> anyhow::Result<(RunDir, Log, Past)> {
         let Self { dir, scores, .. } = self;
         dir.remove_endpoints()?;
+        dir.remove_partial_files();
         let past = Past::read(&dir, experiment)?;
         info!("{}", past.summary(&dir));
         Ok((dir, scores, past))
@@ -125,16 +126,22 @@ impl Past {
         let (schedule, mut snapshots) = (experiment.schedule(), BTreeMap::new());
         for of in dir.snapshots()?.into_iter().filter(|of| schedule.is_evaluated(*of)) {
             // One that the training comes by again, and that nobody has looked at, will be made again.
-            if of <= step || scores.contains_key(&of) {
-                match dir.read_snapshot(of) {
-                    Ok(tensors) => drop(snapshots.insert(of, Hash::of(&tensors))),
-                    Err(error) => warn!("{:#}", anyhow::Error::from(error)),
+            let scored = scores.get(&of);
+            if of > step && scored.is_none() {
+                continue;
+            }
+            match dir.read_snapshot(of).map(|tensors| Hash::of(&tensors)) {
+                Ok(hash) if scored.is_some_and(|scored| scored.weights != hash.to_string()) => {
+                    warn!("the snapshot of step {of} is not the one that was scored: its file is damaged");
+                    dir.mark_damaged(of)?;
                 }
+                Ok(hash) => drop(snapshots.insert(of, hash)),
+                Err(error) => warn!("{:#}", anyhow::Error::from(error)),
             }
         }
-        for (of, earlier) in &scores {
-            let missing = !snapshots.contains_key(of) && *of <= step;
-            if missing && earlier.episodes.len() < experiment.episodes as usize {
+        for of in schedule.evaluated_steps().take_while(|of| *of <= step) {
+            let scored = scores.get(&of).map_or(0, |earlier| earlier.episodes.len());
+            if !snapshots.contains_key(&of) && scored < experiment.episodes as usize {
                 warn!("without the snapshot of step {of} its evaluation stays incomplete");
             }
         }

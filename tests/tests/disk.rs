@@ -63,7 +63,7 @@ fn a_full_disk_delays_scores_and_checkpoints_until_there_is_room() {
     let _evaluator = scratch.evaluator("one", &learner.endpoint());
     eventually("there are scores", PATIENCE, || (!learner.scores().is_empty()).then_some(()));
     fill(&disk.path.join("filler"));
-    wait_for_metric(&learner, "disk_trouble", |trouble| trouble == 1.0);
+    wait_for_metric(&learner, "disk_trouble", |trouble| trouble > 0.0);
     let (steps, scores) = (metric(&learner, "gradient_steps_total").unwrap(), learner.scores().len());
     learner.process.wait_for_log("No space left on device", PATIENCE);
     let (status, health) = http::get(&learner.metrics(), "/healthz").expect("the learner answers");
@@ -74,10 +74,39 @@ fn a_full_disk_delays_scores_and_checkpoints_until_there_is_room() {
     assert!(learner.scores().len() <= scores + 8, "a score counts as kept though there was no room for it");
 
     fs::remove_file(disk.path.join("filler")).unwrap();
-    learner.process.wait_for_log("takes what is saved again", PATIENCE);
+    learner.process.wait_for_log("the run can be saved again", PATIENCE);
     let status = learner.process.wait(PATIENCE);
     assert!(status.success(), "the learner ended with {status}");
     learner.assert_complete(&setting);
+}
+
+#[test]
+fn scores_wait_for_a_disk_that_is_full_and_that_is_told() {
+    let scratch = Scratch::new();
+    let Some(disk) = SmallDisk::mount(scratch.path().join("run")) else {
+        eprintln!("skipped: mounting a tmpfs needs the rights of root");
+        return;
+    };
+    let setting = Setting { steps: 500, eval_interval: 250, ..SETTING };
+    let mut learner = scratch.learner_with("run", setting, &LISTEN);
+    learner.process.wait_for_log("waiting for the scores", PATIENCE);
+    fill(&disk.path.join("filler"));
+    let evaluator = scratch.evaluator("one", &learner.endpoint());
+    let of_scores = || Some(http::sum(&http::metrics(&learner.metrics())?, "quad_learner_disk_trouble", "scores"));
+    eventually("the metric tells of it", PATIENCE, || (of_scores()? == 1.0).then_some(()));
+    learner.process.wait_for_log("scores cannot be saved", PATIENCE);
+    let (status, health) = http::get(&learner.metrics(), "/healthz").expect("the learner answers");
+    assert!(status == 503 && health.contains("scribe: scores cannot be saved"), "{status} {health}");
+    evaluator.process.wait_for_log("No space left on device", PATIENCE);
+    assert!(learner.scores().is_empty());
+
+    fs::remove_file(disk.path.join("filler")).unwrap();
+    learner.process.wait_for_log("scores can be saved again", PATIENCE);
+    let status = learner.process.wait(PATIENCE);
+    assert!(status.success(), "the learner ended with {status}");
+    learner.assert_complete(&setting);
+    let measured = http::sum(&http::metrics(&evaluator.metrics()).unwrap(), "quad_evaluator_episodes_total", "");
+    assert_eq!(measured, 8.0, "nothing is measured twice");
 }
 
 #[test]
@@ -102,9 +131,13 @@ fn hang(learner: &Learner) -> u64 {
     let kept = fs::read_dir(learner.run_dir.join("snapshots")).unwrap().count() as u64;
     let next = (kept + 1) * SETTING.eval_interval;
     assert!(next < SETTING.steps, "the training was over too soon");
-    // Who opens a pipe to write into it waits until somebody reads from it.
-    assert!(Command::new("mkfifo").arg(pipe(learner, next)).status().unwrap().success());
+    make_pipe(&pipe(learner, next));
     next
+}
+
+/// Who opens a pipe to write into it waits until somebody reads from it.
+fn make_pipe(path: &Path) {
+    assert!(Command::new("mkfifo").arg(path).status().unwrap().success());
 }
 
 fn pipe(learner: &Learner, step: u64) -> PathBuf {
@@ -115,9 +148,13 @@ fn pipe(learner: &Learner, step: u64) -> PathBuf {
 async fn a_run_that_fails_while_the_disk_hangs_says_why_and_ends() {
     let (scratch, other) = (Scratch::new(), Scratch::new());
     let mut learner = scratch.learner_with("run", SETTING, &LISTEN);
-    learner.process.wait_for_log("snapshot handed to evaluation", PATIENCE);
+    let evaluator = scratch.evaluator("one", &learner.endpoint());
+    eventually("there are scores", PATIENCE, || (!learner.scores().is_empty()).then_some(()));
     learner.process.terminate(PATIENCE);
+    drop(evaluator);
     let next = hang(&learner);
+    // With scores, there is a report to write.
+    make_pipe(&learner.run_dir.join("report.json.partial"));
 
     let endpoint = format!("tcp/127.0.0.1:{}", free_port());
     let _router = router(&endpoint).await;

@@ -7,6 +7,7 @@ use std::path::Path;
 use std::thread::sleep;
 use std::time::{Duration, Instant};
 
+use quad_protocol::Hash;
 use quad_tests::system::{Learner, Scratch, Setting, free_port};
 use quad_tests::{PATIENCE, eventually, http};
 use rand::{Rng, SeedableRng};
@@ -145,21 +146,69 @@ fn a_stopped_learner_goes_on_from_its_very_step() {
     assert!(twin.process.log().contains("another learner is at work"), "{}", twin.process.log());
 }
 
+/// As if the scores were of another machine's bits. Training has to come by the step again to find out.
 #[test]
 fn weights_that_come_out_otherwise_for_a_scored_step_end_the_run() {
+    for snapshot_is_there in [true, false] {
+        let scratch = Scratch::new();
+        let mut learner = scratch.learner("run", LONG);
+        let _evaluator = scratch.evaluator("one", &learner.endpoint());
+        eventually("there are scores", PATIENCE, || (!learner.scores().is_empty()).then_some(()));
+        learner.process.kill();
+        fs::remove_dir_all(learner.run_dir.join("checkpoints")).ok();
+        let first = learner.scores().remove(0);
+        let snapshot = learner.snapshot(first.key().0);
+        let mut bytes = fs::read(&snapshot).unwrap();
+        *bytes.last_mut().unwrap() ^= 1;
+        if snapshot_is_there {
+            fs::write(&snapshot, &bytes).unwrap();
+        }
+        let log = learner.run_dir.join("scores.jsonl");
+        let weights = Hash::of(&bytes).to_string();
+        fs::write(&log, fs::read_to_string(&log).unwrap().replace(first.text("weights"), &weights)).unwrap();
+        let mut learner = scratch.learner("run", LONG);
+        assert_eq!(learner.process.wait(PATIENCE).code(), Some(1));
+        let said = learner.process.log();
+        assert!(said.contains(&format!("but {weights} were scored before")), "{said}");
+        assert!(said.contains("hint: another kind of processor"), "{said}");
+        if snapshot_is_there {
+            assert!(fs::read(&snapshot).unwrap() == bytes, "what was scored is overwritten");
+        }
+    }
+}
+
+#[test]
+fn a_damaged_snapshot_holds_up_nothing_and_what_has_no_score_is_an_error_at_the_end() {
     let scratch = Scratch::new();
-    let mut learner = scratch.learner("run", LONG);
-    let _evaluator = scratch.evaluator("one", &learner.endpoint());
-    eventually("there are scores", PATIENCE, || (!learner.scores().is_empty()).then_some(()));
-    learner.process.kill();
-    let before = fs::read(learner.run_dir.join("scores.jsonl")).unwrap();
-    // As if the scores were of another machine's bits: no checkpoint, and a snapshot that training will not make again.
-    fs::remove_dir_all(learner.run_dir.join("checkpoints")).ok();
-    let weights = learner.scores()[0].text("weights").to_owned();
-    let changed = String::from_utf8(before).unwrap().replace(&weights, &"0".repeat(64));
-    fs::write(learner.run_dir.join("scores.jsonl"), &changed).unwrap();
-    let mut learner = scratch.learner("run", LONG);
+    let setting = Setting::default();
+    let mut learner = scratch.learner("run", setting);
+    let endpoint = learner.endpoint();
+    let _evaluator = scratch.evaluator("one", &endpoint);
+    assert!(learner.process.wait(PATIENCE).success());
+    let [first, second, ..] = setting.evaluated_steps()[..] else { panic!("two evaluations") };
+    let damage = |learner: &Learner, step| {
+        let mut bytes = fs::read(learner.snapshot(step)).unwrap();
+        *bytes.last_mut().unwrap() ^= 1;
+        fs::write(learner.snapshot(step), bytes).unwrap();
+    };
+    damage(&learner, first);
+    let leftover = learner.run_dir.join("checkpoints/step_000000001_0123456789abcdef.safetensors.partial");
+    fs::write(&leftover, "half").unwrap();
+    let mut learner = scratch.learner_with("run", setting, &["--listen", &endpoint]);
+    assert!(learner.process.wait(PATIENCE).success(), "it has all its scores");
+    assert!(learner.process.log().contains("its file is damaged"), "{}", learner.process.log());
+    assert!(!leftover.exists());
+
+    // One that has not all of them cannot get the rest.
+    damage(&learner, second);
+    let log = learner.run_dir.join("scores.jsonl");
+    let lines = fs::read_to_string(&log).unwrap();
+    let lost = lines.lines().position(|line| line.contains(&format!("\"step\":{second},"))).unwrap();
+    let kept = lines.lines().enumerate().filter(|(number, _)| *number != lost).map(|(_, line)| format!("{line}\n"));
+    fs::write(&log, kept.collect::<String>()).unwrap();
+    let mut learner = scratch.learner_with("run", setting, &["--listen", &endpoint]);
     assert_eq!(learner.process.wait(PATIENCE).code(), Some(1));
-    assert!(learner.process.log().contains("were scored before"), "{}", learner.process.log());
-    assert!(learner.process.log().contains("hint: another kind of processor"), "{}", learner.process.log());
+    for said in [&format!("without the snapshot of step {second}")[..], "but 1 episodes have no score", "hint: "] {
+        assert!(learner.process.log().contains(said), "{}", learner.process.log());
+    }
 }

@@ -26,10 +26,12 @@ use crate::presets;
 use crate::report::RunReport;
 use crate::resume::{self, Begun, Past};
 use crate::run_dir::{Log, RunDir};
-use crate::threads::{Run, Threads};
+use crate::threads::{Run, STUCK, Threads};
 
 /// Where evaluators look by default.
 const DEFAULT_PORT: u16 = 7447;
+/// How long a run that has failed may write its report.
+const REPORT_PATIENCE: Duration = Duration::from_secs(5);
 /// For a run without evaluations, which needs no known port: several of them may run at a time.
 const ANY_PORT: u16 = 0;
 
@@ -133,6 +135,7 @@ async fn conduct(
         notices,
         threads,
         display,
+        beat: health.part("main", STUCK),
     };
     Ok((run_dir, conductor.conduct(opening).await?))
 }
@@ -175,11 +178,15 @@ fn endpoints(args: &TrainArgs, eval_interval: u64) -> anyhow::Result<Endpoints> 
 /// Writes the report, however the run ended; a run that did not complete is an error.
 fn conclude(run_dir: &RunDir, config: &RunConfig, ending: Ending) -> anyhow::Result<()> {
     let folder = run_dir.path().display();
-    let reported = summarise(run_dir);
+    let reported = match &ending {
+        // Perhaps of a disk that hangs.
+        Ending::Failed(_) => within(REPORT_PATIENCE, run_dir.clone(), |run_dir| summarise(&run_dir)),
+        _ => summarise(run_dir),
+    };
     let kept =
         format!("everything up to the newest checkpoint is kept in {folder}; the same command goes on from there");
     let error = match ending {
-        Ending::Complete => return reported,
+        Ending::Complete => return all_scored(reported?),
         Ending::Failed(error) => error,
         Ending::Interrupted => {
             anyhow!("interrupted before the end of {} steps and their evaluations", config.experiment.steps)
@@ -191,7 +198,28 @@ fn conclude(run_dir: &RunDir, config: &RunConfig, ending: Ending) -> anyhow::Res
     Err(hinted(error, kept))
 }
 
-fn summarise(run_dir: &RunDir) -> anyhow::Result<()> {
+/// That no episode was given up.
+fn all_scored(report: RunReport) -> anyhow::Result<()> {
+    let missing: usize = report.missing.iter().map(|missing| missing.episodes).sum();
+    if missing == 0 {
+        return Ok(());
+    }
+    let hint = "the log says why; when that is mended, the same command hands them out again";
+    Err(anyhow!("training is complete, but {missing} episodes have no score")).hint(hint)
+}
+
+/// Does it on another thread, which is not waited for any longer.
+fn within<I: Send + 'static, T: Send + 'static>(
+    patience: Duration,
+    input: I,
+    work: impl FnOnce(I) -> anyhow::Result<T> + Send + 'static,
+) -> anyhow::Result<T> {
+    let (tell, told) = std::sync::mpsc::channel();
+    std::thread::spawn(move || tell.send(work(input)));
+    told.recv_timeout(patience).unwrap_or_else(|_| Err(anyhow!("it took longer than {patience:?}")))
+}
+
+fn summarise(run_dir: &RunDir) -> anyhow::Result<RunReport> {
     let report = RunReport::read(run_dir.path())?;
     let mut text = String::new();
     if !report.evaluations.is_empty() {
@@ -200,7 +228,8 @@ fn summarise(run_dir: &RunDir) -> anyhow::Result<()> {
         plot::learning_curves(&picture, std::slice::from_ref(&report))?;
         text = format!("\n{}\nlearning curve: {}\n", report.table(), picture.display());
     }
-    Ok(print(&format!("{text}run folder: {}", run_dir.path().display()))?)
+    print(&format!("{text}run folder: {}", run_dir.path().display()))?;
+    Ok(report)
 }
 
 fn default_run_dir(preset: &str, experiment: &Experiment) -> anyhow::Result<PathBuf> {

@@ -7,6 +7,9 @@ use std::path::{Path, PathBuf};
 
 use super::{RunDirError, io_error};
 
+/// Ending of a file that is being written.
+const PARTIAL: &str = ".partial";
+
 /// Replaces the file `target`: written beside it, synchronised, renamed, and the folder synchronised, without which a power
 /// cut could undo the renaming.
 pub(super) fn replace(target: &Path, bytes: &[u8]) -> Result<(), RunDirError> {
@@ -23,8 +26,19 @@ pub(super) fn replace(target: &Path, bytes: &[u8]) -> Result<(), RunDirError> {
 
 fn partial(target: &Path) -> PathBuf {
     let mut name = OsString::from(target.file_name().unwrap_or_default());
-    name.push(".partial");
+    name.push(PARTIAL);
     target.with_file_name(name)
+}
+
+/// Removes the half files that killed processes have left in a folder. One that stays does no harm but to take room.
+pub(super) fn remove_partial_files(folder: &Path) {
+    let Ok(entries) = fs::read_dir(folder) else { return };
+    for entry in entries.flatten() {
+        let is_partial = entry.file_name().to_string_lossy().ends_with(PARTIAL);
+        if is_partial && entry.file_type().is_ok_and(|kind| kind.is_file()) {
+            fs::remove_file(entry.path()).ok();
+        }
+    }
 }
 
 fn write_synchronised(path: &Path, bytes: &[u8]) -> io::Result<()> {

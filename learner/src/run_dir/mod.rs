@@ -152,6 +152,19 @@ impl RunDir {
         fs::read(&path).map_err(io_error("read", &path))
     }
 
+    /// Renames a snapshot whose contents are not what was scored, so that it does not count as one any more.
+    pub fn mark_damaged(&self, step: u64) -> Result<(), RunDirError> {
+        let path = self.snapshot_path(step);
+        fs::rename(&path, path.with_extension("damaged")).map_err(io_error("rename", &path))
+    }
+
+    /// Removes what writers that were killed have left behind.
+    pub fn remove_partial_files(&self) {
+        for folder in [self.path.clone(), self.path.join("snapshots"), self.path.join("checkpoints")] {
+            durable::remove_partial_files(&folder);
+        }
+    }
+
     /// The gradient steps of which there are snapshots, in ascending order.
     pub fn snapshots(&self) -> Result<Vec<u64>, RunDirError> {
         let folder = self.path.join("snapshots");
