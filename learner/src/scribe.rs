@@ -7,18 +7,14 @@ use std::thread;
 use std::time::Duration;
 
 use quad_service::Beat;
-use tracing::{debug, error};
 
 use crate::hub::Event;
 use crate::inbox::Inbox;
-use crate::run_dir::{AuditLine, Log, RunDirError, ScoreLine};
+use crate::run_dir::{AuditLine, Log, PatientLog, RunDirError, ScoreLine};
 use crate::trouble::Trouble;
 
 /// After a write, scores are left to gather for so long: to synchronise a file takes much of a processor, too.
 const GATHER: Duration = Duration::from_millis(50);
-
-/// Most audits that are kept for a disk that does not take them.
-const MOST_UNWRITTEN: usize = 10_000;
 
 /// What is to be written.
 #[derive(Debug)]
@@ -35,15 +31,13 @@ pub struct Scribe {
     /// `scores.jsonl`.
     pub scores: Log,
     /// Where episodes are written down that were scored twice, if any are to be.
-    pub audits: Option<Log>,
+    pub audits: Option<PatientLog<AuditLine>>,
     /// What is to be written, in its order.
     pub lines: Receiver<Lines>,
     /// Who is told.
     pub hub: Inbox<Event>,
     /// How the disk takes the scores.
     pub trouble: Trouble,
-    /// Audits that the disk has not taken.
-    pub unwritten: Vec<AuditLine>,
 }
 
 impl Scribe {
@@ -61,24 +55,16 @@ impl Scribe {
                     self.hub.send(Event::Written(written.map_err(|error| said(&error))));
                     thread::sleep(GATHER);
                 }
-                Ok(Lines::Audits(lines)) => self.unwritten.extend(lines),
-                Err(RecvTimeoutError::Timeout) => {}
-                Err(RecvTimeoutError::Disconnected) => return,
+                Ok(Lines::Audits(lines)) => self.append_audits(lines),
+                Err(RecvTimeoutError::Timeout) => self.append_audits(Vec::new()),
+                Err(RecvTimeoutError::Disconnected) => return self.append_audits(Vec::new()),
             }
-            self.write_audits();
         }
     }
 
-    /// What the disk does not take is kept for the next time.
-    fn write_audits(&mut self) {
-        let Some(log) = self.audits.as_mut().filter(|_| !self.unwritten.is_empty()) else { return };
-        match log.append(&self.unwritten) {
-            Ok(()) => self.unwritten.clear(),
-            Err(error) if self.unwritten.len() > MOST_UNWRITTEN => {
-                error!("{} audits are not saved: {}", self.unwritten.len(), said(&error));
-                self.unwritten.clear();
-            }
-            Err(error) => debug!("the audits are saved later: {}", said(&error)),
+    fn append_audits(&mut self, lines: Vec<AuditLine>) {
+        if let Some(log) = &mut self.audits {
+            log.append(lines);
         }
     }
 }

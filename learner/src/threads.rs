@@ -14,7 +14,6 @@ use quad_protocol::Name;
 use quad_service::{Beat, Health};
 use tokio::sync::mpsc::UnboundedSender;
 use tokio::sync::oneshot;
-use tracing::warn;
 
 use crate::config::RunConfig;
 use crate::hub::{self, EvaluationPlan, Hub};
@@ -24,7 +23,7 @@ use crate::metrics::Metrics;
 use crate::notice::Notice;
 use crate::publisher::{self, Identity, SnapshotPublisher};
 use crate::resume::Past;
-use crate::run_dir::{Log, RunDir};
+use crate::run_dir::{Log, PatientLog, RunDir};
 use crate::scoreboard::{Rules, Scoreboard};
 use crate::scribe::Scribe;
 use crate::train::Row;
@@ -107,11 +106,11 @@ impl Threads {
         let plan = EvaluationPlan { seed: experiment.seed, episodes: experiment.episodes };
         let mut scoreboard = Scoreboard::new(rules);
         scoreboard.remember(earlier);
-        let audits = if audit > 0.0 { Some(dir.audit_log()?) } else { None };
+        let audits = if audit > 0.0 { Some(PatientLog::new(dir.audit_log()?)) } else { None };
         let (hub, hub_messages) = inbox();
         let (sender, lines) = channel();
         let trouble = Trouble::new(Saved::Scores, &metrics.disk, notices.clone());
-        let scribe = Scribe { scores, audits, lines, hub: hub.clone(), trouble, unwritten: Vec::new() };
+        let scribe = Scribe { scores, audits, lines, hub: hub.clone(), trouble };
         let scribe = spawn("scribe", notices, with(health.part("scribe", STUCK), move |beat| scribe.run(beat)))?;
         let state = Hub::new(name.clone(), plan, scoreboard, sender, metrics.clone(), notices.clone());
         let hub_thread =
@@ -257,16 +256,12 @@ fn finish(name: &str, thread: Thread) -> anyhow::Result<()> {
     Ok(thread.join().map_err(|_| anyhow!("the thread `{name}` panicked"))??)
 }
 
-fn write_rows(rows: &Receiver<Row>, mut log: Log) {
-    let mut warned = false;
+fn write_rows(rows: &Receiver<Row>, log: Log) {
+    let mut log = PatientLog::new(log);
     for row in rows {
-        if let Err(error) = log.append(&[row])
-            && !warned
-        {
-            warned = true;
-            warn!(%error, "training metrics cannot be saved; training goes on");
-        }
+        log.append([row]);
     }
+    log.append([]);
 }
 
 #[cfg(test)]

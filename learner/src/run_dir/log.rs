@@ -2,7 +2,7 @@
 
 use std::fs::{File, OpenOptions, TryLockError};
 use std::io::{self, Read, Seek, SeekFrom, Write};
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 
 use serde::Serialize;
 use tracing::warn;
@@ -44,6 +44,20 @@ impl Log {
         let durable = log.mend().and_then(|()| log.synchronise()).and_then(|()| synchronise_folder(&log.path));
         durable.map_err(io_error("open", &log.path))?;
         Ok(log)
+    }
+
+    /// Where it is.
+    pub(super) fn path(&self) -> &Path {
+        &self.path
+    }
+
+    /// For tests: neither locked nor looked at, and whole.
+    #[cfg(test)]
+    pub(super) fn unchecked(path: PathBuf) -> Self {
+        let opened = OpenOptions::new().create(true).append(true).open(&path);
+        #[allow(clippy::unwrap_used)]
+        let file = opened.unwrap();
+        Self { path, file, length: 0, torn: false, synchronise: false }
     }
 
     /// Whether there is no whole line in it.

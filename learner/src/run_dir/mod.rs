@@ -18,6 +18,7 @@ mod durable;
 mod error;
 mod lines;
 mod log;
+mod patient;
 
 use std::fs;
 use std::io;
@@ -34,6 +35,7 @@ pub use error::RunDirError;
 use error::{content, io_error};
 pub use lines::{AuditLine, RunEndpoints, ScoreLine};
 pub use log::Log;
+pub use patient::PatientLog;
 
 /// The folder of one run.
 #[derive(Clone, Debug)]

@@ -69,9 +69,7 @@ pub fn file(step: u64) -> Vec<u8> {
 fn scribe(scores: Log, hub: Inbox<hub::Event>, trouble: Trouble, disk: Arc<Mutex<usize>>) -> Sender<Lines> {
     let (sender, before) = channel();
     let (forward, lines) = channel();
-    std::thread::spawn(move || {
-        Scribe { scores, audits: None, lines, hub, trouble, unwritten: Vec::new() }.run(&beat())
-    });
+    std::thread::spawn(move || Scribe { scores, audits: None, lines, hub, trouble }.run(&beat()));
     std::thread::spawn(move || {
         for lines in before {
             *disk.blocking_lock() += 1;
