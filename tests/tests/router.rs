@@ -1,8 +1,8 @@
 //! Several runs behind one router, one evaluator for all of them.
 #![allow(clippy::unwrap_used, clippy::expect_used)]
 
-use std::sync::Arc;
 use std::sync::atomic::{AtomicUsize, Ordering::Relaxed};
+use std::sync::{Arc, mpsc};
 use std::time::{Duration, Instant};
 
 use quad_protocol::{Name, keys};
@@ -11,6 +11,9 @@ use quad_tests::crowd::{Crowd, Pace};
 use quad_tests::router::{configuration, router};
 use quad_tests::system::{Scratch, Setting, free_port};
 use quad_tests::{PATIENCE, eventually, http};
+use zenoh::bytes::ZBytes;
+use zenoh::key_expr::KeyExpr;
+use zenoh::query::Query;
 
 #[tokio::test(flavor = "multi_thread")]
 async fn one_evaluator_serves_two_runs_in_turn_and_survives_the_routers_restart() {
@@ -128,9 +131,46 @@ async fn a_flood_ends_at_the_router_and_an_evaluator_of_many_runs_is_none() {
     tokio::join!(honest, flood);
     assert!(!evaluator.process.log().contains("nobody answered"), "{}", evaluator.process.log());
 
-    let [plain, protected] =
-        ["router.json5", "router-tls.json5"].map(|file| configuration(file).get_json("downsampling").unwrap());
-    assert_eq!(plain, protected, "both routers end the same floods");
+    for section in ["downsampling", "low_pass_filter"] {
+        let [plain, protected] =
+            ["router.json5", "router-tls.json5"].map(|file| configuration(file).get_json(section).unwrap());
+        assert_eq!(plain, protected, "both routers drop the same: {section}");
+    }
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn what_is_too_large_ends_at_the_router() {
+    let endpoint = format!("tcp/127.0.0.1:{}", free_port());
+    let session = router(&endpoint).await;
+    let stranger = open_session(&Endpoints { connect: vec![endpoint], ..Endpoints::default() }).await.unwrap();
+    let (sender, arrived) = mpsc::channel();
+    let questioned = sender.clone();
+    let told = move |key: &KeyExpr, size| sender.send((key.to_string(), size)).unwrap();
+    let subscriber = session.declare_subscriber("quad/run/**");
+    let _subscriber = subscriber.callback(move |put| told(put.key_expr(), put.payload().len())).await.unwrap();
+    let asked = move |query: Query| {
+        let size = query.payload().map_or(0, ZBytes::len);
+        questioned.send((query.key_expr().to_string(), size)).unwrap();
+    };
+    let _queryable = session.declare_queryable("quad/run/**").callback(asked).await.unwrap();
+
+    let puts = [("progress/e", 1 << 12), ("scores/1", 1 << 20)];
+    let questions = [("weights/1", 1 << 12), ("jobs", 1 << 18), ("scores", 1 << 18)];
+    for (number, (key, largest)) in puts.into_iter().chain(questions).enumerate() {
+        let key = format!("quad/run/{key}");
+        // Slowly enough for the limits on how many there may be.
+        for size in [largest, largest + 1, largest] {
+            tokio::time::sleep(Duration::from_millis(250)).await;
+            match number < puts.len() {
+                true => stranger.put(&key, vec![0; size]).await.unwrap(),
+                false => stranger.get(&key).payload(vec![0; size]).callback(drop).await.unwrap(),
+            }
+        }
+        let next = || arrived.recv_timeout(PATIENCE).unwrap();
+        assert_eq!([next(), next()], [(key.clone(), largest), (key, largest)]);
+    }
+    stranger.put("quad/run/progress/e", vec![0; 60 << 20]).await.unwrap();
+    assert_eq!(arrived.recv_timeout(Duration::from_secs(3)).ok(), None, "60 MB of progress");
 }
 
 #[tokio::test(flavor = "multi_thread")]
