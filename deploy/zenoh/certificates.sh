@@ -16,10 +16,10 @@
 #
 # The result is the folder DIR/NAME with ca.pem, cert.pem and key.pem, for `--certificates` of learner and evaluator: copy
 # it to the machine that it is for. Made again, it is renewed. The authority is DIR/ca, made when it is missing: its key
-# (DIR/ca/key.pem) signs, so it stays on this machine, and whoever has it can make any certificate.
+# (DIR/ca/key.pem) signs, so it stays on this machine, or offline until this runs again: whoever has it can make any certificate.
 #
 #   --in DIR   [default: certificates]
-#   --days N   how long the certificate is valid [default: 365]; the authority is for ten years
+#   --days N   how long the certificate is valid [default: 365]; the authority is for ten years, and no certificate for longer
 set -euo pipefail
 FROM=$PWD
 cd "$(dirname "$0")/../.."
@@ -58,6 +58,7 @@ esac
   wrong "the name $WHO is not made of 1 to 64 letters, digits, dots, dashes or underscores"
 [ "$WHO" != ca ] || wrong "the name ca is the authority's"
 [[ $DAYS =~ ^[0-9]{1,5}$ ]] || wrong "--days takes a number of days, not $DAYS"
+DAYS=$((10#$DAYS)) # 089 is no number to a shell
 command -v openssl >/dev/null || die "openssl is not there" "install it: apt-get install --no-install-recommends openssl"
 
 umask 077
@@ -68,7 +69,12 @@ new_key() { # new_key FILE: on the curve that every TLS library has
   try "is this openssl 1.1.1 or newer?" openssl genpkey -algorithm EC -pkeyopt ec_paramgen_curve:P-256 -out "$1"
 }
 
-if [ ! -e "$DIR/ca/key.pem" ]; then
+if [ ! -e "$DIR/ca/key.pem" ] || [ ! -e "$DIR/ca/ca.pem" ]; then
+  # Whoever has a certificate trusts the authority that signed it, and would refuse what another one signs.
+  for made in "$DIR"/*/ca.pem "$DIR/ca/key.pem"; do
+    [ ! -e "$made" ] || die "$made is there, but not the whole authority: $DIR/ca/ca.pem and $DIR/ca/key.pem" \
+      "if they are kept elsewhere, put them back while this runs; for another authority, which nobody trusts yet, move $DIR away"
+  done
   mkdir -p "$SCRATCH/ca"
   new_key "$SCRATCH/ca/key.pem"
   # Its name is its own, so that programs can tell one authority from another before they connect.
@@ -90,6 +96,10 @@ fi
     if [[ ${HOSTS[i]} =~ ^[0-9.]+$ || ${HOSTS[i]} == *:* ]]; then echo "IP.$i = ${HOSTS[i]}"; else echo "DNS.$i = ${HOSTS[i]}"; fi
   done
 } >"$SCRATCH/extensions"
+
+openssl x509 -in "$DIR/ca/ca.pem" -noout -checkend $((DAYS * 24 * 60 * 60)) >/dev/null ||
+  die "the authority ($DIR/ca/ca.pem) is not valid for $DAYS more days, and no certificate is good for longer than that" \
+    "ask for fewer by --days; or, for another authority, move $DIR away and make all certificates anew"
 
 made=$SCRATCH/$WHO
 mkdir "$made"

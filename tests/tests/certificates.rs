@@ -58,3 +58,31 @@ fn what_cannot_be_safe_is_refused_before_anything_starts() {
     command.arg("serve").env("QUAD_CERTIFICATES", certificates.of("nowhere"));
     assert_refused(&command.output().unwrap(), "nowhere/ca.pem", "certificates.sh");
 }
+
+#[test]
+fn no_authority_is_replaced_and_no_certificate_outlives_it() {
+    let Some(certificates) = Certificates::make() else { return };
+    let folder = certificates.of("learner").parent().unwrap().to_owned();
+    let make = |days: &str| {
+        let script = Path::new(env!("CARGO_MANIFEST_DIR")).join("../deploy/zenoh/certificates.sh");
+        Command::new(script).arg("--in").arg(&folder).args(["--days", days, "evaluator", "another"]).output().unwrap()
+    };
+    let refused = |days: &str, because: &str, advice: &str| {
+        let output = make(days);
+        let said = String::from_utf8_lossy(&output.stderr);
+        assert!(output.status.code() == Some(1) && said.contains(because) && said.contains(advice), "{said}");
+        assert!(!folder.join("another").exists(), "a certificate was made");
+    };
+    refused("3651", "is not valid for 3651 more days", "ask for fewer");
+    for offline in ["ca/key.pem", "ca/ca.pem", "ca"] {
+        fs::rename(folder.join(offline), folder.join("offline")).unwrap();
+        refused("10", "is there, but not the whole authority", "put them back");
+        // A new authority would be in the way.
+        fs::rename(folder.join("offline"), folder.join(offline)).unwrap();
+    }
+    for days in ["3649", "0089"] {
+        assert!(make(days).status.success(), "{days} days");
+    }
+    let authority = |name: &str| fs::read(folder.join(name).join("ca.pem")).unwrap();
+    assert_eq!(authority("another"), authority("learner"));
+}
