@@ -10,7 +10,7 @@ use quad_policy::{
     NoisePredictor, Policy, Precision, Weights, load_policy,
 };
 
-/// What is not counted, such as the embedding of each denoising step: a thousandth of what an evaluator gives, bytes.
+/// What is not counted, such as the embedding of each denoising step: little of what an evaluator gives, bytes.
 const SMALL_CHANGE: usize = 1 << 20;
 
 /// The system's allocator, which counts.

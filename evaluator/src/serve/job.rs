@@ -16,8 +16,9 @@ use crate::rollout::{EpisodeOutcome, Rollout};
 const MAX_ROWS: usize = 65_536;
 /// Most episodes: each is a simulation of its own. A learner gives forty at most.
 const MAX_EPISODES: usize = 256;
-/// Most memory that one network call may take, bytes.
-const MAX_BYTES: u64 = 1 << 30;
+/// Most memory that one network call may take, bytes: far more than the paper's few megabytes, and far less than an evaluator's
+/// container may have (1 GiB, in docker-compose.yml), of which snapshots and policy take their part.
+const MAX_BYTES: u64 = 256 << 20;
 /// Most multiplications of one network call, which cannot be broken off: a minute on a slow core. The paper's have 10⁹.
 const MAX_PRODUCTS: u64 = 1 << 40;
 
@@ -262,6 +263,11 @@ mod tests {
         assert!(check_cost(&job(1, 1), policy(1, 65_535, 1).as_ref()).is_ok());
         let many_critics = check_cost(&job(256, 256), policy(1, 65_535, 1).as_ref());
         assert!(matches!(many_critics, Err(JobError::Cost { bytes: 17_000_000_000.., .. })), "{many_critics:?}");
+        let many_critics = check_cost(&job(256, 256), policy(1, 3_500, 1).as_ref());
+        assert!(
+            matches!(many_critics, Err(JobError::Cost { bytes: 900_000_000..1_000_000_000, .. })),
+            "{many_critics:?}"
+        );
         let slow = check_cost(&job(256, 256), policy(512, 1, 1000).as_ref());
         assert!(matches!(slow, Err(JobError::Cost { products: 10_000_000_000_000.., .. })), "{slow:?}");
     }
