@@ -6,7 +6,7 @@ use crate::weights::Tensors;
 use crate::{ActionNoise, DiffusionShape, GaussianShape, PolicyError, Precision, check_finite};
 use candle_core::Device;
 use candle_core::safetensors::Load;
-use safetensors::SafeTensors;
+use safetensors::{SafeTensorError, SafeTensors};
 use serde::{Deserialize, Serialize};
 use std::collections::{BTreeMap, HashMap};
 
@@ -14,6 +14,9 @@ use std::collections::{BTreeMap, HashMap};
 const DESCRIPTION: &str = "policy";
 /// Widest hidden layer, most critics and most denoising steps that are believed.
 pub(crate) const MOST: usize = u16::MAX as usize;
+/// Longest header of a safetensors file that is read, bytes. The paper's networks have 3 KB; a million empty tensors would
+/// take a gigabyte of memory before anything else is known of them.
+const MAX_HEADER: u64 = 1 << 20;
 
 /// What one call of [`Policy::act`] takes, at most.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -81,6 +84,7 @@ impl Description {
     /// # Errors
     /// No such file, or one that says nothing of the kind.
     pub fn read(file: &[u8]) -> Result<Self, PolicyError> {
+        check_header(file)?;
         let (_, metadata) = SafeTensors::read_metadata(file)?;
         let described = metadata.metadata().as_ref().and_then(|metadata| metadata.get(DESCRIPTION));
         Ok(serde_json::from_str(described.ok_or(PolicyError::NoDescription)?)?)
@@ -123,11 +127,55 @@ pub fn load_policy(bytes: &[u8], precision: Precision) -> Result<Box<dyn Policy>
 /// # Errors
 /// A file that cannot be read.
 pub fn read_tensors(bytes: &[u8]) -> Result<Tensors, PolicyError> {
+    check_header(bytes)?;
     let file = SafeTensors::deserialize(bytes)?;
     file.tensors().into_iter().map(|(name, view)| Ok((name, view.load(&Device::Cpu)?))).collect()
+}
+
+/// That the header is not too long, which the file's first eight bytes say; one without them is refused later.
+fn check_header(file: &[u8]) -> Result<(), PolicyError> {
+    match file.first_chunk() {
+        Some(length) if u64::from_le_bytes(*length) > MAX_HEADER => Err(SafeTensorError::HeaderTooLarge.into()),
+        _ => Ok(()),
+    }
 }
 
 /// That a shape's number is one that somebody could mean.
 pub(crate) fn check_range(field: &'static str, value: usize) -> Result<(), PolicyError> {
     if (1..=MOST).contains(&value) { Ok(()) } else { Err(PolicyError::Range { field, value }) }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use std::fmt::Write;
+
+    /// A file of so many tensors without numbers.
+    fn empty_tensors(count: usize) -> Vec<u8> {
+        let mut header = String::from("{\"__metadata__\":{\"policy\":\"none\"}");
+        for number in 0..count {
+            write!(header, ",\"{number:07}\":{{\"dtype\":\"F32\",\"shape\":[0],\"data_offsets\":[0,0]}}").unwrap();
+        }
+        header.push('}');
+        [&(header.len() as u64).to_le_bytes(), header.as_bytes()].concat()
+    }
+
+    #[test]
+    fn a_header_that_is_too_long_is_not_even_read() {
+        let refused = |file: &[u8]| {
+            let [read, loaded] = [read_tensors(file).map(drop), load_policy(file, Precision::F32).map(drop)];
+            [read, loaded].map(|result| matches!(result, Err(PolicyError::Unreadable(SafeTensorError::HeaderTooLarge))))
+        };
+        let many = empty_tensors(20_000);
+        assert!(many.len() as u64 > MAX_HEADER && SafeTensors::deserialize(&many).is_ok());
+        assert_eq!(refused(&many), [true; 2]);
+        // Reading it would find that this is no text.
+        let noise = [&(MAX_HEADER + 1).to_le_bytes()[..], &vec![0xff; 2 * MAX_HEADER as usize]].concat();
+        assert_eq!(refused(&noise), [true; 2]);
+
+        assert_eq!(read_tensors(&empty_tensors(10_000)).unwrap().len(), 10_000);
+        for file in [&empty_tensors(10_000)[..], b"short", b""] {
+            assert_eq!(refused(file), [false; 2]);
+        }
+    }
 }
