@@ -12,5 +12,6 @@ mod crash;
 mod faults;
 mod firewall;
 mod images;
+mod stop;
 mod tls;
 mod whole;
