@@ -2,7 +2,7 @@
 
 use std::pin::pin;
 use std::thread;
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
 use tokio::signal::unix::{Signal, SignalKind, signal};
 use tokio::sync::oneshot;
@@ -10,6 +10,9 @@ use tracing::{info, warn};
 
 /// A process that was told to end has so long for it: less than the 10 s after which Docker kills.
 const LEAVE_WITHIN: Duration = Duration::from_secs(9);
+/// Whoever sends one signal may send another at once and mean the same: a terminal's Ctrl-C reaches a script and what it has
+/// started, and then the script tells these to end, as well.
+const SAME: Duration = Duration::from_millis(500);
 /// What is said last gets so long to be read.
 const LAST_WORDS: Duration = Duration::from_millis(100);
 /// What a shell reports of a process that SIGINT has ended.
@@ -17,17 +20,26 @@ const ENDED_AT_ONCE: i32 = 130;
 
 /// Becomes ready at the first SIGINT (Ctrl-C) or SIGTERM after this call, even if it is not awaited by then.
 ///
-/// From this call on, the first of the two signals does not end the process by itself any more. The second one does, at
-/// once, with exit code 130; and so does the process itself if it is still there 9 s after the first, whatever it waits
+/// From this call on, the first of the two signals does not end the process by itself any more. The next one does that comes
+/// half a second later or more, at once, with exit code 130; and so does the process itself if it is still there 9 s after the first, whatever it waits
 /// for. Needs a tokio runtime, and lasts as long as that.
 pub fn shutdown_signal() -> impl Future<Output = ()> + Send {
     let (mut interrupt, mut terminate) = (listen(SignalKind::interrupt()), listen(SignalKind::terminate()));
     let (tell, told) = oneshot::channel();
     tokio::spawn(async move {
         let name = either(&mut interrupt, &mut terminate).await;
+        let first = Instant::now();
         tell.send(()).ok();
         aside(move || info!("received {name}"));
-        match tokio::time::timeout(LEAVE_WITHIN, either(&mut interrupt, &mut terminate)).await {
+        let another = async {
+            loop {
+                let again = either(&mut interrupt, &mut terminate).await;
+                if first.elapsed() >= SAME {
+                    return again;
+                }
+            }
+        };
+        match tokio::time::timeout(LEAVE_WITHIN, another).await {
             Ok(again) => aside(move || warn!("received {again} after {name}: ending at once")),
             Err(_) => {
                 aside(move || warn!("{} s after {name} something still hangs: ending at once", LEAVE_WITHIN.as_secs()))
