@@ -100,13 +100,16 @@ impl RunClient {
             complaint: String::new(),
             _token: token,
         };
-        client.follow(&found.lives);
+        client.follow(found);
         Ok(client)
     }
 
     /// Follows the learner that it follows already, if that is among these; else the one that was started first, because of two
     /// learners of one name the later one stops.
-    pub fn follow(&mut self, lives: &BTreeSet<u64>) {
+    pub fn follow(&mut self, Found { lives, proven, .. }: &Found) {
+        // A run that has gone and come again is found anew.
+        proven.fetch_or(self.proven.load(Relaxed), Relaxed);
+        self.proven = proven.clone();
         if let Some(&first) = lives.first()
             && !lives.contains(&self.incarnation)
         {
@@ -279,3 +282,6 @@ impl RunClient {
         }
     }
 }
+
+#[cfg(test)]
+mod tests;

@@ -114,7 +114,7 @@ impl Worker {
         for (key, learner) in &found {
             let was_gone = self.gone.remove(key).is_some();
             if let Some(run) = self.runs.get_mut(key) {
-                run.follow(&learner.lives);
+                run.follow(learner);
                 if was_gone {
                     run.standing.wake(Instant::now());
                 }
