@@ -28,6 +28,18 @@ pub async fn router(endpoint: &str) -> Session {
     zenoh::open(config).await.expect("the port is free")
 }
 
+/// The same, but it passes on no scores: however fast a machine is, no job is over before a test lets something happen to it.
+/// A learner that listens itself is one to `connect` to.
+pub async fn router_without_scores(endpoint: &str, connect: Option<&str>) -> Session {
+    let mut config = configuration("router.json5");
+    config.insert_json5("listen/endpoints", &format!("[{endpoint:?}]")).expect("the setting exists");
+    let connect: Vec<&str> = connect.into_iter().collect();
+    config.insert_json5("connect/endpoints", &format!("{connect:?}")).expect("the setting exists");
+    let filter = r#"[{ flows: ["ingress"], messages: ["query"], key_exprs: ["quad/*/scores"], size_limit: 0 }]"#;
+    config.insert_json5("low_pass_filter", filter).expect("the setting exists");
+    zenoh::open(config).await.expect("the port is free")
+}
+
 /// A file of deploy/zenoh, as it is.
 pub fn configuration(file: &str) -> Config {
     let file = Path::new(env!("CARGO_MANIFEST_DIR")).join("../deploy/zenoh").join(file);
