@@ -6,13 +6,15 @@ use std::time::Duration;
 
 use quad_dataset::environment;
 use quad_policy::Precision;
-use quad_protocol::{EpisodeScore, JobReply, Message, ScoreReply, ScoreReport, decode, encode, keys};
+use quad_protocol::{
+    EpisodeScore, Job, JobReply, JobRequest, Message, Progress, ScoreReply, ScoreReport, decode, encode, keys,
+};
 use quad_tests::made_up::{self, name};
 use quad_tests::router::router;
 use quad_tests::system::{Scratch, Setting, free_port};
 use quad_tests::{PATIENCE, eventually, http};
 use serde_json::Value;
-use zenoh::Session;
+use zenoh::{Session, Wait};
 
 async fn ask<A: Message>(session: &Session, key: String, question: Vec<u8>) -> A {
     loop {
@@ -21,6 +23,17 @@ async fn ask<A: Message>(session: &Session, key: String, question: Vec<u8>) -> A
             && let Ok(sample) = reply.into_result()
         {
             return decode(&sample.payload().to_bytes()).unwrap();
+        }
+    }
+}
+
+/// A job for the liar; it is another one if `attempt` is.
+async fn claim(session: &Session, attempt: u64) -> Job {
+    let claim = encode(&made_up::claim("liar", attempt, "hopper")).unwrap();
+    loop {
+        match ask(session, keys::jobs(&name("run")), claim.clone()).await {
+            JobReply::Job(job) => return job,
+            _ => tokio::time::sleep(Duration::from_millis(50)).await,
         }
     }
 }
@@ -34,13 +47,8 @@ async fn scores_that_were_made_up_are_found_out_by_the_next_evaluator() {
     let mut learner = scratch.learner_with("run", setting, &["--connect", &endpoint, "--audit", "1"]);
 
     // A job done by nobody: its scores are possible, but not true.
-    let (run, claim) = (name("run"), made_up::claim("liar", 1, "hopper"));
-    let job = loop {
-        match ask(&session, keys::jobs(&run), encode(&claim).unwrap()).await {
-            JobReply::Job(job) => break job,
-            _ => tokio::time::sleep(Duration::from_millis(50)).await,
-        }
-    };
+    let run = name("run");
+    let job = claim(&session, 1).await;
     let hopper = environment::find("hopper").unwrap();
     let score =
         |&seed: &u64| EpisodeScore { seed, episode_return: 5.0, length: 10, score: hopper.normalised_score(5.0) };
@@ -49,13 +57,23 @@ async fn scores_that_were_made_up_are_found_out_by_the_next_evaluator() {
     let reply: ScoreReply = ask(&session, keys::scores(&run), encode(&report).unwrap()).await;
     assert!(matches!(reply, ScoreReply::Recorded { new: 4, .. }), "{reply:?}");
 
+    // Of another one nothing is delivered, so that the run goes on until both are there: without, nobody checks the last scores.
+    let held = claim(&session, 2).await;
     let _honest: Vec<_> = ["honest", "true"]
         .map(|name| scratch.evaluator_with(name, &["--connect", &endpoint, "--precision", "f32"]))
         .into();
-    let page = eventually("the lie is found out", PATIENCE, || {
+    let mut steps_done = 0;
+    let page = eventually("both are there and the lie is found out", PATIENCE, || {
+        steps_done += 1;
+        let progress = Progress { steps_done, ..Progress::of(&held, name("liar")) }.signed(&held.lease);
+        session.put(keys::progress(&run, &name("liar")), encode(&progress).unwrap()).wait().unwrap();
         let page = http::metrics(&learner.metrics())?;
-        (http::sum(&page, "quad_learner_audits_total", "outcome=\"differ\"") == 4.0).then_some(page)
+        let found_out = http::sum(&page, "quad_learner_audits_total", "outcome=\"differ\"") == 4.0;
+        (found_out && http::sum(&page, "quad_learner_evaluators", "") == 2.0).then_some(page)
     });
+    let hand_back = JobRequest::HandBack { evaluator: name("liar"), job: held.id, lease: held.lease, failed: None };
+    let reply: JobReply = ask(&session, keys::jobs(&run), encode(&hand_back).unwrap()).await;
+    assert!(matches!(reply, JobReply::HandedBack { accepted: true, .. }), "{reply:?}");
     assert!(http::sum(&page, "quad_learner_scores_duplicate_total", "") >= 4.0);
     let status = learner.process.wait(PATIENCE);
     assert!(status.success(), "the learner ended with {status}");
