@@ -73,12 +73,12 @@ impl Process {
         self.child.id()
     }
 
-    /// The most memory that it has had, bytes.
-    pub fn peak_memory(&self) -> u64 {
-        let status = fs::read_to_string(format!("/proc/{}/status", self.child.id())).expect("it runs");
-        let line = status.lines().find_map(|line| line.strip_prefix("VmHWM:")).expect("Linux says so");
+    /// The most memory that it has had, bytes; nothing if it has ended.
+    pub fn peak_memory(&self) -> Option<u64> {
+        let status = fs::read_to_string(format!("/proc/{}/status", self.child.id())).ok()?;
+        let line = status.lines().find_map(|line| line.strip_prefix("VmHWM:"))?;
         let kilobytes = line.trim().trim_end_matches(" kB").parse::<u64>().expect("a number of kilobytes");
-        kilobytes << 10
+        Some(kilobytes << 10)
     }
 
     /// Kills it at once, as a power cut would.

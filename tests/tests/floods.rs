@@ -76,7 +76,7 @@ where
     let setting = Setting { steps: 40, eval_interval: 10, ..Setting::default() };
     let mut learner = scratch.learner_with("run", setting, &["--connect", &endpoint]);
     learner.process.wait_for_log("training is done", PATIENCE);
-    let quiet = learner.process.peak_memory();
+    let quiet = learner.process.peak_memory().unwrap();
 
     let stop = Arc::new(AtomicBool::new(false));
     let flooding = tokio::spawn(flood(session, name("run"), stop.clone()));
@@ -88,9 +88,13 @@ where
             (http::sum(&page, "quad_learner_rejected_messages_total", &label) > 100.0).then_some(())
         });
     }
+    // Before there is anybody who could bring the run to its end, and as long as it lasts.
+    let mut flooded = learner.process.peak_memory().unwrap();
     let evaluator = scratch.evaluator("steady", &endpoint);
-    eventually("the first scores", PATIENCE, || (!learner.scores().is_empty()).then_some(()));
-    let flooded = learner.process.peak_memory();
+    eventually("the run is over", PATIENCE, || {
+        flooded = learner.process.peak_memory().unwrap_or(flooded);
+        (!learner.process.is_running()).then_some(())
+    });
     let status = learner.process.wait(PATIENCE);
     assert!(status.success(), "the learner ended with {status}");
     drop(evaluator);

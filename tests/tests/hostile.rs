@@ -231,7 +231,7 @@ impl Scene {
     /// Lets the stranger try one after the other.
     fn bears(mut self, attacks: &[Attack]) {
         let (phase, rounds) = (Duration::from_secs(number("QUAD_SECONDS", 1)), number("QUAD_ROUNDS", 1) as usize);
-        let quiet_memory = self.learner.process.peak_memory();
+        let quiet_memory = self.learner.process.peak_memory().unwrap();
         let (mut shares, mut taken) = (Vec::new(), Vec::new());
         for &attack in attacks {
             let mut stranger = None;
@@ -263,7 +263,7 @@ impl Scene {
         let taken = median(taken.into_iter());
         assert!(taken < 0.05, "most attacks take {taken:.3} s of processor time a second");
         assert!(median(shares.iter().copied()) > 0.7, "training at {shares:.2?}");
-        let growth = self.learner.process.peak_memory().saturating_sub(quiet_memory) >> 20;
+        let growth = self.learner.process.peak_memory().unwrap().saturating_sub(quiet_memory) >> 20;
         let page = http::metrics(&self.learner.metrics()).unwrap();
         let rejected = page.lines().filter(|line| line.starts_with("quad_learner_rejected"));
         eprintln!("memory: at most {growth} MiB more\n{}", rejected.collect::<Vec<_>>().join("\n"));

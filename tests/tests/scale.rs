@@ -62,7 +62,7 @@ impl Scene {
         let runtime = Runtime::new().unwrap();
         let router = runtime.block_on(router(&endpoint));
         learner.metrics();
-        let alone = learner.process.peak_memory();
+        let alone = learner.process.peak_memory().unwrap();
         let crowd = runtime.block_on(Crowd::connect(count, &run, &endpoint));
         // Behind a router, a learner sees who has asked it for work.
         crowd.set(Pace::Quick);
@@ -127,7 +127,7 @@ fn many_evaluators_are_served_and_training_does_not_notice() {
         thread::sleep(phase);
         tell("as fast as it goes", &crowd.measured(), begin.elapsed());
         crowd.set(Pace::Still);
-        let memory = learner.process.peak_memory();
+        let memory = learner.process.peak_memory().unwrap();
         eprintln!("memory: {} MiB alone, at most {} MiB with all", alone >> 20, memory >> 20);
         let scores = assert_each_once(learner);
         eprintln!("{scores} scores, each once");
