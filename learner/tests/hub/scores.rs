@@ -75,7 +75,7 @@ async fn garbage_is_counted_by_reason_and_answered_with_an_error() {
 
 #[tokio::test(flavor = "multi_thread")]
 async fn while_the_disk_hangs_jobs_go_out_and_scores_wait_to_be_written_together() {
-    let mut bench = Bench::with_lease(PATIENCE).await;
+    let mut bench = Bench::start().await;
     let client = bench.client().await;
     bench.snapshot(10).await;
     bench.snapshot(20).await;
