@@ -1,7 +1,6 @@
 //! The signals that end a process.
 
 use std::pin::pin;
-use std::thread;
 use std::time::{Duration, Instant};
 
 use tokio::signal::unix::{Signal, SignalKind, signal};
@@ -20,9 +19,9 @@ const ENDED_AT_ONCE: i32 = 130;
 
 /// Becomes ready at the first SIGINT (Ctrl-C) or SIGTERM after this call, even if it is not awaited by then.
 ///
-/// From this call on, the first of the two signals does not end the process by itself any more. The next one does that comes
-/// half a second later or more, at once, with exit code 130; and so does the process itself if it is still there 9 s after the first, whatever it waits
-/// for. Needs a tokio runtime, and lasts as long as that.
+/// From this call on, the first of the two signals does not end the process by itself any more. The next one that comes half
+/// a second later or more does, at once, with exit code 130; and so does the process itself if it is still there 9 s after
+/// the first, whatever it waits for. Needs a tokio runtime, and lasts as long as that.
 pub fn shutdown_signal() -> impl Future<Output = ()> + Send {
     let (mut interrupt, mut terminate) = (listen(SignalKind::interrupt()), listen(SignalKind::terminate()));
     let (tell, told) = oneshot::channel();
@@ -30,7 +29,7 @@ pub fn shutdown_signal() -> impl Future<Output = ()> + Send {
         let name = either(&mut interrupt, &mut terminate).await;
         let first = Instant::now();
         tell.send(()).ok();
-        aside(move || info!("received {name}"));
+        info!("received {name}");
         let another = async {
             loop {
                 let again = either(&mut interrupt, &mut terminate).await;
@@ -40,10 +39,8 @@ pub fn shutdown_signal() -> impl Future<Output = ()> + Send {
             }
         };
         match tokio::time::timeout(LEAVE_WITHIN, another).await {
-            Ok(again) => aside(move || warn!("received {again} after {name}: ending at once")),
-            Err(_) => {
-                aside(move || warn!("{} s after {name} something still hangs: ending at once", LEAVE_WITHIN.as_secs()))
-            }
+            Ok(again) => warn!("received {again} after {name}: ending at once"),
+            Err(_) => warn!("{} s after {name} something still hangs: ending at once", LEAVE_WITHIN.as_secs()),
         }
         tokio::time::sleep(LAST_WORDS).await;
         std::process::exit(ENDED_AT_ONCE);
@@ -54,12 +51,6 @@ pub fn shutdown_signal() -> impl Future<Output = ()> + Send {
             std::future::pending::<()>().await;
         }
     }
-}
-
-/// Says something in a thread of its own: nobody may read what this process says, and then whoever says it waits for ever.
-fn aside(say: impl FnOnce() + Send + 'static) {
-    // Without a thread for it, it is not said.
-    thread::Builder::new().spawn(say).ok();
 }
 
 async fn either(interrupt: &mut Option<Signal>, terminate: &mut Option<Signal>) -> &'static str {

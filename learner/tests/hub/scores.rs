@@ -108,7 +108,7 @@ async fn while_the_disk_hangs_jobs_go_out_and_scores_wait_to_be_written_together
 /// An evaluator that has done its job keeps it, for as long as it asks, though another one would be lost after this lease.
 #[tokio::test(flavor = "multi_thread")]
 async fn while_scores_cannot_be_saved_their_job_is_not_lost() {
-    let mut bench = Bench::start().await;
+    let mut bench = Bench::with_lease(LEASE).await;
     let client = bench.client().await;
     bench.snapshot(10).await;
     let job = claim_eventually(&client, &bench.run, "a").await;
@@ -118,10 +118,10 @@ async fn while_scores_cannot_be_saved_their_job_is_not_lost() {
     let message = encode(&report).unwrap();
     let first = client.get(keys::scores(&bench.run)).payload(message.clone()).timeout(2 * PATIENCE).await.unwrap();
     let begin = Instant::now();
-    while begin.elapsed() < 4 * LEASE {
+    while begin.elapsed() < 2 * LEASE {
         let again = ask::<ScoreReply>(&client, keys::scores(&bench.run), Some(message.clone())).await.unwrap();
         assert!(again.unwrap_err().contains("being written"));
-        tokio::time::sleep(LEASE / 8).await;
+        tokio::time::sleep(LEASE / 30).await;
     }
     assert_eq!(bench.metrics.evaluation.jobs_expired.get(), 0);
     drop(hanging);
