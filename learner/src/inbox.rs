@@ -12,8 +12,9 @@ const MOST_WAITING: usize = 4096;
 const MOST_BYTES_WAITING: usize = 64 << 20;
 /// The same for what Zenoh itself tells of who comes and goes, which takes little room and is not sent again.
 const MOST_CHANGES_WAITING: usize = 4096;
-/// Largest message to the learner with all that comes with it, bytes; a score report of a job is a few hundred bytes.
-pub const MOST_BYTES: usize = 256 * 1024;
+/// Largest message to the learner with all that comes with it, bytes; a score report of the largest job is 1.4 KB. A learner
+/// that listens hears of none that Zenoh sends in several pieces, which begins at 32,700 bytes at the earliest.
+pub const MOST_BYTES: usize = 30 * 1024;
 
 /// The sending side. Clones share the bound.
 #[derive(Debug)]
@@ -144,6 +145,8 @@ pub struct Disconnected;
 
 #[cfg(test)]
 mod tests {
+    use quad_protocol::{EpisodeScore, Hash, Name, ScoreReport, encode};
+
     use super::*;
 
     #[test]
@@ -156,7 +159,10 @@ mod tests {
         assert_eq!(received.len(), MOST_WAITING + 1);
         assert_eq!(received.last(), Some(&7777));
         assert_eq!(offered(MOST_BYTES), MOST_BYTES_WAITING / MOST_BYTES, "large ones are fewer");
-        assert_eq!(std::iter::from_fn(|| messages.next(Duration::ZERO).unwrap()).count(), 256);
+        assert_eq!(
+            std::iter::from_fn(|| messages.next(Duration::ZERO).unwrap()).count(),
+            MOST_BYTES_WAITING / MOST_BYTES
+        );
         let changes = (0..MOST_CHANGES_WAITING + 10).filter(|&n| inbox.offer_change(n).is_ok()).count();
         assert_eq!(changes, MOST_CHANGES_WAITING);
         assert_eq!(std::iter::from_fn(|| messages.next(Duration::ZERO).unwrap()).count(), changes);
@@ -164,5 +170,22 @@ mod tests {
         drop(inbox);
         assert_eq!(std::iter::from_fn(|| messages.next(Duration::ZERO).ok().flatten()).count(), MOST_WAITING);
         assert_eq!(messages.next(Duration::ZERO), Err(Disconnected));
+    }
+
+    #[test]
+    fn an_honest_message_is_far_from_too_large() {
+        let longest = Name::new("n".repeat(Name::MAX_LENGTH)).unwrap();
+        let episode = EpisodeScore { seed: 1, episode_return: 1.0, length: 1, score: 1.0 };
+        let report = ScoreReport {
+            evaluator: longest.clone(),
+            run: longest.clone(),
+            incarnation: 1,
+            job: 1,
+            step: 1,
+            weights: Hash::of(b"weights"),
+            precision: longest,
+            episodes: vec![episode; 256], // more than an evaluator would do
+        };
+        assert!(encode(&report).unwrap().len() < MOST_BYTES / 2);
     }
 }

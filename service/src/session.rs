@@ -18,10 +18,11 @@ use crate::endpoints::{Endpoints, SessionError, leaves_port_open};
 const LEASE: Duration = Duration::from_secs(5);
 /// Largest message that a client takes in, bytes: the largest snapshot that may be sent (64 MiB) and what Zenoh adds.
 const MAX_SNAPSHOT_SIZE: u64 = 65 << 20;
-/// Largest message that a session takes in that listens, bytes: claims, reports and progress, of which 1 MiB is the most,
-/// and what Zenoh adds. Each of many connections can start 16 messages (8 priorities, reliable or not) that Zenoh keeps
-/// until they are whole: 65 MiB for each would be 1 GiB for each connection.
-const MAX_REQUEST_SIZE: u64 = 2 << 20;
+/// Largest message in several pieces that a session takes in that listens, bytes: none. Zenoh keeps each piece until the last
+/// one has come, and with it the whole buffer of 64 KiB that it was received in, so that a stranger who sends pieces of one
+/// byte fills any memory. What evaluators send (at most 30 KiB) comes in one piece: one takes 32,700 bytes at least,
+/// whatever the network.
+const MAX_PIECED_REQUEST: u64 = 0;
 /// Most connections of a session that listens. Each is an open file, of which many systems allow a process 1024; the rest
 /// is for datasets, logs and metrics. Beyond it, connections are refused; without it, files could not be opened any more.
 const MAX_SESSIONS: u64 = 768;
@@ -96,7 +97,7 @@ fn config(endpoints: &Endpoints) -> zenoh::Result<Config> {
             json!(DROP_AFTER.as_micros() as u64),
         ),
         ("transport/link/tx/queue/congestion_control/block/wait_before_close", json!(CLOSE_AFTER.as_micros() as u64)),
-        ("transport/link/rx/max_message_size", json!(if listens { MAX_REQUEST_SIZE } else { MAX_SNAPSHOT_SIZE })),
+        ("transport/link/rx/max_message_size", json!(if listens { MAX_PIECED_REQUEST } else { MAX_SNAPSHOT_SIZE })),
         ("transport/unicast/max_sessions", json!(MAX_SESSIONS)),
         // The only stable way to learn a port that the system chose. Others could read the configuration there, so it
         // is closed where it is not needed.

@@ -12,6 +12,7 @@
 //! - [`crowd`]: hundreds of evaluators that only talk; [`made_up`]: messages of such as do not exist; [`pace`]: how fast a learner trains, and what slows it down.
 //! - [`certificates`]: one for each role, and sessions that show them.
 //! - [`http`]: fetch a page, read a metric, serve a file.
+//! - [`pieces`]: somebody who speaks Zenoh's protocol byte by byte.
 //! - [`peers`]: programs that are not ours; where one is missing, a test is skipped or fails.
 //! - [`prometheus`]: one to start, and what to ask any; [`dashboard`]: what Grafana's panels ask it.
 //!
@@ -29,6 +30,7 @@ pub mod link;
 pub mod made_up;
 pub mod pace;
 pub mod peers;
+pub mod pieces;
 pub mod power;
 pub mod process;
 pub mod prometheus;

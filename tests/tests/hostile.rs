@@ -16,6 +16,7 @@ use quad_tests::crowd::{Crowd, Pace};
 use quad_tests::knock::knock;
 use quad_tests::made_up::{self, name};
 use quad_tests::pace::{ENDLESS, compare, median, on_core};
+use quad_tests::pieces::Pieces;
 use quad_tests::process::Process;
 use quad_tests::router::router;
 use quad_tests::system::{Learner, Scratch, free_port};
@@ -51,9 +52,11 @@ enum Attack {
     Evaluators,
     Connections,
     ReadsNothing,
+    /// Of a message that never ends.
+    Pieces,
 }
 
-const ATTACKS: [Attack; 15] = [
+const ATTACKS: [Attack; 16] = [
     Attack::Nothing,
     Attack::Progress,
     Attack::Claims,
@@ -69,6 +72,7 @@ const ATTACKS: [Attack; 15] = [
     Attack::ReadsNothing,
     Attack::Evaluators,
     Attack::Tokens,
+    Attack::Pieces,
 ];
 
 fn run() -> Name {
@@ -104,6 +108,12 @@ fn be_a_stranger(what: &str) {
     match attack {
         Attack::ReadsNothing => runtime.block_on(read_nothing(endpoint)),
         Attack::Connections => knock(&endpoint.trim_start_matches("tcp/").parse().unwrap(), &AtomicBool::new(true)),
+        Attack::Pieces => {
+            let mut stranger = Pieces::connect(endpoint);
+            loop {
+                stranger.piece(b"x", false);
+            }
+        }
         attack => runtime.block_on(flood(attack, endpoint)),
     }
 }
@@ -176,7 +186,7 @@ async fn flood(attack: Attack, endpoint: &str) {
                     tokens.clear();
                 }
             }
-            Attack::Connections | Attack::ReadsNothing => unreachable!("they need no session"),
+            Attack::Connections | Attack::ReadsNothing | Attack::Pieces => unreachable!("they need no session"),
         }
         tokio::task::yield_now().await;
     }
@@ -281,6 +291,7 @@ fn whatever_strangers_do_the_work_goes_on() {
         eprintln!("at a learner that listens");
         Scene::direct().bears(&ATTACKS);
         eprintln!("at its router");
-        Scene::behind_a_router().bears(&ATTACKS);
+        // A router keeps pieces for as long as their sender is there.
+        Scene::behind_a_router().bears(&ATTACKS[..ATTACKS.len() - 1]);
     });
 }

@@ -11,6 +11,8 @@ use crate::metrics::Metrics;
 
 /// Scores that the learner answers with an error are delivered again after this time.
 const AGAIN: Duration = Duration::from_millis(100);
+/// Longest reason that a learner is told, characters: it takes no large messages.
+const LONGEST_REASON: usize = 1000;
 
 /// A job that is to be handed back, so that it need not wait for the end of its lease.
 pub struct HandBack {
@@ -31,8 +33,8 @@ impl HandBack {
     }
 
     /// The job could not be done, and why.
-    pub fn because(self, reason: String) -> HandBack {
-        HandBack { failed: Some(reason), ..self }
+    pub fn because(self, reason: &str) -> HandBack {
+        HandBack { failed: Some(reason.chars().take(LONGEST_REASON).collect()), ..self }
     }
 
     /// The job is done, and only to be handed back if these cannot be delivered.

@@ -194,7 +194,7 @@ impl Worker {
             Err(error) => {
                 self.metrics.job(JobOutcome::Failed);
                 self.hold(key, None);
-                run.hand_back(&job).because(format!("{error:#}")).send(HAND_BACK).await;
+                run.hand_back(&job).because(&format!("{error:#}")).send(HAND_BACK).await;
                 return Err(error.context(format!("a job of step {} failed", job.step)));
             }
         };
