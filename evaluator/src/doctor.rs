@@ -44,6 +44,7 @@ pub fn examine(args: &DoctorArgs) -> anyhow::Result<Findings> {
     let mut findings = Findings::default();
     machine::threads(&mut findings);
     machine::open_files(&mut findings);
+    machine::clock(&mut findings);
     precision(&mut findings);
     simulator(&mut findings);
     let certificates = args.certificates.as_deref();

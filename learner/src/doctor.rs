@@ -26,6 +26,7 @@ pub fn examine(args: &DoctorArgs) -> anyhow::Result<Findings> {
     let mut findings = Findings::default();
     machine::threads(&mut findings);
     machine::open_files(&mut findings);
+    machine::clock(&mut findings);
     precision(&mut findings);
     hdf5(&mut findings);
     disk::folder(&mut findings, "run folder", &args.run_dir, "another folder is chosen by --run-dir");

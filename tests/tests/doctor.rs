@@ -50,12 +50,15 @@ fn a_machine_that_is_well() {
     assert!(line(&text, "ok", "run").contains("well speaks version "));
     assert!(line(&text, "ok", "libmujoco").contains("3.17.0, and Hopper moves in it"));
     line(&text, "ok", "precision");
+    assert!(line(&text, "ok", "clock").contains("this program is older"));
 
     let folder = scratch.path().join("another");
     let (text, well) = findings(&doctor("learner", &["--run-dir", folder.to_str().unwrap()]));
     assert!(well, "{text}");
     assert!(line(&text, "ok", "run folder").contains("GiB free"));
     assert!(line(&text, "ok", "HDF5").contains("with compression"));
+    assert!(line(&text, "ok", "clock").contains("this program is older"));
+    assert!(line(&text, "ok", "file times").contains("no file from the future"));
     assert!(!folder.exists(), "the doctor makes no folder");
 
     let output = doctor("evaluator", &["--json", "--connect", &endpoint]);

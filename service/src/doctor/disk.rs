@@ -17,7 +17,7 @@ const TOO_LITTLE: u64 = 100 << 20;
 const LITTLE: u64 = 2 << 30;
 /// Free inodes: a run has some hundred files.
 const FEW_INODES: u64 = 1000;
-/// A file's time may be off by this much before clocks are said to differ.
+/// A file's time may be off by this much before that is worth a word.
 const CLOCK_TOLERANCE: Duration = Duration::from_secs(10);
 
 /// Checks a folder that a program will write to, or the one that it would be made in. `elsewhere` says how to choose
@@ -42,7 +42,7 @@ pub fn folder(findings: &mut Findings, check: &str, path: &Path, elsewhere: &str
         }
     };
     space(findings, check, folder, &shown, elsewhere);
-    clock(findings, folder, written, SystemTime::now());
+    times(findings, folder, written, SystemTime::now());
 }
 
 /// Writes a file, to the disk itself, and removes it; gives the time that the file system gave it.
@@ -79,8 +79,9 @@ fn space(findings: &mut Findings, check: &str, folder: &Path, shown: &str, elsew
     }
 }
 
-/// The trial's time by the file system, and the files that lie there already, against this machine's clock.
-fn clock(findings: &mut Findings, folder: &Path, written: SystemTime, now: SystemTime) {
+/// The trial's time by the file system, which for a folder of another machine is that machine's, and those of the files that
+/// lie there already, against this machine's clock.
+fn times(findings: &mut Findings, folder: &Path, written: SystemTime, now: SystemTime) {
     let ahead = |time: SystemTime| time.duration_since(now).unwrap_or_default();
     let off = ahead(written).max(now.duration_since(written).unwrap_or_default());
     let entries = fs::read_dir(folder).into_iter().flatten().filter_map(Result::ok);
@@ -88,12 +89,12 @@ fn clock(findings: &mut Findings, folder: &Path, written: SystemTime, now: Syste
     let hint = "set the clock, best by NTP (`timedatectl set-ntp true`)";
     if off > CLOCK_TOLERANCE {
         let what = format!("{} and this machine differ by {off:.0?}", folder.display());
-        findings.warn("clock", what, hint);
+        findings.warn("file times", what, hint);
     } else if ahead(newest) > CLOCK_TOLERANCE {
         let what = format!("{} has a file from {:.0?} in the future", folder.display(), ahead(newest));
-        findings.warn("clock", what, hint);
+        findings.warn("file times", what, hint);
     } else {
-        findings.ok("clock", format!("it agrees with that of {}", folder.display()));
+        findings.ok("file times", format!("{} has no file from the future", folder.display()));
     }
 }
 
@@ -130,7 +131,7 @@ mod tests {
         let now = SystemTime::now();
         let told = |written| {
             let mut findings = Findings::default();
-            clock(&mut findings, folder.path(), written, now);
+            times(&mut findings, folder.path(), written, now);
             findings.to_string()
         };
         assert!(told(now).starts_with("ok "), "{}", told(now));

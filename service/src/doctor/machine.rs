@@ -1,9 +1,10 @@
-//! Processor cores, threads, open files.
+//! Processor cores, threads, open files, the clock.
 
-use std::env;
-use std::thread;
+use std::time::{Duration, SystemTime, UNIX_EPOCH};
+use std::{env, fs, io, thread};
 
 use rustix::process::{Resource, getrlimit};
+use x509_parser::time::ASN1Time;
 
 use super::Findings;
 
@@ -11,6 +12,8 @@ use super::Findings;
 const THREADS: &str = "RAYON_NUM_THREADS";
 /// Fewer open files than this leave little room: each connection is one, and so is each file of a run.
 const FEW_FILES: u64 = 1024;
+/// The machine on which this program was made may be ahead by this much.
+const CLOCK_TOLERANCE: Duration = Duration::from_secs(10);
 
 /// The cores that this process may use, and how many threads it would start on them.
 pub fn threads(findings: &mut Findings) {
@@ -48,9 +51,47 @@ pub fn open_files(findings: &mut Findings) {
     }
 }
 
+/// The time that it is by this machine, which is wrong for certain if this program was made later. Nobody else is asked.
+pub fn clock(findings: &mut Findings) {
+    clock_at(findings, SystemTime::now(), fs::metadata("/proc/self/exe").and_then(|program| program.modified()));
+}
+
+fn clock_at(findings: &mut Findings, now: SystemTime, made: io::Result<SystemTime>) {
+    let shown = |time: SystemTime| {
+        let seconds = time.duration_since(UNIX_EPOCH).map_or(0, |time| time.as_secs() as i64);
+        ASN1Time::from_timestamp(seconds)
+            .map_or_else(|_| format!("second {seconds} since 1970"), |time| time.to_string())
+    };
+    let it_is = format!("it is {} by this machine", shown(now));
+    match made {
+        Ok(made) if made > now + CLOCK_TOLERANCE => findings.warn(
+            "clock",
+            format!("{it_is}, but this program is of {}", shown(made)),
+            "set the clock, best by NTP (`timedatectl set-ntp true`): with a wrong one, certificates seem not to be valid",
+        ),
+        Ok(_) => findings.ok("clock", format!("{it_is}; this program is older, and nobody else was asked")),
+        Err(_) => findings.ok("clock", format!("{it_is}; nobody else was asked")),
+    }
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn a_program_is_not_from_the_future() {
+        let now = UNIX_EPOCH + Duration::from_secs(1_800_000_000);
+        for (made, line) in [
+            (Ok(now - Duration::from_secs(60)), "ok    clock  it is Jan 15 08:00:00 2027 +00:00 by this machine; this"),
+            (Ok(now + Duration::from_secs(9)), "ok    clock"),
+            (Ok(now + Duration::from_secs(60)), "warn  clock  it is Jan 15 08:00:00 2027 +00:00 by this machine, but"),
+            (Err(io::ErrorKind::NotFound.into()), "ok    clock"),
+        ] {
+            let mut findings = Findings::default();
+            clock_at(&mut findings, now, made);
+            assert!(findings.to_string().starts_with(line), "{findings}");
+        }
+    }
 
     #[test]
     fn settings_that_make_no_sense_here_are_told() {

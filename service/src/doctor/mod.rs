@@ -1,9 +1,9 @@
 //! Checks a machine before a run is trusted to it: what goes wrong in practice, and what to do about it.
 //!
 //! # Layout
-//! - [`machine`]: processor cores, threads, open files.
+//! - [`machine`]: processor cores, threads, open files, the clock.
 //! - [`disk`]: whether a folder can be written to, and how much of it.
-//! - [`certificates`]: whether they are good, and until when.
+//! - [`certificates`]: whether they are good, for whom, and until when.
 //! - [`network`]: whether somebody is there to connect to.
 //!
 //! What only one of the programs needs is in its own `doctor.rs`.
