@@ -1,11 +1,17 @@
 //! Who a program is to the others, by the three files that `deploy/zenoh/certificates.sh` makes.
 
+use std::net::IpAddr;
 use std::path::{Path, PathBuf};
 use std::{fs, io};
 
+use rustls::crypto::ring;
+use rustls::pki_types::pem::{self, PemObject};
+use rustls::pki_types::{CertificateDer, PrivateKeyDer};
+use rustls::sign::CertifiedKey;
 use serde_json::{Value, json};
 use tracing::{info, warn};
 use x509_parser::certificate::X509Certificate;
+use x509_parser::extensions::GeneralName;
 use x509_parser::pem::Pem;
 use x509_parser::time::ASN1Time;
 
@@ -42,6 +48,8 @@ impl Role {
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Certificates {
     folder: PathBuf,
+    /// The hosts at which its owner may be connected to.
+    hosts: Vec<String>,
 }
 
 /// The files cannot be used.
@@ -91,6 +99,14 @@ pub enum CertificatesError {
         /// The authority's file.
         authority: PathBuf,
     },
+    /// Its owner could not prove that it is its.
+    #[error("{} is not the key of {}", key.display(), path.display())]
+    OtherKey {
+        /// The certificate's file.
+        path: PathBuf,
+        /// The key's file.
+        key: PathBuf,
+    },
 }
 
 impl CertificatesError {
@@ -118,10 +134,11 @@ impl Certificates {
     pub fn read(folder: &Path, role: Role) -> Result<Self, CertificatesError> {
         let (authority, path) = (folder.join(AUTHORITY), folder.join(CERTIFICATE));
         let authorities = certificates(&authority)?;
-        let certificate = certificates(&path)?.swap_remove(0);
-        key(&folder.join(KEY))?;
+        let own = certificates(&path)?;
+        let key_path = folder.join(KEY);
+        let key = key(&key_path)?;
 
-        let certificate = parse(&certificate, &path)?;
+        let certificate = parse(&own[0], &path)?;
         let found = certificate.subject().iter_common_name().next().and_then(|name| name.as_str().ok());
         if found != Some(role.common_name()) {
             let (found, wanted) = (found.unwrap_or("nobody").to_owned(), role.common_name());
@@ -139,13 +156,22 @@ impl Certificates {
         if !known {
             return Err(CertificatesError::OtherAuthority { path, authority });
         }
+        let chain = own.iter().map(|pem| CertificateDer::from(pem.contents.clone())).collect();
+        if CertifiedKey::from_der(chain, key, &ring::default_provider()).is_err() {
+            return Err(CertificatesError::OtherKey { path, key: key_path });
+        }
 
         let left = validity.not_after.timestamp() - ASN1Time::now().timestamp();
         match left < EXPIRES_SOON {
             true => warn!("{} is valid until {} only; make a new one soon", path.display(), validity.not_after),
             false => info!("{} is valid until {}", path.display(), validity.not_after),
         }
-        Ok(Self { folder: folder.to_owned() })
+        Ok(Self { folder: folder.to_owned(), hosts: hosts(&certificate) })
+    }
+
+    /// Whether nobody but this machine itself could connect to whoever listens with it.
+    pub(crate) fn is_for_this_machine_alone(&self) -> bool {
+        self.hosts.iter().all(|host| is_this_machine(host))
     }
 
     /// Zenoh's `transport/link/tls`: both sides show a certificate, and stay connected only while it is valid.
@@ -169,14 +195,30 @@ fn certificates(path: &Path) -> Result<Vec<Pem>, CertificatesError> {
     if found.is_empty() { Err(malformed(path, "certificate")) } else { Ok(found) }
 }
 
-fn key(path: &Path) -> Result<(), CertificatesError> {
-    // The labels of what Zenoh reads.
-    for label in ["PRIVATE KEY", "RSA PRIVATE KEY", "EC PRIVATE KEY"] {
-        if !blocks(path, label)?.is_empty() {
-            return Ok(());
+fn key(path: &Path) -> Result<PrivateKeyDer<'static>, CertificatesError> {
+    PrivateKeyDer::from_pem_file(path).map_err(|error| match error {
+        pem::Error::Io(source) => CertificatesError::Unreadable { path: path.to_owned(), source },
+        _ => malformed(path, "private key"),
+    })
+}
+
+/// The names and addresses in a certificate at which its owner may be connected to.
+pub(crate) fn hosts(certificate: &X509Certificate<'_>) -> Vec<String> {
+    let names = certificate.subject_alternative_name().ok().flatten().map(|names| &names.value.general_names);
+    let host = |name: &GeneralName<'_>| match *name {
+        GeneralName::DNSName(name) => Some(name.to_owned()),
+        GeneralName::IPAddress(bytes) => {
+            let four = <[u8; 4]>::try_from(bytes).map(IpAddr::from);
+            four.or_else(|_| <[u8; 16]>::try_from(bytes).map(IpAddr::from)).ok().map(|address| address.to_string())
         }
-    }
-    Err(malformed(path, "private key"))
+        _ => None,
+    };
+    names.into_iter().flatten().filter_map(host).collect()
+}
+
+/// Whether a host is only this machine's name for itself.
+pub(crate) fn is_this_machine(host: &str) -> bool {
+    host == "localhost" || host.parse().is_ok_and(|host: IpAddr| host.is_loopback())
 }
 
 fn blocks(path: &Path, label: &str) -> Result<Vec<Pem>, CertificatesError> {

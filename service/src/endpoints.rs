@@ -1,10 +1,8 @@
 //! Where learner and evaluators meet, as a person writes it: Zenoh's endpoints.
 
-use std::net::IpAddr;
-
 use zenoh::config::EndPoint;
 
-use crate::certificates::Certificates;
+use crate::certificates::{Certificates, is_this_machine};
 
 /// The protocols that Zenoh is built with here: readable by anybody in between, and encrypted and authenticated.
 const OPEN: &str = "tcp/";
@@ -102,13 +100,23 @@ impl Endpoints {
 
     /// What it listens at without certificates, and not on loopback only: whoever reaches it may come in.
     pub fn open_to_anybody(&self) -> Option<&str> {
+        self.for_others().filter(|_| self.certificates.is_none())
+    }
+
+    /// What it listens at for others who would all refuse its certificate, because that names no host which they could mean.
+    pub(crate) fn closed_to_anybody(&self) -> Option<&str> {
+        self.for_others().filter(|_| self.certificates.as_ref().is_some_and(Certificates::is_for_this_machine_alone))
+    }
+
+    /// What it listens at, and not on loopback only.
+    fn for_others(&self) -> Option<&str> {
         let is_local = |endpoint: &&String| {
-            let address = endpoint.trim_start_matches(OPEN).split(['?', '#']).next().unwrap_or_default();
+            let address = endpoint.trim_start_matches(OPEN).trim_start_matches(PROTECTED);
+            let address = address.split(['?', '#']).next().unwrap_or_default();
             let host = address.rsplit_once(':').map_or(address, |(host, _)| host).trim_matches(['[', ']']);
-            host == "localhost" || host.parse().is_ok_and(|host: IpAddr| host.is_loopback())
+            is_this_machine(host)
         };
-        let open = self.listen.iter().find(|endpoint| !is_local(endpoint));
-        open.filter(|_| self.certificates.is_none()).map(String::as_str)
+        self.listen.iter().find(|endpoint| !is_local(endpoint)).map(String::as_str)
     }
 }
 

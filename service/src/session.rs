@@ -48,6 +48,12 @@ const SELF_QUERY_TIMEOUT: Duration = Duration::from_secs(5);
 /// lost.
 pub async fn open_session(endpoints: &Endpoints) -> Result<Session, SessionError> {
     endpoints.check()?;
+    if let Some(endpoint) = endpoints.closed_to_anybody() {
+        warn!(
+            "{endpoint} is for other machines, but the certificate names none that they could connect to, so they will refuse it; \
+             make one with deploy/zenoh/certificates.sh that names this machine as they do"
+        );
+    }
     let wrong = |error| {
         let endpoints = [&endpoints.listen[..], &endpoints.connect[..]].concat().join(", ");
         SessionError::Endpoint { endpoints, reason: for_people(error) }

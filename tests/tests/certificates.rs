@@ -5,10 +5,10 @@ use std::fs;
 use std::path::Path;
 use std::process::Command;
 
-use quad_tests::PATIENCE;
 use quad_tests::certificates::Certificates;
 use quad_tests::process::{assert_refused, binary};
 use quad_tests::system::{Scratch, Setting, free_port};
+use quad_tests::{PATIENCE, peers};
 
 #[test]
 fn what_cannot_be_safe_is_refused_before_anything_starts() {
@@ -49,6 +49,9 @@ fn what_cannot_be_safe_is_refused_before_anything_starts() {
     assert_refused(&with(&mixed), "is of another authority", "ca.pem");
     fs::write(mixed.join("key.pem"), "a secret").unwrap();
     assert_refused(&with(&mixed), "key.pem holds no private key", "ca.pem");
+    fs::copy(certificates.of("evaluator").join("ca.pem"), mixed.join("ca.pem")).unwrap();
+    fs::copy(certificates.of("monitor").join("key.pem"), mixed.join("key.pem")).unwrap();
+    assert_refused(&with(&mixed), "key.pem is not the key of", "ca.pem");
     let swapped = learner(&["--listen", &tls, "--certificates", &good]);
     assert_refused(&swapped, "is a certificate for quad-evaluator", "this program's role");
     assert!(!scratch.path().join("run").exists(), "a refused start leaves a folder behind");
@@ -57,6 +60,27 @@ fn what_cannot_be_safe_is_refused_before_anything_starts() {
     let mut command = start("evaluator");
     command.arg("serve").env("QUAD_CERTIFICATES", certificates.of("nowhere"));
     assert_refused(&command.output().unwrap(), "nowhere/ca.pem", "certificates.sh");
+}
+
+#[test]
+fn a_learner_for_others_says_that_its_certificate_names_none_of_them() {
+    let Some(certificates) = Certificates::make() else { return };
+    let reached = certificates.of("reached");
+    peers::certificates(reached.parent().unwrap(), &["learner", "reached", "192.0.2.1"]);
+    let scratch = Scratch::new();
+    let endless = Setting { steps: 100_000_000, ..Setting::default() };
+    let mut number = 0;
+    for (certificate, listen, warned) in
+        [("learner", "tls/0.0.0.0:0", true), ("learner", "tls/localhost:0", false), ("reached", "tls/0.0.0.0:0", false)]
+    {
+        number += 1;
+        let certificate = certificates.argument(certificate);
+        let arguments = ["--listen", listen, "--certificates", &certificate];
+        let learner = scratch.learner_with(&format!("run-{number}"), endless, &arguments);
+        learner.process.wait_for_log("its metrics at", PATIENCE);
+        let log = learner.process.log();
+        assert_eq!(log.contains(&format!("{listen} is for other machines, but")), warned, "{log}");
+    }
 }
 
 #[test]

@@ -9,7 +9,7 @@ use quad_protocol::{Name, keys};
 use quad_tests::process::binary;
 use quad_tests::router::router;
 use quad_tests::system::{Scratch, Setting, free_port};
-use quad_tests::{PATIENCE, eventually};
+use quad_tests::{PATIENCE, eventually, peers};
 use serde_json::Value;
 
 fn doctor(program: &str, arguments: &[&str]) -> Output {
@@ -202,6 +202,35 @@ fn good_certificates() {
     }
     let (text, well) = Certificates::make("evaluator", 365).unwrap().examine();
     assert!(!well && line(&text, "FAIL", "role").contains("for quad-evaluator, not for quad-learner"), "{text}");
+}
+
+#[test]
+fn hosts_of_a_certificate_and_an_authority_that_is_being_replaced() {
+    let Some(made) = quad_tests::certificates::Certificates::make() else { return };
+    let examine =
+        |name: &str| findings(&doctor("learner", &["--run-dir", "run", "--certificates", &made.argument(name)]));
+    let (text, _) = examine("learner");
+    let certificate = line(&text, "ok", "certificate");
+    assert!(
+        certificate.contains("no other machine could") && certificate.ends_with("names localhost, 127.0.0.1"),
+        "{text}"
+    );
+    let folder = made.of("reached").parent().unwrap().to_owned();
+    peers::certificates(&folder, &["learner", "reached", "learner.example", "192.0.2.1", "2001:db8::1"]);
+    let (text, _) = examine("reached");
+    let certificate = line(&text, "ok", "certificate");
+    assert!(certificate.contains("others could connect"), "{text}");
+    assert!(certificate.contains("127.0.0.1, learner.example, 192.0.2.1, 2001:db8::1"), "{text}");
+
+    let new = Certificates::make("learner", 365).unwrap();
+    let authorities = |folder: &Path| std::fs::read(folder.join("ca.pem")).unwrap();
+    let [old, new] = [authorities(&made.of("reached")), authorities(new.path())];
+    for both in [[&old[..], &new].concat(), [&new[..], &old].concat()] {
+        std::fs::write(made.of("reached").join("ca.pem"), both).unwrap();
+        let (text, well) = examine("reached");
+        assert!(well && text.contains("CN=authority: trusted besides"), "{text}");
+        assert!(quad_service::Certificates::read(&made.of("reached"), quad_service::Role::Learner).is_ok());
+    }
 }
 
 #[test]

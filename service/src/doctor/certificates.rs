@@ -7,7 +7,7 @@ use std::sync::Arc;
 use std::time::{SystemTime, UNIX_EPOCH};
 
 use rustls::crypto::ring;
-use rustls::pki_types::pem::PemObject;
+use rustls::pki_types::pem::{self, PemObject};
 use rustls::pki_types::{CertificateDer, PrivateKeyDer, UnixTime};
 use rustls::server::WebPkiClientVerifier;
 use rustls::sign::CertifiedKey;
@@ -15,7 +15,7 @@ use rustls::{InconsistentKeys, RootCertStore};
 use x509_parser::prelude::{FromDer, X509Certificate};
 
 use super::Findings;
-use crate::certificates::{AUTHORITY, CERTIFICATE, EXPIRES_SOON, KEY};
+use crate::certificates::{AUTHORITY, CERTIFICATE, EXPIRES_SOON, KEY, hosts, is_this_machine};
 use crate::{Certificates, CertificatesError, Role};
 
 const DAY: i64 = 24 * 3600;
@@ -25,7 +25,7 @@ const MAKE: &str = "make new ones, or copy all three files from where they were 
 /// Checks the certificates in `folder`, which are to be those of `role`, with the time that it is now. Gives them if a
 /// connection can be tried with them.
 pub fn folder(findings: &mut Findings, folder: &Path, role: Role) -> Option<Certificates> {
-    by_themselves(findings, folder);
+    by_themselves(findings, folder, role);
     match Certificates::read(folder, role) {
         Ok(certificates) => Some(certificates),
         Err(error) => {
@@ -38,22 +38,14 @@ pub fn folder(findings: &mut Findings, folder: &Path, role: Role) -> Option<Cert
     }
 }
 
-fn by_themselves(findings: &mut Findings, folder: &Path) {
+fn by_themselves(findings: &mut Findings, folder: &Path, role: Role) {
     let [ca, own, key] = [AUTHORITY, CERTIFICATE, KEY].map(|name| folder.join(name));
-    let ca = read(findings, &ca, CertificateDer::from_pem_file(&ca));
-    let own_chain = CertificateDer::pem_file_iter(&own).and_then(Iterator::collect::<Result<Vec<_>, _>>);
-    let own_chain = own_chain.and_then(|chain| match chain.is_empty() {
-        true => Err(rustls::pki_types::pem::Error::NoItemsFound),
-        false => Ok(chain),
-    });
-    let own = read(findings, &own, own_chain);
+    let [ca, own] = [ca, own].map(|path| read(findings, &path, all_of(&path)));
     let key = read(findings, &key, PrivateKeyDer::from_pem_file(&key));
     let now = SystemTime::now();
-    if let Some(ca) = &ca {
-        validity(findings, "authority", ca, now);
-    }
+    authorities(findings, ca.as_deref().unwrap_or_default(), own.as_ref().map(|own| &own[0]), now);
     let Some(own) = own else { return };
-    validity(findings, "certificate", &own[0], now);
+    validity(findings, "certificate", &own[0], now, Some(role));
     if let Some(key) = key {
         belongs_to(findings, &own, key);
     }
@@ -62,12 +54,33 @@ fn by_themselves(findings: &mut Findings, folder: &Path) {
     }
 }
 
-fn read<T>(findings: &mut Findings, path: &Path, result: Result<T, rustls::pki_types::pem::Error>) -> Option<T> {
+/// Those that may have signed one's own certificate. Another one is trusted besides, and may be over.
+fn authorities(findings: &mut Findings, all: &[CertificateDer<'_>], own: Option<&CertificateDer<'_>>, now: SystemTime) {
+    let parse = |der| X509Certificate::from_der(der).ok().map(|(_, parsed)| parsed);
+    let own = own.and_then(|own| parse(own));
+    for ca in all {
+        match (parse(ca), &own) {
+            (Some(ca), Some(own)) if all.len() > 1 && ca.subject() != own.issuer() => {
+                let (other, until) = (ca.subject(), ca.validity().not_after);
+                findings.ok("authority", format!("{other}: trusted besides, until {until}"));
+            }
+            _ => validity(findings, "authority", ca, now, None),
+        }
+    }
+}
+
+/// All certificates of a file: while an authority is replaced, ca.pem has the old and the new one.
+fn all_of(path: &Path) -> Result<Vec<CertificateDer<'static>>, pem::Error> {
+    let all: Vec<_> = CertificateDer::pem_file_iter(path)?.collect::<Result<_, _>>()?;
+    if all.is_empty() { Err(pem::Error::NoItemsFound) } else { Ok(all) }
+}
+
+fn read<T>(findings: &mut Findings, path: &Path, result: Result<T, pem::Error>) -> Option<T> {
     result
         .inspect_err(|error| {
             let reason = match error {
-                rustls::pki_types::pem::Error::Io(error) => error.to_string(),
-                rustls::pki_types::pem::Error::NoItemsFound => "nothing of that kind in PEM is in it".to_owned(),
+                pem::Error::Io(error) => error.to_string(),
+                pem::Error::NoItemsFound => "nothing of that kind in PEM is in it".to_owned(),
                 other => other.to_string(),
             };
             findings.fail("certificates", format!("{}: {reason}", path.display()), MAKE);
@@ -75,8 +88,14 @@ fn read<T>(findings: &mut Findings, path: &Path, result: Result<T, rustls::pki_t
         .ok()
 }
 
-/// Whose it is, and from when until when it is good.
-fn validity(findings: &mut Findings, check: &str, certificate: &CertificateDer<'_>, now: SystemTime) {
+/// Whose it is, from when until when it is good and, for the certificate of a program that may listen, at which hosts.
+fn validity(
+    findings: &mut Findings,
+    check: &str,
+    certificate: &CertificateDer<'_>,
+    now: SystemTime,
+    role: Option<Role>,
+) {
     let parsed = match X509Certificate::from_der(certificate) {
         Ok((_, parsed)) => parsed,
         Err(error) => return findings.fail(check, format!("it cannot be read: {error}"), MAKE),
@@ -94,7 +113,20 @@ fn validity(findings: &mut Findings, check: &str, certificate: &CertificateDer<'
         let what = format!("{subject}: good until {until}, which is {} days", left / DAY);
         findings.warn(check, what, "make a new one before then: without it nobody can connect");
     } else {
-        findings.ok(check, format!("{subject}: good until {until}"));
+        let whom = match role {
+            Some(Role::Learner) => at_hosts(&hosts(&parsed)),
+            _ => String::new(),
+        };
+        findings.ok(check, format!("{subject}: good until {until}{whom}"));
+    }
+}
+
+/// Who may connect to a learner that listens.
+fn at_hosts(hosts: &[String]) -> String {
+    let alone = if hosts.iter().all(|host| is_this_machine(host)) { "no other machine" } else { "others" };
+    match hosts {
+        [] => "; nobody could connect to whoever listens with it, since it names no host".to_owned(),
+        hosts => format!("; {alone} could connect to whoever listens with it: it names {}", hosts.join(", ")),
     }
 }
 
@@ -109,10 +141,12 @@ fn belongs_to(findings: &mut Findings, own: &[CertificateDer<'static>], key: Pri
 }
 
 /// As the other side of a connection checks it.
-fn signed_by(findings: &mut Findings, own: &[CertificateDer<'_>], ca: CertificateDer<'static>, now: SystemTime) {
+fn signed_by(findings: &mut Findings, own: &[CertificateDer<'_>], ca: Vec<CertificateDer<'static>>, now: SystemTime) {
     let mut roots = RootCertStore::empty();
-    if let Err(error) = roots.add(ca) {
-        return findings.fail("signature", format!("ca.pem is no certificate authority: {error}"), MAKE);
+    for ca in ca {
+        if let Err(error) = roots.add(ca) {
+            return findings.fail("signature", format!("ca.pem is no certificate authority: {error}"), MAKE);
+        }
     }
     let provider = Arc::new(ring::default_provider());
     let verifier = match WebPkiClientVerifier::builder_with_provider(Arc::new(roots), provider).build() {
