@@ -44,6 +44,7 @@ impl RunDirError {
                 "put a copy of the file in its place; --fresh renames the folder and begins anew. A line of scores.jsonl may \
                  also be taken out: its episode is scored again"
             }
+            Self::Io { action: "create", .. } => "choose a folder that you may write to with --run-dir DIR",
             Self::Io { source, .. } => match source.kind() {
                 ErrorKind::NotFound => "is it a folder that `learner train` has written?",
                 ErrorKind::PermissionDenied | ErrorKind::ReadOnlyFilesystem => {
