@@ -205,13 +205,14 @@ fn a_job_that_nobody_can_do_is_given_up_but_not_soon() {
         let (mut failed, mut seconds) = (0, 0);
         while bench.board.missing().is_empty() {
             seconds += 1;
+            assert!(seconds < 1200, "never given up");
             if let JobReply::Job(job) = bench.claim("a", seconds, seconds) {
                 failed += 1;
                 let given_up = bench.hand_back("a", &job, Some(seconds)).unwrap().given_up;
                 assert_eq!(given_up, bench.board.missing());
             }
         }
-        assert!((600..1200).contains(&seconds), "proven: {proven}, given up after {seconds} s and {failed} failures");
+        assert!(seconds >= 600, "proven: {proven}, given up after {seconds} s and {failed} failures");
     }
 }
 
