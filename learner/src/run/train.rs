@@ -180,7 +180,10 @@ fn conclude(run_dir: &RunDir, config: &RunConfig, ending: Ending) -> anyhow::Res
     let folder = run_dir.path().display();
     let reported = match &ending {
         // Perhaps of a disk that hangs.
-        Ending::Failed(_) => within(REPORT_PATIENCE, run_dir.clone(), |run_dir| summarise(&run_dir)),
+        Ending::Failed(_) => {
+            let run_dir = run_dir.clone();
+            within(REPORT_PATIENCE, move || summarise(&run_dir))
+        }
         _ => summarise(run_dir),
     };
     let kept =
@@ -209,13 +212,12 @@ fn all_scored(report: RunReport) -> anyhow::Result<()> {
 }
 
 /// Does it on another thread, which is not waited for any longer.
-fn within<I: Send + 'static, T: Send + 'static>(
+fn within<T: Send + 'static>(
     patience: Duration,
-    input: I,
-    work: impl FnOnce(I) -> anyhow::Result<T> + Send + 'static,
+    work: impl FnOnce() -> anyhow::Result<T> + Send + 'static,
 ) -> anyhow::Result<T> {
     let (tell, told) = std::sync::mpsc::channel();
-    std::thread::spawn(move || tell.send(work(input)));
+    std::thread::spawn(move || tell.send(work()));
     told.recv_timeout(patience).unwrap_or_else(|_| Err(anyhow!("it took longer than {patience:?}")))
 }
 
