@@ -33,7 +33,7 @@ async fn messages(session: &Session, run: &Name, stop: &AtomicBool) {
         session.put(keys::progress(run, &name("flood")), progress).await.unwrap();
         let report = encode(&made_up::report(run, 10 + number % 2, number)).unwrap();
         for (key, message) in [(keys::jobs(run), claim(number)), (keys::scores(run), report)] {
-            session.get(key).payload(message).timeout(Duration::from_secs(1)).callback(drop).await.unwrap();
+            session.get(key).payload(message).timeout(Duration::from_secs(30)).callback(drop).await.unwrap();
         }
         let token = keys::live_evaluator(run, &name(&evaluator));
         tokens.push(session.liveliness().declare_token(token).await.unwrap());
@@ -53,7 +53,7 @@ async fn large_questions(session: &Session, run: &Name, stop: &AtomicBool) {
     while !stop.load(Ordering::Relaxed) {
         for key in [keys::jobs(run), keys::scores(run), keys::weights_at(run, 10)] {
             number += 1;
-            let ask = |key: String| session.get(key).timeout(Duration::from_secs(1)).callback(drop);
+            let ask = |key: String| session.get(key).timeout(Duration::from_secs(30)).callback(drop);
             ask(format!("{key}?{much}")).payload(claim(number)).await.unwrap();
             ask(key.clone()).payload(claim(number)).attachment(&much).await.unwrap();
             ask(key.clone()).payload(claim(number)).encoding(format!("text/plain;{number}")).await.unwrap();
