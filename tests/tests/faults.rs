@@ -11,7 +11,7 @@ use quad_tests::{PATIENCE, eventually, http};
 const LONG_JOBS: Setting =
     Setting { steps: 120, eval_interval: 10, episodes: 5, candidates: 500, hidden: 256, seed: 1 };
 
-/// Whoever is told to leave must have left within this time: Docker does not wait for longer.
+/// Whoever is told to leave must have left within this time (docs/reliability.md).
 const LONGEST_LEAVE: Duration = Duration::from_secs(10);
 
 #[tokio::test(flavor = "multi_thread")]
