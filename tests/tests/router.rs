@@ -155,7 +155,7 @@ async fn what_is_too_large_ends_at_the_router() {
     let _queryable = session.declare_queryable("quad/run/**").callback(asked).await.unwrap();
 
     let puts = [("progress/e", 1 << 12), ("scores/1", 1 << 20)];
-    let questions = [("weights/1", 1 << 12), ("jobs", 1 << 18), ("scores", 1 << 18)];
+    let questions = [("weights/1", 1 << 12), ("jobs", 30 << 10), ("scores", 30 << 10)];
     for (number, (key, largest)) in puts.into_iter().chain(questions).enumerate() {
         let key = format!("quad/run/{key}");
         // Slowly enough for the limits on how many there may be.

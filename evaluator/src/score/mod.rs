@@ -56,7 +56,7 @@ pub struct ScoreArgs {
     /// Environment to act in [default: the run's]
     #[arg(long, value_name = "NAME", value_parser = environment::find)]
     env: Option<&'static EnvironmentSpec>,
-    /// Arithmetic of the networks, f32 or bf16 [default: as `evaluator serve`]
+    /// Arithmetic of the networks, as in `scores.jsonl`. f32 or bf16 [default: as `evaluator serve`]
     #[arg(long, value_name = "NAME")]
     precision: Option<Precision>,
     /// Print a JSON array with every episode
@@ -79,8 +79,8 @@ pub struct Scored {
     pub seed: u64,
     /// Actions sampled per state.
     pub candidates: u32,
-    /// Arithmetic of the networks.
-    pub precision: Precision,
+    /// Arithmetic of the networks, as in `scores.jsonl`.
+    pub precision: String,
     /// In the order of their seeds.
     pub episodes: Vec<Episode>,
 }
@@ -141,7 +141,7 @@ fn measure(subject: &Subject, candidates: u32) -> anyhow::Result<Scored> {
         step: *step,
         seed: *seed,
         candidates,
-        precision: *precision,
+        precision: precision.arithmetic(),
         episodes: batches.iter().flatten().map(Episode::from).collect(),
     };
     info!("{}, {candidates} candidates: {}", path.display(), table::Spread::of(&scored.scores()));

@@ -51,7 +51,7 @@ pub fn table(scored: &[Scored]) -> String {
         };
         rows.push(head.into_iter().chain(candidates.iter().map(score)).collect());
     }
-    let precision = scored.first().map_or("", |scored| scored.precision.name());
+    let precision = scored.first().map_or("", |scored| &scored.precision);
     let mut note = format!("normalised score in {precision}, mean ± standard deviation over the episodes");
     if snapshots.len() > 1 && scored.iter().all(|other| other.environment == scored[0].environment) {
         let head = [format!("mean of {} snapshots", snapshots.len()), String::new(), String::new(), String::new()];
@@ -85,7 +85,6 @@ fn aligned(rows: &[Vec<String>]) -> String {
 mod tests {
     use super::*;
     use crate::score::Episode;
-    use quad_policy::Precision;
     use std::path::Path;
 
     fn scored(snapshot: &str, candidates: u32, scores: &[f64]) -> Scored {
@@ -97,7 +96,7 @@ mod tests {
             step: Some(20),
             seed: 1,
             candidates,
-            precision: Precision::F32,
+            precision: "f32-avx2".to_owned(),
             episodes: scores.iter().map(episode).collect(),
         }
     }
