@@ -8,7 +8,7 @@ use std::sync::{Mutex, Once};
 use std::time::{Duration, Instant};
 
 use quad_tests::certificates::{Certificates, connect};
-use quad_tests::router::protected_router;
+use quad_tests::router::{protected_router, protected_router_at};
 use quad_tests::system::{Scratch, Setting};
 use quad_tests::{PATIENCE, eventually};
 use tokio::time::timeout;
@@ -95,6 +95,20 @@ async fn a_run_completes_through_the_shipped_router() {
     let status = learner.process.wait(PATIENCE);
     assert!(status.success(), "the learner ended with {status}");
     learner.assert_complete(&setting);
+}
+
+/// Its certificate is for 127.0.0.1, so whoever looks for it elsewhere has met somebody else.
+#[tokio::test(flavor = "multi_thread")]
+async fn a_router_whose_certificate_is_for_another_host_is_not_believed() {
+    let Some(certificates) = make_certificates() else { return };
+    let (_router, endpoint) = protected_router_at("127.0.0.2", &certificates.of("router")).await;
+    let scratch = Scratch::new();
+    let launcher = ["env", "RUST_LOG=info,zenoh=debug"].map(str::to_owned);
+    let folder = certificates.argument("evaluator");
+    let evaluator =
+        scratch.evaluator_through(&launcher, "careful", &["--connect", &endpoint, "--certificates", &folder]);
+    evaluator.process.wait_for_log("certificate not valid for name", PATIENCE);
+    assert!(!evaluator.process.log().contains("Successfully connected"), "{}", evaluator.process.log());
 }
 
 #[tokio::test(flavor = "multi_thread")]

@@ -25,7 +25,11 @@ impl SmallDisk {
     fn mount(path: PathBuf) -> Option<Self> {
         fs::create_dir_all(&path).unwrap();
         let mounted = Command::new("mount").args(["-t", "tmpfs", "-o", "size=6m", "tmpfs"]).arg(&path).output();
-        mounted.is_ok_and(|output| output.status.success()).then_some(Self { path })
+        let mounted = mounted.is_ok_and(|output| output.status.success());
+        if !mounted {
+            eprintln!("skipped: mounting a tmpfs needs the rights of root");
+        }
+        mounted.then_some(Self { path })
     }
 }
 
@@ -53,10 +57,7 @@ fn fill(path: &Path) {
 #[test]
 fn a_full_disk_delays_scores_and_checkpoints_until_there_is_room() {
     let scratch = Scratch::new();
-    let Some(disk) = SmallDisk::mount(scratch.path().join("run")) else {
-        eprintln!("skipped: mounting a tmpfs needs the rights of root");
-        return;
-    };
+    let Some(disk) = SmallDisk::mount(scratch.path().join("run")) else { return };
     // Long enough for the disk to be full in the middle of it.
     let setting = Setting { hidden: 64, ..SETTING };
     let mut learner = scratch.learner_with("run", setting, &LISTEN);
@@ -83,10 +84,7 @@ fn a_full_disk_delays_scores_and_checkpoints_until_there_is_room() {
 #[test]
 fn scores_wait_for_a_disk_that_is_full_and_that_is_told() {
     let scratch = Scratch::new();
-    let Some(disk) = SmallDisk::mount(scratch.path().join("run")) else {
-        eprintln!("skipped: mounting a tmpfs needs the rights of root");
-        return;
-    };
+    let Some(disk) = SmallDisk::mount(scratch.path().join("run")) else { return };
     let setting = Setting { steps: 500, eval_interval: 250, ..SETTING };
     let mut learner = scratch.learner_with("run", setting, &LISTEN);
     learner.process.wait_for_log("waiting for the scores", PATIENCE);
