@@ -1,7 +1,6 @@
 //! The thread that writes scores to the disk. All that came while it was at the last ones go together, in one write and one
 //! synchronisation. A slow disk delays the thanks for scores, and nothing else: jobs go out meanwhile.
 
-use std::error::Error;
 use std::sync::mpsc::{Receiver, RecvTimeoutError};
 use std::thread;
 use std::time::Duration;
@@ -10,7 +9,7 @@ use quad_service::Beat;
 
 use crate::hub::Event;
 use crate::inbox::Inbox;
-use crate::run_dir::{AuditLine, Log, PatientLog, RunDirError, ScoreLine};
+use crate::run_dir::{AuditLine, Log, PatientLog, ScoreLine};
 use crate::trouble::Trouble;
 
 /// After a write, scores are left to gather for so long: to synchronise a file takes much of a processor, too.
@@ -48,11 +47,12 @@ impl Scribe {
             match self.lines.recv_timeout(beat.interval()) {
                 Ok(Lines::Scores(lines)) => {
                     let written = self.scores.append(&lines);
+                    let written = written.map_err(|error| format!("{:#}", anyhow::Error::from(error)));
                     match &written {
                         Ok(()) => self.trouble.over(beat),
-                        Err(error) => self.trouble.refused(beat, &said(error)),
+                        Err(error) => self.trouble.refused(beat, error),
                     }
-                    self.hub.send(Event::Written(written.map_err(|error| said(&error))));
+                    self.hub.send(Event::Written(written));
                     thread::sleep(GATHER);
                 }
                 Ok(Lines::Audits(lines)) => self.append_audits(lines),
@@ -66,13 +66,5 @@ impl Scribe {
         if let Some(log) = &mut self.audits {
             log.append(lines);
         }
-    }
-}
-
-/// With what the system says of it.
-fn said(error: &RunDirError) -> String {
-    match error.source() {
-        Some(cause) => format!("{error}: {cause}"),
-        None => error.to_string(),
     }
 }

@@ -56,7 +56,7 @@ pub struct ScoreArgs {
     /// Environment to act in [default: the run's]
     #[arg(long, value_name = "NAME", value_parser = environment::find)]
     env: Option<&'static EnvironmentSpec>,
-    /// Arithmetic of the networks, as in `scores.jsonl`. f32 or bf16 [default: as `evaluator serve`]
+    /// Arithmetic of the networks, f32 or bf16 [default: as `evaluator serve`]
     #[arg(long, value_name = "NAME")]
     precision: Option<Precision>,
     /// Print a JSON array with every episode
