@@ -5,7 +5,7 @@
 //! length (u64) before them, an enumeration with its variant's index (u32) before its fields. (It is bincode with
 //! fixed-width integers.)
 //!
-//! Bytes may come from anybody: whatever they are, [`decode`] gives a message that keeps all rules or a typed error.
+//! The bytes may come from any peer. Whatever they are, [`decode`] gives a message that keeps all rules or a typed error.
 //! A frame of up to 1 MiB never makes it allocate more than 4 MiB at once, a larger one never more than 64 MiB.
 
 use std::io::Read;
@@ -17,13 +17,10 @@ use bincode::error::{DecodeError, EncodeError};
 
 pub(crate) use bincode::{Decode, Encode};
 
-use crate::{
-    Hash, JobReply, JobRequest, Name, Progress, RecordedScores, Schema, ScoreReply, ScoreReport, Snapshot,
-    WeightsRequest,
-};
+use crate::{Hash, JobReply, JobRequest, Name, Progress, Schema, ScoreReply, ScoreReport, Snapshot};
 
 /// Version of keys, messages and encoding. Frames of another version are refused.
-pub const PROTOCOL_VERSION: u16 = 6;
+pub const PROTOCOL_VERSION: u16 = 7;
 
 const MAGIC: &[u8; 4] = b"QUAD";
 const HEADER_LENGTH: usize = MAGIC.len() + size_of::<u16>() + size_of::<u8>();
@@ -84,16 +81,8 @@ impl Message for ScoreReply {
     const KIND: u8 = 5;
 }
 
-impl Message for RecordedScores {
-    const KIND: u8 = 6;
-}
-
 impl Message for Progress {
-    const KIND: u8 = 7;
-}
-
-impl Message for WeightsRequest {
-    const KIND: u8 = 8;
+    const KIND: u8 = 6;
 }
 
 /// Why bytes are not the expected message, or a message cannot be sent.
@@ -225,12 +214,6 @@ pub fn decode_from<M: Message>(length: usize, mut frame: impl Read) -> Result<M,
     }
     message.verify()?;
     Ok(message)
-}
-
-/// The encoding of what is not a message of its own, without a header.
-pub(crate) fn fields<T: Encode>(value: &T) -> Vec<u8> {
-    // Writing to memory cannot fail, and none of our types refuses to be encoded.
-    bincode::encode_to_vec(value, FIXED).unwrap_or_default()
 }
 
 fn body_error(error: DecodeError) -> CodecError {

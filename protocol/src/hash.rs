@@ -13,16 +13,6 @@ impl Hash {
     pub fn of(bytes: &[u8]) -> Hash {
         Hash(blake3::hash(bytes).into())
     }
-
-    /// The hash of `bytes` that only whoever knows `key` can make.
-    pub(crate) fn keyed(key: &[u8; 32], bytes: &[u8]) -> Hash {
-        Hash(blake3::keyed_hash(key, bytes).into())
-    }
-
-    /// Equality in a time that says nothing of where they differ.
-    pub(crate) fn is(&self, other: &Hash) -> bool {
-        blake3::Hash::from_bytes(self.0) == blake3::Hash::from_bytes(other.0)
-    }
 }
 
 impl fmt::Display for Hash {

@@ -3,7 +3,7 @@
 use std::time::Duration;
 
 use crate::codec::{Decode, Encode};
-use crate::{Hash, Lease, Name};
+use crate::{Hash, Name};
 
 /// What an evaluator asks a learner about jobs.
 #[derive(Clone, Debug, PartialEq, Eq, Encode, Decode)]
@@ -17,8 +17,6 @@ pub enum JobRequest {
         attempt: u64,
         /// The environments it has.
         environments: Vec<String>,
-        /// The arithmetic that it computes policies in, e.g. `f32-avx2` or `bf16-amx`: those of one name compute the same bits.
-        precision: Name,
     },
     /// It will not do the one that it has.
     HandBack {
@@ -26,8 +24,6 @@ pub enum JobRequest {
         evaluator: Name,
         /// [`Job::id`].
         job: u64,
-        /// [`Job::lease`].
-        lease: Lease,
         /// Why it could not do it, for people; nothing if it only leaves.
         failed: Option<String>,
     },
@@ -69,8 +65,6 @@ impl JobReply {
 pub struct Job {
     /// Number of the job, counted within the learner's incarnation.
     pub id: u64,
-    /// The secret that shows whose job it is.
-    pub lease: Lease,
     /// The run.
     pub run: Name,
     /// The learner's incarnation.

@@ -3,17 +3,15 @@
 //! | key | verb | message |
 //! |---|---|---|
 //! | `quad/<run>/weights` | learner publishes | [`Snapshot`](crate::Snapshot) |
-//! | `quad/<run>/weights/<step>` | learner answers | [`WeightsRequest`](crate::WeightsRequest) or nothing → [`Snapshot`](crate::Snapshot) |
+//! | `quad/<run>/weights/<step>` | learner answers | nothing → [`Snapshot`](crate::Snapshot) |
 //! | `quad/<run>/jobs` | learner answers | [`JobRequest`](crate::JobRequest) → [`JobReply`](crate::JobReply) |
 //! | `quad/<run>/scores` | learner answers | [`ScoreReport`](crate::ScoreReport) → [`ScoreReply`](crate::ScoreReply) |
-//! | `quad/<run>/scores/<step>` | learner publishes | [`RecordedScores`](crate::RecordedScores) |
 //! | `quad/<run>/progress/<evaluator>` | evaluator publishes | [`Progress`](crate::Progress) |
 //! | `quad/<run>/live/learner/<incarnation>` | learner's liveliness token | |
 //! | `quad/<run>/live/evaluator/<evaluator>` | evaluator's liveliness token | |
 //!
-//! Anybody who reaches the network may answer on these keys, too. So a learner's answers, jobs and snapshots name its
-//! incarnation, and an evaluator believes those of the incarnation that it follows by its token; of several answers it takes
-//! the first that fits. Only access control keeps out whoever forges tokens and answers alike.
+//! A learner's answers, jobs and snapshots name its incarnation: an evaluator believes those of the incarnation that it
+//! follows by its token, and not those of an earlier life. Which peers may use these keys is up to TLS and access control.
 
 use crate::Name;
 
@@ -25,7 +23,7 @@ pub fn weights(run: &Name) -> String {
     format!("quad/{run}/weights")
 }
 
-/// The weights after `step` gradient steps, for whoever asks.
+/// The weights after `step` gradient steps, for an evaluator that asks.
 pub fn weights_at(run: &Name, step: u64) -> String {
     format!("quad/{run}/weights/{step}")
 }
@@ -43,11 +41,6 @@ pub fn jobs(run: &Name) -> String {
 /// Where evaluators deliver scores.
 pub fn scores(run: &Name) -> String {
     format!("quad/{run}/scores")
-}
-
-/// Scores of the weights after `step` gradient steps, as they are recorded.
-pub fn scores_at(run: &Name, step: u64) -> String {
-    format!("quad/{run}/scores/{step}")
 }
 
 /// How far one evaluator is.
@@ -75,6 +68,18 @@ pub fn live_evaluator(run: &Name, evaluator: &Name) -> String {
     format!("quad/{run}/live/evaluator/{evaluator}")
 }
 
+/// Key expression of the tokens of all of a run's evaluators.
+pub fn all_evaluators(run: &Name) -> String {
+    format!("quad/{run}/live/evaluator/*")
+}
+
+/// The evaluator that a key of [`live_evaluator`] names.
+pub fn evaluator_of(key: &str) -> Option<Name> {
+    let run = run_of(key)?;
+    let name = key.strip_prefix("quad/")?.strip_prefix(run.as_str())?.strip_prefix("/live/evaluator/")?;
+    Name::new(name).ok()
+}
+
 /// The run that `key` belongs to; `None` if it is no key of ours.
 pub fn run_of(key: &str) -> Option<Name> {
     let (run, _) = key.strip_prefix("quad/")?.split_once('/')?;
@@ -89,12 +94,11 @@ pub fn incarnation_of(key: &str) -> Option<u64> {
     incarnation.parse().ok().filter(|number: &u64| number.to_string() == incarnation)
 }
 
-/// The step that a key of [`weights_at`] or [`scores_at`] names.
+/// The step that a key of [`weights_at`] names.
 pub fn step_of(key: &str) -> Option<u64> {
     let run = run_of(key)?;
     let rest = key.strip_prefix("quad/")?.strip_prefix(run.as_str())?;
-    let step = rest.strip_prefix("/weights/").or_else(|| rest.strip_prefix("/scores/"))?;
-    step.parse().ok()
+    rest.strip_prefix("/weights/")?.parse().ok()
 }
 
 #[cfg(test)]
@@ -110,9 +114,10 @@ mod tests {
             assert_eq!(run_of(&key), Some(run.clone()), "{key}");
             assert_eq!(step_of(&key), None, "{key}");
         }
-        for key in [weights_at(&run, 10_000), scores_at(&run, 10_000)] {
-            assert_eq!((run_of(&key), step_of(&key)), (Some(run.clone()), Some(10_000)), "{key}");
-        }
+        let key = weights_at(&run, 10_000);
+        assert_eq!((run_of(&key), step_of(&key)), (Some(run.clone()), Some(10_000)));
+        assert_eq!(evaluator_of(&live_evaluator(&run, &evaluator)), Some(evaluator.clone()));
+        assert_eq!(evaluator_of("quad/run-1/live/evaluator/a*b"), None);
         for key in [progress(&run, &evaluator), live_evaluator(&run, &evaluator)] {
             assert_eq!((run_of(&key), step_of(&key)), (Some(run.clone()), None), "{key}");
         }

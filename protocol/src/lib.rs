@@ -7,10 +7,9 @@
 //! - `name`: what runs and evaluators may be called; `hash`: how weights are identified.
 //! - [`keys`]: where on Zenoh each message is found.
 //! - `snapshot`: weights, from the learner to evaluators; `origin`: what their file says of where it comes from.
-//! - `seeds`: which episodes an evaluation has; `job`: an evaluator asks for work and gets some; `lease`: what shows whose
-//!   job it is.
+//! - `seeds`: which episodes an evaluation has; `job`: an evaluator asks for work and gets some.
 //! - `progress`: an evaluator tells how far its job is.
-//! - `score`: an evaluator delivers scores, the learner acknowledges and publishes them.
+//! - `score`: an evaluator delivers scores, the learner acknowledges them.
 //! - `codec`: messages to bytes and back; the only place that knows the encoding.
 //!
 //! Nothing here knows what the weights mean or how episodes are simulated.
@@ -21,7 +20,6 @@ mod codec;
 mod hash;
 mod job;
 pub mod keys;
-mod lease;
 mod name;
 mod origin;
 mod progress;
@@ -32,10 +30,9 @@ mod snapshot;
 pub use codec::{CodecError, Message, PROTOCOL_VERSION, decode, decode_from, encode};
 pub use hash::Hash;
 pub use job::{Job, JobReply, JobRequest};
-pub use lease::Lease;
 pub use name::{InvalidName, Name};
 pub use origin::{Origin, OriginError};
 pub use progress::Progress;
-pub use score::{EpisodeScore, RecordedScores, ScoreReply, ScoreReport};
+pub use score::{EpisodeScore, ScoreReply, ScoreReport};
 pub use seeds::episode_seeds;
-pub use snapshot::{Schema, Snapshot, WeightsRequest};
+pub use snapshot::{Schema, Snapshot};

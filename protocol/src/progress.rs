@@ -1,11 +1,9 @@
 //! Progress of an evaluator.
 
 use crate::codec::{Decode, Encode};
-use crate::{Hash, Job, Lease, Name};
+use crate::{Job, Name};
 
 /// How far a job is, and what the evaluator has done so far. Extends the job's lease, if it is further than before.
-///
-/// Everybody may read it, so it does not hold the job's lease but a proof that its sender has it.
 #[derive(Clone, Debug, PartialEq, Eq, Encode, Decode)]
 pub struct Progress {
     /// The evaluator.
@@ -28,12 +26,10 @@ pub struct Progress {
     pub environment_steps: u64,
     /// Episodes of this evaluator since it started, over all of its jobs and runs.
     pub episodes: u64,
-    /// Of everything above, under the job's lease. [`signed`](Self::signed) makes it.
-    pub proof: Hash,
 }
 
 impl Progress {
-    /// Of `job`, in which nothing has been done yet, by an evaluator that has done nothing yet; not signed.
+    /// Of `job`, in which nothing has been done yet, by an evaluator that has done nothing yet.
     pub fn of(job: &Job, evaluator: Name) -> Self {
         Self {
             evaluator,
@@ -46,22 +42,6 @@ impl Progress {
             steps_done: 0,
             environment_steps: 0,
             episodes: 0,
-            proof: Hash::of(&[]),
         }
-    }
-
-    /// The same with its proof.
-    pub fn signed(self, lease: &Lease) -> Self {
-        let proof = self.proof_under(lease);
-        Self { proof, ..self }
-    }
-
-    /// Whether the sender has the lease.
-    pub fn is_signed(&self, lease: &Lease) -> bool {
-        self.proof.is(&self.proof_under(lease))
-    }
-
-    fn proof_under(&self, lease: &Lease) -> Hash {
-        lease.proof(&("progress", Self { proof: Hash::of(&[]), ..self.clone() }))
     }
 }

@@ -1,4 +1,4 @@
-//! Scores: an evaluator delivers them, the learner acknowledges them and publishes what it has recorded.
+//! Scores: an evaluator delivers them, the learner acknowledges them.
 
 use crate::codec::{Decode, Encode};
 use crate::{Hash, Job, Name};
@@ -16,8 +16,8 @@ pub struct EpisodeScore {
     pub score: f64,
 }
 
-/// An evaluator delivers the episodes of a job. They are welcome whoever had the job and whichever life of the learner handed
-/// it out: what counts is that run, step, weights and seeds are those of an evaluation.
+/// An evaluator delivers the episodes of a job. The learner records them even if the job has gone to another evaluator, or an
+/// earlier life of the learner handed it out: what counts is that run, step, weights and seeds are those of an evaluation.
 #[derive(Clone, Debug, PartialEq, Encode, Decode)]
 pub struct ScoreReport {
     /// Who delivers.
@@ -32,7 +32,7 @@ pub struct ScoreReport {
     pub step: u64,
     /// Hash of the snapshot's tensors.
     pub weights: Hash,
-    /// The arithmetic that the policy was computed in, as in [`JobRequest::Claim`](crate::JobRequest::Claim).
+    /// The arithmetic that the policy was computed in, e.g. `f32-avx2` or `bf16-amx`: evaluators of one name compute the same bits.
     pub precision: Name,
     /// The episodes.
     pub episodes: Vec<EpisodeScore>,
@@ -74,19 +74,4 @@ impl ScoreReply {
             Self::Recorded { incarnation, .. } | Self::Refused { incarnation, .. } => *incarnation,
         }
     }
-}
-
-/// Scores that the learner has recorded, published for observers.
-#[derive(Clone, Debug, PartialEq, Encode, Decode)]
-pub struct RecordedScores {
-    /// The run.
-    pub run: Name,
-    /// Gradient step of the snapshot.
-    pub step: u64,
-    /// Hash of the snapshot's tensors.
-    pub weights: Hash,
-    /// Who measured.
-    pub evaluator: Name,
-    /// The episodes.
-    pub episodes: Vec<EpisodeScore>,
 }

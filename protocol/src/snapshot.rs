@@ -22,13 +22,6 @@ impl Schema {
     pub const MAX_NAME_LENGTH: usize = 64;
 }
 
-/// An evaluator asks for the weights of a step. Its name lets a learner share its attention fairly.
-#[derive(Clone, Debug, PartialEq, Eq, Encode, Decode)]
-pub struct WeightsRequest {
-    /// Who asks.
-    pub evaluator: Name,
-}
-
 /// The policy of one run after one gradient step.
 #[derive(Clone, Debug, PartialEq, Eq, Encode, Decode)]
 pub struct Snapshot {

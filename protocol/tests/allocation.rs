@@ -68,7 +68,6 @@ fn claimed_lengths_are_not_believed() {
     let episodes = vec![EpisodeScore { seed: 1, episode_return: 2.0, length: 3, score: 4.0 }; 3];
     let job = Job {
         id: 1,
-        lease: Lease::random(),
         run: name(),
         incarnation: 2,
         step: 3,
@@ -81,10 +80,9 @@ fn claimed_lengths_are_not_believed() {
     };
     claim_too_much(&Snapshot { run: name(), incarnation: 1, step: 2, schema, hash, tensors });
     let environments = vec![environment(); 3];
-    claim_too_much(&JobRequest::Claim { evaluator: name(), attempt: 1, environments, precision: name() });
+    claim_too_much(&JobRequest::Claim { evaluator: name(), attempt: 1, environments });
     let failed = Some(environment());
-    claim_too_much(&JobRequest::HandBack { evaluator: name(), job: 1, lease: Lease::random(), failed });
-    claim_too_much(&WeightsRequest { evaluator: name() });
+    claim_too_much(&JobRequest::HandBack { evaluator: name(), job: 1, failed });
     claim_too_much(&JobReply::Job(job));
     claim_too_much(&ScoreReport {
         evaluator: name(),
@@ -94,8 +92,7 @@ fn claimed_lengths_are_not_believed() {
         step: 3,
         weights: hash,
         precision: name(),
-        episodes: episodes.clone(),
+        episodes,
     });
     claim_too_much(&ScoreReply::Refused { incarnation: 1, reason: environment() });
-    claim_too_much(&RecordedScores { run: name(), step: 1, weights: hash, evaluator: name(), episodes });
 }

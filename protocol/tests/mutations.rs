@@ -84,8 +84,6 @@ proptest! {
         decode_as::<JobReply>(&frame);
         decode_as::<ScoreReport>(&frame);
         decode_as::<ScoreReply>(&frame);
-        decode_as::<RecordedScores>(&frame);
         decode_as::<Progress>(&frame);
-        decode_as::<WeightsRequest>(&frame);
     }
 }

@@ -63,35 +63,19 @@ fn snapshot() -> impl Strategy<Value = Snapshot> {
     )
 }
 
-fn lease() -> impl Strategy<Value = Lease> {
-    // A lease comes out of its own generator only; what it is does not matter here.
-    Just(()).prop_map(|()| Lease::random())
-}
-
 fn job_request() -> impl Strategy<Value = JobRequest> {
-    let claim =
-        (name(), any::<u64>(), vec(text(), 0..5), name()).prop_map(|(evaluator, attempt, environments, precision)| {
-            JobRequest::Claim { evaluator, attempt, environments, precision }
-        });
-    let hand_back = (name(), any::<u64>(), lease(), prop::option::of(text()))
-        .prop_map(|(evaluator, job, lease, failed)| JobRequest::HandBack { evaluator, job, lease, failed });
+    let claim = (name(), any::<u64>(), vec(text(), 0..5))
+        .prop_map(|(evaluator, attempt, environments)| JobRequest::Claim { evaluator, attempt, environments });
+    let hand_back = (name(), any::<u64>(), prop::option::of(text()))
+        .prop_map(|(evaluator, job, failed)| JobRequest::HandBack { evaluator, job, failed });
     prop_oneof![claim, hand_back]
 }
 
 fn job_reply() -> impl Strategy<Value = JobReply> {
-    let job = (any::<[u64; 5]>(), lease(), name(), hash(), text(), vec(any::<u64>(), 0..100), any::<u32>()).prop_map(
-        |(
-            [id, incarnation, step, instance, progress_milliseconds],
-            lease,
-            run,
-            weights,
-            environment,
-            seeds,
-            candidates,
-        )| {
+    let job = (any::<[u64; 5]>(), name(), hash(), text(), vec(any::<u64>(), 0..100), any::<u32>()).prop_map(
+        |([id, incarnation, step, instance, progress_milliseconds], run, weights, environment, seeds, candidates)| {
             JobReply::Job(Job {
                 id,
-                lease,
                 run,
                 incarnation,
                 step,
@@ -132,15 +116,9 @@ fn score_reply() -> impl Strategy<Value = ScoreReply> {
     prop_oneof![recorded, refused]
 }
 
-fn recorded_scores() -> impl Strategy<Value = RecordedScores> {
-    (name(), any::<u64>(), hash(), name(), episodes()).prop_map(|(run, step, weights, evaluator, episodes)| {
-        RecordedScores { run, step, weights, evaluator, episodes }
-    })
-}
-
 fn progress() -> impl Strategy<Value = Progress> {
-    (name(), name(), any::<[u64; 6]>(), any::<[u32; 2]>(), hash()).prop_map(
-        |(evaluator, run, numbers, [episodes_done, episodes_total], proof)| {
+    (name(), name(), any::<[u64; 6]>(), any::<[u32; 2]>()).prop_map(
+        |(evaluator, run, numbers, [episodes_done, episodes_total])| {
             let [incarnation, job, step, steps_done, environment_steps, episodes] = numbers;
             Progress {
                 evaluator,
@@ -153,7 +131,6 @@ fn progress() -> impl Strategy<Value = Progress> {
                 steps_done,
                 environment_steps,
                 episodes,
-                proof,
             }
         },
     )
@@ -203,9 +180,6 @@ proptest! {
     fn job_requests(message in job_request()) { withstands_the_wire(&message)?; }
 
     #[test]
-    fn weights_requests(evaluator in name()) { withstands_the_wire(&WeightsRequest { evaluator })?; }
-
-    #[test]
     fn job_replies(message in job_reply()) { withstands_the_wire(&message)?; }
 
     #[test]
@@ -215,26 +189,7 @@ proptest! {
     fn score_replies(message in score_reply()) { withstands_the_wire(&message)?; }
 
     #[test]
-    fn recorded_score_messages(message in recorded_scores()) { withstands_the_wire(&message)?; }
-
-    #[test]
     fn progress_messages(message in progress()) { withstands_the_wire(&message)?; }
-
-    #[test]
-    fn what_is_signed_is_signed_as_a_whole(message in progress(), other in progress()) {
-        let (mine, another) = (Lease::random(), Lease::random());
-        let signed = message.clone().signed(&mine);
-        prop_assert!(signed.is_signed(&mine) && !signed.is_signed(&another) && !message.is_signed(&mine));
-        for changed in [
-            Progress { evaluator: other.evaluator, ..signed.clone() },
-            Progress { job: signed.job ^ 1, ..signed.clone() },
-            Progress { steps_done: signed.steps_done ^ 1, ..signed.clone() },
-            Progress { episodes_done: signed.episodes_done ^ 1, ..signed.clone() },
-            Progress { incarnation: signed.incarnation ^ 1, ..signed.clone() },
-        ] {
-            prop_assert!(changed == signed || !changed.is_signed(&mine), "{:?}", changed);
-        }
-    }
 
     #[test]
     fn random_bytes_are_no_message(bytes in vec(any::<u8>(), 0..300)) {
@@ -254,9 +209,7 @@ proptest! {
         check::<JobReply>(&body);
         check::<ScoreReport>(&body);
         check::<ScoreReply>(&body);
-        check::<RecordedScores>(&body);
         check::<Progress>(&body);
-        check::<WeightsRequest>(&body);
     }
 }
 
@@ -285,9 +238,8 @@ proptest! {
 
 #[test]
 fn a_name_that_is_not_allowed_is_malformed() {
-    let precision = Name::new("f32").unwrap();
     let evaluator = Name::new("a-b").unwrap();
-    let message = JobRequest::Claim { evaluator, attempt: 0, environments: vec![], precision };
+    let message = JobRequest::Claim { evaluator, attempt: 0, environments: vec![] };
     let mut frame = encode(&message).unwrap();
     let dash = frame.iter().position(|&byte| byte == b'-').unwrap();
     frame[dash] = b'/';
@@ -317,7 +269,7 @@ fn a_schema_has_no_long_names() {
 }
 
 #[test]
-fn what_nobody_would_accept_is_not_sent() {
+fn what_every_receiver_refuses_is_not_sent() {
     let tensors = vec![0; Snapshot::LIMIT];
     let schema = hopper();
     let hash = Hash::of(&tensors);

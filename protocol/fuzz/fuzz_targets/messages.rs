@@ -33,9 +33,7 @@ fuzz_target!(init: write_seeds(), |bytes: &[u8]| {
     read::<JobReply>(bytes);
     read::<ScoreReport>(bytes);
     read::<ScoreReply>(bytes);
-    read::<RecordedScores>(bytes);
     read::<Progress>(bytes);
-    read::<WeightsRequest>(bytes);
     // A key is text from the wire, too.
     if let Ok(key) = std::str::from_utf8(bytes) {
         let _ = (keys::run_of(key), keys::incarnation_of(key), keys::step_of(key));

@@ -13,10 +13,8 @@ pub fn frames() -> Vec<Vec<u8>> {
     let weights = Hash::of(&tensors);
     let schema = Schema { environment: text(), observation_dim: 11, action_dim: 3, policy: "diffusion".to_owned() };
     let episodes = vec![EpisodeScore { seed: 1, episode_return: 2.0, length: 3, score: 4.0 }; 3];
-    let lease = Lease::random();
     let job = Job {
         id: 1,
-        lease: lease.clone(),
         run: name(),
         incarnation: 2,
         step: 3,
@@ -38,14 +36,12 @@ pub fn frames() -> Vec<Vec<u8>> {
         steps_done: 100,
         environment_steps: 200,
         episodes: 7,
-        proof: weights,
     };
     let environments = vec![text(), "walker2d".to_owned()];
     vec![
         encode(&Snapshot { run: name(), incarnation: 1, step: 2, schema, hash: weights, tensors }).unwrap(),
-        encode(&JobRequest::Claim { evaluator: name(), attempt: 9, environments, precision: name() }).unwrap(),
-        encode(&JobRequest::HandBack { evaluator: name(), job: 1, lease: lease.clone(), failed: Some(text()) })
-            .unwrap(),
+        encode(&JobRequest::Claim { evaluator: name(), attempt: 9, environments }).unwrap(),
+        encode(&JobRequest::HandBack { evaluator: name(), job: 1, failed: Some(text()) }).unwrap(),
         encode(&JobReply::Job(job)).unwrap(),
         encode(&JobReply::Wait { incarnation: 2, milliseconds: 10 }).unwrap(),
         encode(&JobReply::HandedBack { incarnation: 2, accepted: true }).unwrap(),
@@ -57,13 +53,11 @@ pub fn frames() -> Vec<Vec<u8>> {
             step: 3,
             weights,
             precision: name(),
-            episodes: episodes.clone(),
+            episodes,
         })
         .unwrap(),
         encode(&ScoreReply::Recorded { incarnation: 1, new: 2, duplicates: 3 }).unwrap(),
         encode(&ScoreReply::Refused { incarnation: 1, reason: text() }).unwrap(),
-        encode(&WeightsRequest { evaluator: name() }).unwrap(),
-        encode(&RecordedScores { run: name(), step: 1, weights, evaluator: name(), episodes }).unwrap(),
-        encode(&progress.signed(&lease)).unwrap(),
+        encode(&progress).unwrap(),
     ]
 }
