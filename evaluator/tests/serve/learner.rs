@@ -91,12 +91,12 @@ fn reply<M: Message>(query: &Query, message: &M) {
 }
 
 impl Learner {
-    pub async fn start(snapshot: Snapshot) -> Learner {
+    pub async fn start(published: Snapshot) -> Learner {
         let listen = Endpoints { listen: vec!["tcp/127.0.0.1:0".to_owned()], ..Endpoints::default() };
         let session = open_session(&listen).await.unwrap();
         let endpoint = reachable_at(&session, &listen).await.unwrap().remove(0);
         let (heard, answer) = (Arc::new(Mutex::new(Vec::new())), Arc::new(Mutex::new(Answer::Recorded)));
-        let learner = Learner { session, endpoint, heard, answer, job: Arc::default(), snapshot };
+        let learner = Learner { session, endpoint, heard, answer, job: Arc::default(), snapshot: published };
         let (heard, job, answer, weights) =
             (learner.heard.clone(), learner.job.clone(), learner.answer.clone(), learner.snapshot.clone());
         let callback = move |query: Query| {
