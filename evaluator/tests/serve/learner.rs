@@ -34,6 +34,8 @@ pub enum Answer {
     Recorded,
     DiskFull,
     Nothing,
+    /// The learner reads nothing more, as long as this is the answer.
+    Hang,
 }
 
 /// A learner that has one job.
@@ -112,12 +114,19 @@ impl Learner {
                 let new = report.episodes.len() as u32;
                 heard.push(Heard::Scores(report));
                 *job.lock().unwrap() = None;
-                match *answer.lock().unwrap() {
+                let now = *answer.lock().unwrap();
+                match now {
                     Answer::Recorded => {
                         reply(&query, &ScoreReply::Recorded { incarnation: INCARNATION, new, duplicates: 0 });
                     }
                     Answer::DiskFull => query.reply_err("No space left on device").wait().unwrap(),
                     Answer::Nothing => {}
+                    Answer::Hang => {
+                        drop(heard);
+                        while matches!(*answer.lock().unwrap(), Answer::Hang) {
+                            std::thread::sleep(Duration::from_millis(20));
+                        }
+                    }
                 }
             } else if let JobRequest::HandBack { failed, .. } = decode(&message).unwrap() {
                 heard.push(Heard::HandedBack(failed));

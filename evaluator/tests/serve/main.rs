@@ -87,6 +87,17 @@ async fn an_evaluator_that_leaves_hands_its_job_back_unless_its_scores_may_be_sa
 }
 
 #[tokio::test(flavor = "multi_thread")]
+async fn an_evaluator_leaves_in_time_though_its_learner_hangs() {
+    let learner = Learner::start(snapshot(tensors())).await;
+    learner.answer(Answer::Hang);
+    learner.give(job(&learner.snapshot));
+    let (evaluator, _tokens) = learner.evaluator().await;
+    learner.wait_for_scores(1).await;
+    assert!(evaluator.leave().success());
+    learner.answer(Answer::Nothing);
+}
+
+#[tokio::test(flavor = "multi_thread")]
 async fn a_job_that_is_not_done_is_handed_back() {
     let learner = Learner::start(snapshot(tensors())).await;
     let seeds = (0..256).collect();
