@@ -4,8 +4,8 @@
 mod reader;
 
 use super::*;
-use crate::agent::Agent;
 use crate::config::resolve;
+use crate::train::agent::Agent;
 use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 pub(super) use reader::{Golden, fresh, goldens};
