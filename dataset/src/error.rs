@@ -159,6 +159,10 @@ impl Problem {
     /// What to do about it.
     pub fn hint(&self) -> String {
         let hint = match self {
+            Self::OtherEnvironment { claimed, expected } => return other_environment(claimed, expected),
+            Self::Width { .. } => {
+                "choose a dataset of that environment, or the preset of the environment it was recorded in"
+            }
             Self::Io(_) => "check the path and its permissions",
             Self::UnknownFormat => {
                 "a dataset is a D4RL file (.hdf5), a folder of Minari, an OGBench file (.npz), \
@@ -185,20 +189,6 @@ impl Problem {
                 "docs/data.md says which shape and type each array must have; all arrays need the same number of rows"
             }
             Self::Episodes { .. } => "the dataset is incomplete: fetch it again",
-            Self::OtherEnvironment { claimed, .. } if environment::find(claimed).is_ok() => {
-                return format!("choose a preset for {claimed}, or another dataset");
-            }
-            Self::OtherEnvironment { expected, .. } => {
-                return format!(
-                    "it is another simulation, so a policy that learns from it cannot be scored in {expected}; train under a \
-                     name of your own, without evaluations: --preset own-data --set environment=NAME"
-                );
-            }
-            Self::Width { environment, .. } => {
-                return format!(
-                    "choose a dataset of {environment}, or the preset of the environment it was recorded in"
-                );
-            }
             Self::NotFinite { .. } => "leave out or repair these rows: a single one would spoil every weight",
             Self::ActionOutside { .. } => {
                 "scale the actions so that each number lies within [-1, 1], and scale them back where they are applied"
@@ -221,5 +211,15 @@ impl Problem {
             Self::BadRow { .. } => "each row must have the environment's sizes and finite numbers",
         };
         hint.to_owned()
+    }
+}
+
+fn other_environment(claimed: &str, expected: &str) -> String {
+    match environment::find(claimed) {
+        Ok(_) => format!("choose a preset for {claimed}, or another dataset"),
+        Err(_) => format!(
+            "it is another simulation, so a policy that learns from it cannot be scored in {expected}; train under a name of \
+             your own, without evaluations: --preset own-data --set environment=NAME"
+        ),
     }
 }
