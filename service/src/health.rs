@@ -1,4 +1,4 @@
-//! Whether a process still does its work: its parts say that they are alive, `/healthz` tells who has stopped.
+//! Whether a process still does its work: its parts say that they are alive, `/healthz` names those that have stopped.
 
 use std::sync::atomic::{AtomicU64, Ordering::Relaxed};
 use std::sync::{Arc, Mutex, PoisonError};

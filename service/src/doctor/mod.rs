@@ -1,73 +1,47 @@
-//! Checks a machine before a run is trusted to it: what goes wrong in practice, and what to do about it.
+//! `learner doctor` and `evaluator doctor`: checks of a machine, before a run is started on it.
 //!
-//! # Layout
-//! - [`machine`]: processor cores, threads, open files, the clock.
-//! - [`disk`]: whether a folder can be written to, and how much of it.
-//! - [`certificates`]: whether they are good, for whom, and until when.
-//! - [`network`]: whether somebody is there to connect to.
-//!
-//! What only one of the programs needs is in its own `doctor.rs`.
+//! Here is what both programs need; each adds its own checks in its `doctor.rs`.
 
-pub mod certificates;
-pub mod disk;
-pub mod machine;
-pub mod network;
+mod machine;
+mod network;
 
 use std::fmt;
 
 use serde::Serialize;
 
-/// How a check came out.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize)]
-#[serde(rename_all = "lowercase")]
-pub enum Verdict {
-    /// As it should be.
-    Ok,
-    /// It works, but perhaps not for long, or not well.
-    Warn,
-    /// It does not work.
-    Fail,
-}
+pub use machine::{folder, threads};
+pub use network::{certificates, connected, port};
 
-/// What one check found.
-#[derive(Debug, Serialize)]
-pub struct Finding {
-    /// How it came out.
-    pub verdict: Verdict,
-    /// What was checked, in a word or two.
-    pub check: String,
-    /// What was found.
-    pub what: String,
-    /// What to do about it.
-    #[serde(skip_serializing_if = "Option::is_none")]
-    pub hint: Option<String>,
-}
-
-/// What all checks found, in their order. Displayed as a line each, with hints below.
+/// The results of all checks, in their order. Displayed as a line each, with hints below.
 #[derive(Debug, Default, Serialize)]
-#[serde(transparent)]
-pub struct Findings {
-    list: Vec<Finding>,
+pub struct Findings(Vec<Finding>);
+
+#[derive(Debug, Serialize)]
+struct Finding {
+    /// `ok`, `warn` or `fail`.
+    verdict: &'static str,
+    check: String,
+    what: String,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    hint: Option<String>,
 }
 
 impl Findings {
-    /// Adds that something is as it should be.
+    /// Adds that `check` found what it should.
     pub fn ok(&mut self, check: &str, what: impl Into<String>) {
-        self.add(Verdict::Ok, check, what.into(), None);
+        self.0.push(Finding { verdict: "ok", check: check.to_owned(), what: what.into(), hint: None });
     }
 
-    /// Adds something that works, but perhaps not for long, or not well.
+    /// Adds that `check` found something that works, but may fail later or be slow.
     pub fn warn(&mut self, check: &str, what: impl Into<String>, hint: impl Into<String>) {
-        self.add(Verdict::Warn, check, what.into(), Some(hint.into()));
+        let hint = Some(hint.into());
+        self.0.push(Finding { verdict: "warn", check: check.to_owned(), what: what.into(), hint });
     }
 
-    /// Adds something that does not work.
+    /// Adds that `check` found something that does not work.
     pub fn fail(&mut self, check: &str, what: impl Into<String>, hint: impl Into<String>) {
-        self.add(Verdict::Fail, check, what.into(), Some(hint.into()));
-    }
-
-    fn add(&mut self, verdict: Verdict, check: &str, what: String, hint: Option<String>) {
-        self.list.push(Finding { verdict, check: check.to_owned(), what, hint });
+        let hint = Some(hint.into());
+        self.0.push(Finding { verdict: "fail", check: check.to_owned(), what: what.into(), hint });
     }
 
     /// As an indented JSON array.
@@ -81,46 +55,18 @@ impl Findings {
     /// # Errors
     /// Some check failed.
     pub fn verdict(&self) -> anyhow::Result<()> {
-        let failed = self.list.iter().filter(|finding| finding.verdict == Verdict::Fail).count();
-        anyhow::ensure!(failed == 0, "{failed} of {} checks failed", self.list.len());
+        let failed = self.0.iter().filter(|finding| finding.verdict == "fail").count();
+        anyhow::ensure!(failed == 0, "{failed} of {} checks failed", self.0.len());
         Ok(())
     }
 }
 
 impl fmt::Display for Findings {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        let width = self.list.iter().map(|finding| finding.check.chars().count()).max().unwrap_or(0);
-        for (index, Finding { verdict, check, what, hint }) in self.list.iter().enumerate() {
-            let word = match verdict {
-                Verdict::Ok => "ok",
-                Verdict::Warn => "warn",
-                Verdict::Fail => "FAIL",
-            };
-            let end = if index == 0 { "" } else { "\n" };
-            write!(f, "{end}{word:4}  {check:width$}  {what}")?;
-            if let Some(hint) = hint {
-                write!(f, "\n      hint: {hint}")?;
-            }
-        }
-        Ok(())
-    }
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn a_line_each_and_an_error_where_something_failed() {
-        let mut findings = Findings::default();
-        findings.ok("cores", "2");
-        findings.warn("disk", "1 GiB free", "make room");
-        assert_eq!(findings.to_string(), "ok    cores  2\nwarn  disk   1 GiB free\n      hint: make room");
-        assert!(findings.verdict().is_ok());
-        findings.fail("router", "nobody there", "start it");
-        assert_eq!(findings.verdict().unwrap_err().to_string(), "1 of 3 checks failed");
-        let json: serde_json::Value = serde_json::from_str(&findings.json().unwrap()).unwrap();
-        assert_eq!(json[2]["verdict"], "fail");
-        assert_eq!(json[0].get("hint"), None);
+        let lines = self.0.iter().map(|Finding { verdict, check, what, hint }| {
+            let hint = hint.as_ref().map(|hint| format!("\n      hint: {hint}")).unwrap_or_default();
+            format!("{:4}  {check:11}  {what}{hint}", verdict.replace("fail", "FAIL"))
+        });
+        f.write_str(&lines.collect::<Vec<_>>().join("\n"))
     }
 }
