@@ -17,8 +17,7 @@ use crate::serve::DEFAULT_PORT;
 /// How long learners are waited for.
 const ANSWER: Duration = Duration::from_secs(5);
 
-const UPDATE: &str =
-    "update the older of the two programs, both print theirs with --version; a learner that hangs says so in its log";
+const UPDATE: &str = "update the older program (--version tells); if the learner hangs, its log says why";
 
 const AFTER_HELP: &str = "\
 A line per check: ok, warn or FAIL, and a hint where there is something to do. The exit code is 1 if anything failed.";

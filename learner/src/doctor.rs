@@ -17,7 +17,8 @@ const PORT: u16 = 7447;
 pub fn examine(args: &DoctorArgs) -> anyhow::Result<Findings> {
     let mut findings = Findings::default();
     doctor::threads(&mut findings);
-    precision(&mut findings);
+    let fastest = if Precision::Bf16.is_available() { "bf16, by --precision bf16" } else { "f32" };
+    findings.ok("precision", format!("this CPU is fastest in {fastest}"));
     hdf5(&mut findings);
     doctor::folder(&mut findings, "run folder", &args.run_dir, "another folder is chosen by --run-dir");
     match datasets::cache::folder() {
@@ -33,11 +34,6 @@ pub fn examine(args: &DoctorArgs) -> anyhow::Result<Findings> {
     let endpoints = Endpoints { connect: vec![endpoint.clone()], certificates, ..Endpoints::default() };
     doctor::connected(&mut findings, &endpoints, async |_, _| Ok(()))?;
     Ok(findings)
-}
-
-fn precision(findings: &mut Findings) {
-    let faster = if Precision::Bf16.is_available() { "bf16, by --precision bf16" } else { "f32" };
-    findings.ok("precision", format!("this CPU is fastest in {faster}"));
 }
 
 fn hdf5(findings: &mut Findings) {

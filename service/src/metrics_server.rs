@@ -19,7 +19,7 @@ use tokio::task::{AbortHandle, JoinHandle, JoinSet};
 use tokio::time::timeout;
 use tracing::{debug, warn};
 
-use crate::Health;
+use crate::health::Health;
 
 /// A request is a few lines in one packet. A connection on which it is not there whole by then is closed.
 const REQUEST: Duration = Duration::from_secs(3);

@@ -8,7 +8,7 @@ use std::{env, thread};
 
 use rustix::fs::statvfs;
 
-use super::Findings;
+use super::findings::Findings;
 
 /// Bounds the threads of the networks' arithmetic; rayon's.
 const THREADS: &str = "RAYON_NUM_THREADS";

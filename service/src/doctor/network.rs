@@ -10,9 +10,10 @@ use tokio::runtime::Builder;
 use tokio::time::timeout;
 use zenoh::Session;
 
-use super::Findings;
-use crate::endpoints::address_of;
-use crate::{Certificates, Endpoints, Role, open_session};
+use super::findings::Findings;
+use crate::certificates::{Certificates, Role};
+use crate::endpoints::{Endpoints, address_of};
+use crate::session::open_session;
 
 /// A connection across the world takes half a second.
 const CONNECT: Duration = Duration::from_secs(3);
