@@ -118,7 +118,8 @@ impl Certificates {
         }
         let (expires, hosts) = (validity.not_after, hosts(&certificate));
         verify(&chain, authorities).map_err(|error| match error {
-            TlsError::InvalidCertificate(CertificateError::UnknownIssuer) => {
+            // The second is of an authority that has the same name.
+            TlsError::InvalidCertificate(CertificateError::UnknownIssuer | CertificateError::BadSignature) => {
                 CertificatesError::new(&own, format!("is of another authority than {}", ca.display()), HINT)
             }
             other => CertificatesError::new(&own, format!("does not pass with {}: {other}", ca.display()), HINT),

@@ -62,12 +62,12 @@ async fn health_and_nothing_else() {
 async fn ill_health_is_told_line_by_line() {
     let health = Health::default();
     let (server, _) = server_with(health.clone()).await;
-    let hub = health.part("hub", Duration::from_secs(3600));
-    hub.set_trouble(Some("the disk is full".to_owned()));
+    let scores = health.part("scores", Duration::from_secs(3600));
+    scores.set_trouble(Some("the disk is full".to_owned()));
     drop(health.part("training", Duration::from_secs(3600)));
     let (head, body) = get(server.address, "/healthz").await;
     assert!(head.starts_with("http/1.1 503"), "{head}");
-    assert_eq!(body, "hub: the disk is full\ntraining: it ended before its work was done\n");
+    assert_eq!(body, "scores: the disk is full\ntraining: it ended before its work was done\n");
     let (head, _) = get(server.address, "/metrics").await;
     assert!(head.starts_with("http/1.1 200"), "a sick process is still measured: {head}");
 }
