@@ -225,7 +225,7 @@ impl Conductor {
             Notice::JobsExpired(jobs) => format!("{jobs} jobs made no progress; they go to others"),
             Notice::Evaluated { step, scores } => {
                 let values: Vec<_> = scores.iter().map(|score| score.score).collect();
-                let Some(Spread { mean, std }) = Spread::of(&values) else { return };
+                let Some(Spread { mean, std, .. }) = Spread::of(&values) else { return };
                 self.display.scored(step, mean);
                 let std = std.map(|std| format!(" ± {std:.2}")).unwrap_or_default();
                 format!("step {step}: score {mean:.2}{std} over {} episodes", values.len())

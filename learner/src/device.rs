@@ -3,28 +3,10 @@
 use anyhow::{Context, anyhow};
 use quad_policy::Precision;
 use quad_service::Hint;
-use serde::{Deserialize, Serialize};
 
-/// Where training runs, as it is called on the command line and in files.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize, clap::ValueEnum)]
-#[serde(rename_all = "lowercase")]
-pub enum Device {
-    /// On the processor.
-    #[default]
-    Cpu,
-    /// On the first Nvidia GPU.
-    Cuda,
-}
+pub use crate::config::Device;
 
 impl Device {
-    /// What it is called on command lines and in files.
-    pub fn name(self) -> &'static str {
-        match self {
-            Self::Cpu => "cpu",
-            Self::Cuda => "cuda",
-        }
-    }
-
     /// That the device is there and can compute with this precision.
     ///
     /// # Errors

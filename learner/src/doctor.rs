@@ -11,7 +11,7 @@ use quad_service::{Endpoints, Role};
 use zenoh::Session;
 
 use crate::cli::DoctorArgs;
-use crate::datasets;
+use crate::data;
 
 /// Where evaluators look by default.
 const PORT: u16 = 7447;
@@ -30,7 +30,7 @@ pub fn examine(args: &DoctorArgs) -> anyhow::Result<Findings> {
     precision(&mut findings);
     hdf5(&mut findings);
     disk::folder(&mut findings, "run folder", &args.run_dir, "another folder is chosen by --run-dir");
-    match datasets::cache::folder() {
+    match data::cache::folder() {
         Ok(folder) => disk::folder(&mut findings, "datasets", &folder, "another folder is chosen by D4RL_DATASET_DIR"),
         Err(error) => findings.warn("datasets", format!("{error:#}"), "name a folder in D4RL_DATASET_DIR"),
     }

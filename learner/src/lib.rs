@@ -3,10 +3,10 @@
 //! # Layout
 //! In reading order:
 //!
-//! - [`cli`] is the command line; [`config`] the experiment that it describes, one of the [`presets`] with flags on top,
-//!   validated once; [`schedule`] says which of its steps are evaluated.
-//! - [`datasets`] finds or fetches the data that a run learns from.
-//! - [`run`] goes from the command line to the exit, [`resume`] takes up a run that was there, by its [`settings`];
+//! - [`cli`] is the command line; [`config`] the experiment that it describes, a preset with flags on top,
+//!   validated once.
+//! - `data` finds or fetches the data that a run learns from.
+//! - [`command`] goes from the command line to the exit, [`resume`] takes up a run that was there, by its settings;
 //!   [`conduct`] is the main loop in between.
 //! - [`threads`] starts the threads that do the work: [`trainer`] and [`train`] (nothing but gradient steps, by an [`agent`] on a
 //!   [`device`]), [`keeper`] (snapshots and checkpoints to the disk), [`publisher`] (publishes snapshots), [`hub`]
@@ -18,16 +18,17 @@
 //!   that nobody else waits for a peer that does not read; [`notice`] is what threads tell the main loop.
 //! - [`run_dir`] is the folder of a run, [`trouble`] what is told of a disk that takes nothing, [`metrics`] are for Prometheus, [`display`] shows progress on the terminal.
 //! - [`doctor`] checks a machine before a run is trusted to it.
-//! - [`report`] and [`plot`] summarise the scores as tables and as a picture; [`verify`] checks them against the folder.
+//! - `report` summarises the scores as tables and as a picture.
 
 #![deny(unsafe_code)]
 
 pub mod agent;
 pub mod algorithms;
 pub mod cli;
+pub mod command;
 pub mod conduct;
 pub mod config;
-pub mod datasets;
+mod data;
 pub mod device;
 pub mod display;
 pub mod doctor;
@@ -38,23 +39,18 @@ pub mod keeper;
 pub mod metrics;
 pub mod notice;
 pub mod optimiser;
-pub mod plot;
 mod pool;
-pub mod presets;
 pub mod publisher;
 pub mod random;
 pub mod replies;
-pub mod report;
+mod report;
 pub mod resume;
-pub mod run;
+mod run;
 pub mod run_dir;
-pub mod schedule;
 pub mod scoreboard;
 pub mod scribe;
-pub mod settings;
 pub mod threads;
 pub mod train;
 pub mod trainer;
 pub mod trouble;
-pub mod verify;
 pub mod wire;

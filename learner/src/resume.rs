@@ -8,9 +8,9 @@ use quad_protocol::{EpisodeScore, Hash, Name};
 use quad_service::hinted;
 use tracing::{info, warn};
 
+use crate::config::settings;
 use crate::config::{Experiment, RunConfig};
 use crate::run_dir::{Checkpoint, Log, RunDir, RunDirError, ScoreLine};
-use crate::settings;
 
 /// The folder of a run that has begun, locked.
 pub struct Begun {

@@ -15,9 +15,9 @@ use tracing::debug;
 
 use crate::agent::{Agent, PolicyFile};
 use crate::algorithms::{AlgorithmError, Metric};
+use crate::config::Schedule;
 use crate::metrics::TrainingMetrics;
 use crate::run_dir::Checkpoint;
-use crate::schedule::Schedule;
 
 /// Gradient steps that a line of `metrics.jsonl` averages over.
 pub const STEPS_PER_ROW: u64 = 100;

@@ -14,16 +14,13 @@ use quad_service::{
 use tokio::sync::mpsc;
 use tracing::{debug, info, warn};
 
-use super::{print, resolve};
-use crate::cli::TrainArgs;
+use crate::cli::{TrainArgs, print};
 use crate::conduct::{Conductor, Ending, open_network};
-use crate::config::{DatasetInfo, Experiment, RunConfig, RunInfo};
-use crate::datasets::{LocalDataset, Source};
+use crate::config::{DatasetInfo, Experiment, RunConfig, RunInfo, presets, resolve};
+use crate::data::{LocalDataset, Source};
 use crate::display::Display;
 use crate::metrics::Metrics;
-use crate::plot;
-use crate::presets;
-use crate::report::RunReport;
+use crate::report::{RunReport, learning_curves};
 use crate::resume::{self, Begun, Past};
 use crate::run_dir::{Log, RunDir};
 use crate::threads::{Run, STUCK, Threads};
@@ -119,7 +116,7 @@ async fn conduct(
     // A later start has a larger number; the low bits tell two apart that start in the same millisecond.
     let incarnation = now()? << 16 | u64::from(rand::random::<u16>());
     let checkpoint_every = Duration::from_secs(args.checkpoint_seconds);
-    let (name, audit) = (run.clone(), args.audit);
+    let (name, audit) = (run.clone(), 0.0);
     let state = Run { name, incarnation, config, dir: &run_dir, scores, past, checkpoint_every, audit };
     let threads = Threads::start(state, transitions, &metrics, &health, &notify)?;
     let display = Display::start(metrics.clone(), steps);
@@ -227,7 +224,7 @@ fn summarise(run_dir: &RunDir) -> anyhow::Result<RunReport> {
     if !report.evaluations.is_empty() {
         run_dir.write_json("report.json", &report)?;
         let picture = run_dir.learning_curve();
-        plot::learning_curves(&picture, std::slice::from_ref(&report))?;
+        learning_curves(&picture, std::slice::from_ref(&report))?;
         text = format!("\n{}\nlearning curve: {}\n", report.table(), picture.display());
     }
     print(&format!("{text}run folder: {}", run_dir.path().display()))?;
@@ -258,7 +255,7 @@ fn run_config(
     Ok(RunConfig {
         run: RunInfo {
             name: name.to_string(),
-            incarnation: now()?,
+            started: now()?,
             preset: presets::label(&args.preset),
             version: env!("CARGO_PKG_VERSION").to_owned(),
             device: args.device,

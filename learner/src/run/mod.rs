@@ -1,0 +1,3 @@
+//! TEMPORARY: the lead's room.
+pub(crate) mod train;
+pub(crate) mod verify;
