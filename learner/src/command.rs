@@ -1,60 +1,57 @@
-//! The learner's commands, from the command line to the exit.
+//! The learner's commands, from the command line to the exit. All of it runs on the main thread.
 
-mod doctor;
-mod train;
-
-use std::io::{ErrorKind, Write};
+use std::fmt::Alignment::{Left, Right};
 
 use quad_dataset::{DatasetError, environment};
 use quad_service::{Hint, hinted};
-use toml::Table;
 use tracing::{info, warn};
 
-use crate::cli::{Cli, Command, DatasetsCommand, DoctorArgs, InspectArgs, PresetsArgs, ReportArgs, VerifyArgs};
-use crate::config::{self, Experiment};
-use crate::datasets::{self, Source};
-use crate::plot;
-use crate::presets;
-use crate::report::Report;
+use crate::cli::{Cli, Command, DatasetsCommand, DoctorArgs, InspectArgs, PresetsArgs, ReportArgs, VerifyArgs, print};
+use crate::config::{self, ConfigError, presets};
+use crate::data::{Source, cache};
+use crate::doctor;
+use crate::report::{Report, Style, Table, learning_curves};
 use crate::run::{RunDir, RunDirError};
-use crate::verify;
+use crate::run::{train, verify};
 
 /// Does what the command line says.
+///
+/// # Errors
+/// It cannot, or what it had to check is not as it must be.
 pub fn run(cli: &Cli) -> anyhow::Result<()> {
-    carry_out(&cli.command).map_err(|error| match error.downcast_ref().map(RunDirError::hint) {
+    let done = match &cli.command {
+        Command::Train(args) => train::train(args),
+        Command::Presets(args) => list_presets(args),
+        Command::Datasets(command) => datasets(command),
+        Command::Report(args) => report(args),
+        Command::Verify(args) => check_run(args),
+        Command::Doctor(args) => examine(args),
+    };
+    done.map_err(|error| match hint(&error) {
         Some(hint) => hinted(error, hint),
         None => error,
     })
 }
 
-fn carry_out(command: &Command) -> anyhow::Result<()> {
-    match command {
-        Command::Train(args) => train::train(args),
-        Command::Presets(args) => list_presets(args),
-        Command::Datasets(command) => datasets(command),
-        Command::Report(args) => report(args),
-        Command::Verify(args) => verify(args),
-        Command::Doctor(args) => examine(args),
-    }
+fn hint(error: &anyhow::Error) -> Option<String> {
+    let of_config = error.downcast_ref().and_then(ConfigError::hint);
+    of_config.or_else(|| error.downcast_ref().map(|error: &RunDirError| error.hint().to_owned()))
 }
 
 fn list_presets(args: &PresetsArgs) -> anyhow::Result<()> {
-    let text = match &args.preset {
-        Some(preset) => toml::to_string(&resolve(preset, &Table::new())?)?,
-        None => presets::list()?,
-    };
-    Ok(print(text.trim_end())?)
-}
-
-fn resolve(preset: &str, changes: &Table) -> anyhow::Result<Experiment> {
-    config::resolve(preset, changes).or_else(|error| match error.hint() {
-        Some(hint) => Err(error).hint(hint),
-        None => Err(error.into()),
-    })
+    if let Some(preset) = &args.preset {
+        return print(&toml::to_string(&config::resolve(preset, &toml::Table::new())?)?);
+    }
+    let tasks = presets::tasks()?;
+    let bases = presets::names().filter(|name| tasks.iter().all(|[task, ..]| task != name));
+    let bases = Vec::from_iter(bases).join(", ");
+    let mut table = Table::new(&["preset", "environment", "dataset", "what is special"].map(|name| (name, Left)));
+    tasks.into_iter().for_each(|task| table.push(task));
+    print(&format!("{}\nBases of these, which name no environment: {bases}", table.render(Style::Text)))
 }
 
 fn report(args: &ReportArgs) -> anyhow::Result<()> {
-    // What else lies beside runs, where somebody writes `runs/*`, does not keep them from being read.
+    // What else lies beside runs, where a user writes `runs/*`, does not keep them from being read.
     let (runs, others): (Vec<_>, Vec<_>) = args.dirs.iter().cloned().partition(|dir| RunDir::is_occupied(dir));
     let dirs = if runs.is_empty() { &args.dirs } else { &runs };
     let report = Report::read(dirs)?;
@@ -62,19 +59,17 @@ fn report(args: &ReportArgs) -> anyhow::Result<()> {
         warn!("there is no run in {}", other.display());
     }
     if let Some(path) = &args.plot {
-        plot::learning_curves(path, &report.runs)?;
+        learning_curves(path, &report.runs)?;
         info!("learning curves: {}", path.display());
     }
-    let text = match (args.json, args.markdown) {
+    print(&match (args.json, args.markdown) {
         (true, _) => serde_json::to_string_pretty(&report)?,
         (_, true) => report.markdown(),
         _ => report.text(),
-    };
-    print(text.trim_end())?;
-    Ok(())
+    })
 }
 
-fn verify(args: &VerifyArgs) -> anyhow::Result<()> {
+fn check_run(args: &VerifyArgs) -> anyhow::Result<()> {
     let mut findings = vec![(String::new(), verify::verify(&args.dir)?)];
     if let Some(other) = &args.same_as {
         findings.push((format!("with {}: ", other.display()), verify::compare(&args.dir, other)?));
@@ -94,14 +89,16 @@ fn examine(args: &DoctorArgs) -> anyhow::Result<()> {
 
 fn datasets(command: &DatasetsCommand) -> anyhow::Result<()> {
     match command {
-        DatasetsCommand::List => print(&datasets::cache::table(&datasets::cache::folder()?))?,
-        DatasetsCommand::Fetch { name } => {
-            let dataset = Source::Named(datasets::source::named(name)?).obtain()?;
-            print(&dataset.path.display().to_string())?;
+        DatasetsCommand::List => {
+            let folder = cache::folder()?;
+            let header = [("dataset", Left), ("environment", Left), ("size", Right), ("in the cache", Left)];
+            let mut table = Table::new(&header);
+            cache::list(&folder).for_each(|dataset| table.push(dataset));
+            print(&format!("{}\ncache folder: {}", table.render(Style::Text), folder.display()))
         }
-        DatasetsCommand::Inspect(args) => inspect(args)?,
+        DatasetsCommand::Fetch { name } => print(&Source::named(name)?.obtain()?.path.display().to_string()),
+        DatasetsCommand::Inspect(args) => inspect(args),
     }
-    Ok(())
 }
 
 /// Problems are part of the result: only what cannot be read at all is an error.
@@ -113,17 +110,5 @@ fn inspect(args: &InspectArgs) -> anyhow::Result<()> {
         source => source.obtain()?.path,
     };
     let inspection = quad_dataset::inspect(&path, environment).hint_of(DatasetError::hint)?;
-    match args.json {
-        true => print(&serde_json::to_string_pretty(&inspection)?)?,
-        false => print(&inspection.to_string())?,
-    }
-    Ok(())
-}
-
-/// Results go to stdout, logs do not. Whoever reads may stop at any time, like `head` does.
-fn print(text: &str) -> std::io::Result<()> {
-    match writeln!(std::io::stdout(), "{text}") {
-        Err(error) if error.kind() == ErrorKind::BrokenPipe => Ok(()),
-        result => result,
-    }
+    print(&if args.json { serde_json::to_string_pretty(&inspection)? } else { inspection.to_string() })
 }
