@@ -29,8 +29,6 @@ pub struct Network {
 pub struct Host {
     /// Of the namespace, and of the outer end of the cable whose inner end is the host's eth0.
     name: String,
-    /// Its address on the bridge.
-    pub address: String,
     endpoint: String,
 }
 
@@ -63,19 +61,7 @@ impl Network {
         run(&format!("ip -n {name} addr add {address}/28 dev eth0"))?;
         run(&format!("ip -n {name} link set lo up"))?;
         run(&format!("ip -n {name} link set eth0 up"))?;
-        Ok(Host { name, address, endpoint: format!("tcp/{}:{port}", self.address) })
-    }
-
-    /// Another address of a host. Whoever speaks to it from this machine does so from another address, too.
-    ///
-    /// # Errors
-    /// Why there can be none here.
-    pub fn other_address(&self, host: &Host) -> Result<String, String> {
-        let ([here, there], bridge) = ([14, 13].map(address), &self.name);
-        run(&format!("ip addr add {here}/32 dev {bridge}"))?;
-        host.run(&format!("ip addr add {there}/32 dev eth0"))?;
-        run(&format!("ip route add {there}/32 dev {bridge} src {here}"))?;
-        Ok(there)
+        Ok(Host { name, endpoint: format!("tcp/{}:{port}", self.address) })
     }
 }
 
@@ -140,14 +126,6 @@ impl Line for Host {
 }
 
 impl Host {
-    /// Runs a command on it.
-    ///
-    /// # Errors
-    /// What the command says.
-    pub fn run(&self, command: &str) -> Result<(), String> {
-        run(&format!("ip netns exec {} {command}", self.name))
-    }
-
     /// Commands that let the bridge drop those packets of this host that fulfil a condition, and those that undo it.
     fn drop_packets(&self, directions: &[(&str, &str)], condition: &str) -> (Vec<String>, Vec<String>) {
         let name = &self.name;

@@ -1,4 +1,4 @@
-//! Compose with docker-compose.tls.yml on top: a run is complete, and who has no certificate has no part in it.
+//! Compose with docker-compose.tls.yml on top: a run is complete, and an evaluator without a certificate has no part in it.
 
 use std::os::unix::fs::chown;
 use std::path::Path;
@@ -27,8 +27,8 @@ fn certificates(folder: &Path) -> bool {
 }
 
 #[test]
-#[ignore = "builds the images: cargo test --release --workspace --test docker -- --ignored"]
-fn compose_with_certificates_works_and_lets_in_nobody_else() {
+#[ignore = "five minutes, after the images"]
+fn compose_with_certificates_works_and_lets_in_no_others() {
     let (ours, theirs) = (tempdir().unwrap(), tempdir().unwrap());
     if !(certificates(ours.path()) && certificates(theirs.path())) {
         return;

@@ -1,0 +1,149 @@
+//! `evaluator score` measures what a run measured, and says clearly what it cannot score.
+
+use std::fs;
+use std::path::Path;
+use std::process::{Command, Output};
+
+use quad_tests::PATIENCE;
+use quad_tests::learner::{Learner, Score};
+use quad_tests::process::binary;
+use quad_tests::setting::Setting;
+use quad_tests::system::Scratch;
+use serde_json::Value;
+
+const SETTING: Setting = Setting { steps: 40, eval_interval: 20, episodes: 7, candidates: 3, hidden: 16, seed: 5 };
+
+/// A finished run, evaluated in the arithmetic of that name.
+fn run(scratch: &Scratch, name: &str, precision: &str) -> Learner {
+    let mut learner = scratch.learner(name, SETTING);
+    let connect = ["--connect", &learner.endpoint(), "--metrics", "127.0.0.1:0", "--precision", precision];
+    let _evaluator = scratch.evaluator_with(&format!("evaluator-of-{name}"), &connect);
+    learner.process.assert_succeeds(PATIENCE);
+    learner
+}
+
+fn score(threads: &str, snapshots: &[&Path], flags: &[&str]) -> Output {
+    let mut command = Command::new(binary("evaluator"));
+    command.env("RAYON_NUM_THREADS", threads).arg("score").args(snapshots).args(flags).output().unwrap()
+}
+
+fn json(output: &Output) -> Vec<Value> {
+    assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
+    serde_json::from_slice(&output.stdout).unwrap()
+}
+
+/// Seed, length, and the bits of return and score of each episode.
+fn episodes(scored: &Value) -> Vec<(u64, u64, u64, u64)> {
+    let bits = |number: &Value| number.as_f64().unwrap().to_bits();
+    let whole = |number: &Value| number.as_u64().unwrap();
+    let episodes = scored["episodes"].as_array().unwrap().iter();
+    episodes.map(|of| (whole(&of["seed"]), whole(&of["length"]), bits(&of["return"]), bits(&of["score"]))).collect()
+}
+
+#[test]
+fn a_snapshot_gets_the_scores_that_its_run_has() {
+    let scratch = Scratch::new();
+    for precision in ["f32", "bf16"] {
+        let learner = run(&scratch, precision, precision);
+        let steps = SETTING.evaluated_steps();
+        let snapshots: Vec<_> = steps.iter().map(|&step| learner.snapshot(step)).collect();
+        let snapshots: Vec<&Path> = snapshots.iter().map(AsRef::as_ref).collect();
+        let scored = json(&score("2", &snapshots, &["--precision", precision, "--json"]));
+        assert_eq!(scored.len(), steps.len());
+        for ((scored, &step), snapshot) in scored.iter().zip(&steps).zip(snapshots) {
+            let of_run: Vec<_> = learner.scores().into_iter().filter(|score| score.key().0 == step).collect();
+            let is = [
+                ("snapshot", Value::from(snapshot.to_str().unwrap())),
+                ("weights", of_run[0].text("weights").into()),
+                ("environment", "hopper".into()),
+                ("step", step.into()),
+                ("seed", SETTING.seed.into()),
+                ("candidates", SETTING.candidates.into()),
+                ("precision", of_run[0].text("precision").into()),
+            ];
+            is.iter().for_each(|(field, value)| assert_eq!(scored[field], *value, "{field}"));
+            let bits = |score: &Score, field| score.number(field).to_bits();
+            let mut of_run: Vec<_> = of_run
+                .iter()
+                .map(|score| (score.key().1, score.integer("length"), bits(score, "return"), bits(score, "score")))
+                .collect();
+            let mut again = episodes(scored);
+            of_run.sort_unstable();
+            again.sort_unstable();
+            assert_eq!(again, of_run, "step {step} in {precision}");
+        }
+    }
+}
+
+#[test]
+fn neither_threads_nor_batches_change_a_score() {
+    let scratch = Scratch::new();
+    let learner = run(&scratch, "batches", "f32");
+    let (first, last) = (learner.snapshot(20), learner.snapshot(40));
+    let flags = ["--precision", "f32", "--json", "--candidates", "1,4"];
+    let few = json(&score("1", &[&first], &[&flags[..], &["--episodes", "3"]].concat()));
+    let many = json(&score("3", &[&first, &last], &[&flags[..], &["--episodes", "40"]].concat()));
+    let setting = |scored: &Value| (scored["step"].as_u64().unwrap(), scored["candidates"].as_u64().unwrap());
+    assert_eq!(many.iter().map(setting).collect::<Vec<_>>(), [(20, 1), (20, 4), (40, 1), (40, 4)]);
+    for (few, many) in few.iter().zip(&many) {
+        assert_eq!(setting(few), setting(many));
+        assert_eq!((episodes(few).len(), episodes(many).len()), (3, 40));
+        assert_eq!(episodes(few)[..], episodes(many)[..3]);
+    }
+    let seeds = |scored: &Value| episodes(scored).iter().map(|episode| episode.0).collect::<Vec<_>>();
+    assert_eq!(seeds(&many[0]), seeds(&many[1]), "all numbers of candidates have the same episodes");
+    assert_ne!(episodes(&many[0]), episodes(&many[1]), "and come to something else");
+    let other = json(&score("2", &[&first], &[&flags[..], &["--seed", "6"]].concat()));
+    assert_ne!(seeds(&other[0]), seeds(&many[0])[..SETTING.episodes as usize], "another seed, other episodes");
+
+    let table = score("2", &[&first, &last], &["--candidates", "1,4"]);
+    let table = String::from_utf8(table.stdout).unwrap();
+    for words in ["1 candidate ", "4 candidates", "mean of 2 snapshots", last.to_str().unwrap()] {
+        assert!(table.contains(words), "{words}: {table}");
+    }
+}
+
+#[test]
+fn what_cannot_be_scored_is_said_in_a_sentence() {
+    let scratch = Scratch::new();
+    let mut learner = scratch.learner_with("unscored", SETTING, &["--eval-interval", "0"]);
+    learner.process.assert_succeeds(PATIENCE);
+    let snapshot = fs::read(learner.snapshot(SETTING.steps)).unwrap();
+    let write = |name: &str, bytes: &[u8]| {
+        let path = scratch.path().join(name);
+        fs::write(&path, bytes).unwrap();
+        path
+    };
+    // Of the same length, so the rest of the file stays what it is.
+    let with = |from: &str, to: &str| {
+        let at = snapshot.windows(from.len()).position(|window| window == from.as_bytes()).unwrap();
+        [&snapshot[..at], to.as_bytes(), &snapshot[at + to.len()..]].concat()
+    };
+    let whole = write("whole.safetensors", &snapshot);
+    let earlier = write("earlier.safetensors", &with("\"origin\"", "\"origen\""));
+    let moon = write("moon.safetensors", &with("hopper", "onmoon"));
+    let forged = write("forged.safetensors", &with("episodes", "episoden"));
+    let cut = write("cut.safetensors", &snapshot[..snapshot.len() / 2]);
+    let noise = write("noise.safetensors", b"not a policy");
+    let missing = scratch.path().join("missing.safetensors");
+    for (path, flags, words) in [
+        (&noise, &[][..], "is not a saved policy"),
+        (&cut, &[], "is not a saved policy"),
+        (&missing, &[], "cannot read"),
+        (&moon, &[], "unknown environment `onmoon`"),
+        (&forged, &[], "is not a snapshot of a run"),
+        (&earlier, &[], "does not say which environment"),
+        (&earlier, &["--env", "hopper"], "does not say which environment"),
+        (&whole, &["--env", "walker2d"], "walker2d"),
+    ] {
+        let output = score("1", &[path], flags);
+        let text = String::from_utf8_lossy(&output.stderr);
+        assert_eq!(output.status.code(), Some(1), "{path:?}: {text}");
+        let told = text.contains(words) && text.contains(path.to_str().unwrap()) && text.contains("hint:");
+        assert!(told && output.stdout.is_empty(), "{path:?}: {text}");
+    }
+    for (path, flags) in [(&moon, &["--env", "hopper"][..]), (&earlier, &["--env", "hopper", "--seed", "5"])] {
+        let scored = json(&score("1", &[path], &[flags, &["--episodes", "2", "--json"]].concat()));
+        assert_eq!(episodes(&scored[0]).len(), 2, "{path:?}");
+    }
+}

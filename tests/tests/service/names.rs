@@ -1,0 +1,64 @@
+//! Two programs of one name: the second is told.
+
+use std::time::Duration;
+
+use quad_tests::router::router;
+use quad_tests::setting::ENDLESS;
+use quad_tests::system::{Scratch, free_endpoint};
+use quad_tests::{PATIENCE, eventually};
+
+#[tokio::test(flavor = "multi_thread")]
+async fn of_two_learners_under_one_name_the_second_says_so_and_stops() {
+    let [one, other] = [Scratch::new(), Scratch::new()];
+    let endpoint = free_endpoint();
+    let _session = router(&endpoint).await;
+    let mut first = one.learner_with("run", ENDLESS, &["--connect", &endpoint]);
+    first.process.wait_for_log("its metrics at", PATIENCE);
+    let mut second = other.learner_with("run", ENDLESS, &["--connect", &endpoint]);
+    let status = second.process.wait(PATIENCE);
+    let log = second.process.log();
+    assert!(!status.success() && log.contains("there is another learner of run run"), "{status}: {log}");
+    assert!(log.contains("hint: choose another name for the folder with --run-dir"), "{log}");
+    let _evaluator = one.evaluator("shared", &endpoint);
+    first.wait_for_scores(0);
+    assert!(first.process.is_running());
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn of_two_learners_under_one_name_that_start_at_once_one_stops() {
+    let scratches = [Scratch::new(), Scratch::new()];
+    let endpoint = free_endpoint();
+    let mut learners =
+        scratches.each_ref().map(|scratch| scratch.learner_with("run", ENDLESS, &["--connect", &endpoint]));
+    // Both wait for the router, and so come together.
+    std::thread::sleep(Duration::from_secs(2));
+    let _session = router(&endpoint).await;
+    eventually("one of them stops", PATIENCE, || {
+        learners.iter_mut().any(|learner| !learner.process.is_running()).then_some(())
+    });
+    let _evaluator = scratches[0].evaluator("shared", &endpoint);
+    eventually("the other is evaluated", PATIENCE, || {
+        learners.iter().any(|learner| !learner.scores().is_empty()).then_some(())
+    });
+    let running = learners.iter_mut().filter_map(|learner| learner.process.is_running().then_some(())).count();
+    assert_eq!(running, 1);
+    let said = learners.iter().filter(|learner| learner.process.log().contains("there is another learner")).count();
+    assert_eq!(said, 1);
+}
+
+#[test]
+fn of_two_evaluators_under_one_name_the_learner_warns_once() {
+    let scratch = Scratch::new();
+    // Jobs of seconds, so that one of them has a job whenever the other one asks.
+    let learner = scratch.learner("run", quad_tests::setting::Setting { candidates: 500, hidden: 256, ..ENDLESS });
+    let _both = ["one", "two"].map(|folder| {
+        let other = Scratch::new();
+        (other.evaluator("twin", &learner.endpoint()), other, folder)
+    });
+    let line = learner.process.wait_for_log("twin", PATIENCE);
+    assert!(line.contains("WARN") && line.contains("--name"), "{line}");
+    std::thread::sleep(Duration::from_secs(2));
+    let warnings = learner.process.log().lines().filter(|line| line.contains("WARN") && line.contains("twin")).count();
+    assert_eq!(warnings, 1, "{}", learner.process.log());
+    learner.wait_for_scores(0);
+}
