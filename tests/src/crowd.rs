@@ -1,9 +1,8 @@
 //! Evaluators that do everything on the wire and nothing else: they claim, report progress and deliver scores that they made
 //! up. Hundreds of them fit into one test.
 
-use std::collections::BTreeMap;
 use std::mem;
-use std::sync::atomic::{AtomicU8, AtomicUsize, Ordering::Relaxed};
+use std::sync::atomic::{AtomicUsize, Ordering::Relaxed};
 use std::sync::{Arc, Mutex};
 use std::time::{Duration, Instant};
 
@@ -14,7 +13,7 @@ use quad_protocol::{
 use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 use tokio::task::JoinSet;
-use tokio::time::{sleep, sleep_until, timeout};
+use tokio::time::{sleep, timeout};
 use zenoh::query::{ConsolidationMode, QueryTarget};
 use zenoh::{Config, Session};
 
@@ -22,8 +21,9 @@ use crate::made_up::{self, name};
 
 /// An evaluator's patience with its learner.
 const ANSWER: Duration = Duration::from_secs(5);
-/// And its pause before the next question of the kind.
-const APART: Duration = Duration::from_millis(50);
+
+/// And its pause after a question without an answer.
+const PAUSE: Duration = Duration::from_millis(250);
 
 /// Most episodes of a job.
 const MOST_EPISODES: u32 = 40;
@@ -35,7 +35,6 @@ pub fn longest_job(episode: Duration) -> Duration {
 
 /// What a crowd does.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-#[repr(u8)]
 pub enum Pace {
     /// Nothing but staying connected.
     Still,
@@ -43,8 +42,6 @@ pub enum Pace {
     Real,
     /// The same in a twentieth of the time, so that there is a claim at every moment.
     Quick,
-    /// A job takes no time.
-    Instant,
 }
 
 /// What a crowd has measured since it was last asked.
@@ -83,7 +80,7 @@ struct Shared {
     run: Name,
     /// The longest episode at a real pace; the shortest takes half as long.
     episode: Duration,
-    pace: AtomicU8,
+    pace: Mutex<Pace>,
     /// Evaluators that have a job.
     busy: AtomicUsize,
     measured: Mutex<Measured>,
@@ -96,7 +93,7 @@ impl Crowd {
         let shared = Arc::new(Shared {
             run: run.clone(),
             episode,
-            pace: AtomicU8::new(0),
+            pace: Mutex::new(Pace::Still),
             busy: AtomicUsize::new(0),
             measured: Mutex::default(),
         });
@@ -110,7 +107,7 @@ impl Crowd {
 
     /// From now on, all of them do this. A job that was begun is still done.
     pub fn set(&self, pace: Pace) {
-        self.shared.pace.store(pace as u8, Relaxed);
+        *self.shared.pace.lock().unwrap() = pace;
     }
 
     /// How many have a job.
@@ -120,17 +117,17 @@ impl Crowd {
 
     /// What was measured since this was last called.
     pub fn measured(&self) -> Measured {
-        mem::take(&mut *self.shared.measured.lock().expect("no thread panics with it"))
+        mem::take(&mut *self.shared.measured.lock().unwrap())
     }
 }
 
 impl Shared {
     fn pace(&self) -> Pace {
-        [Pace::Still, Pace::Real, Pace::Quick, Pace::Instant][self.pace.load(Relaxed) as usize]
+        *self.pace.lock().unwrap()
     }
 
     fn note(&self, note: impl FnOnce(&mut Measured)) {
-        note(&mut self.measured.lock().expect("no thread panics with it"));
+        note(&mut self.measured.lock().unwrap());
     }
 }
 
@@ -139,8 +136,6 @@ struct Member {
     session: Session,
     shared: Arc<Shared>,
     random: ChaCha8Rng,
-    /// When it last got an answer, by the key that it asked.
-    answered: BTreeMap<String, Instant>,
     /// When it last told its progress.
     told: Option<Instant>,
     /// Has had no job yet since it was still.
@@ -159,7 +154,7 @@ impl Member {
         let session = zenoh::open(config).await.expect("the endpoint is open");
         let name = name(&format!("light-{number}"));
         let random = ChaCha8Rng::seed_from_u64(number as u64);
-        Member { name, session, shared, random, answered: BTreeMap::new(), told: None, begins: true }
+        Member { name, session, shared, random, told: None, begins: true }
     }
 
     async fn work(mut self) {
@@ -187,7 +182,7 @@ impl Member {
                     let wait = Duration::from_millis(milliseconds).mul_f64(self.random.random_range(0.5..1.0));
                     timeout(wait, woken.notified()).await.ok();
                 }
-                _ => {}
+                _ => sleep(PAUSE).await,
             }
         }
     }
@@ -209,7 +204,7 @@ impl Member {
         let report = ScoreReport::of(&job, self.name.clone(), name("f32"), episodes.collect());
         // What was not answered is delivered again.
         while self.deliver(&report).await.is_none() {
-            sleep(Duration::from_millis(250)).await;
+            sleep(PAUSE).await;
         }
     }
 
@@ -218,7 +213,7 @@ impl Member {
         let episode = match self.shared.pace() {
             Pace::Real => self.shared.episode,
             Pace::Quick => self.shared.episode / 20,
-            Pace::Still | Pace::Instant => return,
+            Pace::Still => return,
         };
         let longest = episode * job.seeds.len() as u32;
         let mut left = self.random.random_range(longest / 2..longest);
@@ -262,14 +257,10 @@ impl Member {
 
     /// The answer and how long it took.
     async fn ask<A: Message>(&mut self, key: String, question: &impl Message) -> Option<(A, Duration)> {
-        if let Some(&answered) = self.answered.get(&key) {
-            sleep_until((answered + APART).into()).await;
-        }
         let begin = Instant::now();
         let get = self.session.get(&key).payload(encode(question).expect("it is small")).timeout(ANSWER);
         let get = get.target(QueryTarget::All).consolidation(ConsolidationMode::None).await;
         let reply = get.expect("the session is open").recv_async().await.ok();
-        self.answered.insert(key, Instant::now());
         let Some(Ok(sample)) = reply.map(|reply| reply.into_result()) else {
             self.shared.note(|measured| measured.unanswered += 1);
             return None;

@@ -1,6 +1,6 @@
-//! Hosts on one machine: network namespaces on a private bridge, whose packets can be lost, held up or doubled.
+//! Hosts on one machine: network namespaces on a private bridge, whose packets can be lost or held up.
 //!
-//! Needs root, `ip`, `tc` and `nft`, and a kernel of 5.17 or newer. The bridge has an address on this machine, so that a
+//! Needs root, `ip`, `tc` and `nft`. The bridge has an address on this machine, so that a
 //! router in the test's own process can be reached; what happens to packets happens outside the hosts, unseen by them.
 
 use std::fs;
@@ -73,15 +73,8 @@ impl Drop for Network {
 }
 
 impl Line for Host {
-    const TROUBLES: &'static [Trouble] = &[
-        Trouble::Silent,
-        Trouble::Deaf,
-        Trouble::Mute,
-        Trouble::Unplugged,
-        Trouble::Slow,
-        Trouble::Lossy,
-        Trouble::Doubled,
-    ];
+    const TROUBLES: &'static [Trouble] =
+        &[Trouble::Silent, Trouble::Deaf, Trouble::Mute, Trouble::Unplugged, Trouble::Slow, Trouble::Lossy];
 
     fn endpoint(&self) -> String {
         self.endpoint.clone()
@@ -100,13 +93,6 @@ impl Line for Host {
             Trouble::Deaf => self.drop_packets(&[to], ""),
             Trouble::Mute => self.drop_packets(&[from], ""),
             Trouble::Lossy => self.drop_packets(&[from, to], &format!("numgen random mod 200 < {percent}")),
-            Trouble::Doubled => {
-                let rule = |device: &str| format!("numgen random mod 100 < {percent} dup to {device} ;");
-                let hook = |device: &str| format!("type filter hook egress device {device} priority 0 ;");
-                let chain = |device: &str| format!("chain doubled {{ {} {} }} ;", hook(device), rule(device));
-                let begin = self.at_both_ends(|device| format!("nft table netdev {name} {{ {} }}", chain(device)));
-                (begin, self.at_both_ends(|_| format!("nft delete table netdev {name}")))
-            }
             Trouble::Slow => {
                 let rate = 5000 / percent;
                 let limit = format!("tbf rate {rate}kbit burst 5kb limit 30kb");
@@ -156,7 +142,7 @@ fn remove(of: impl Fn(u32) -> bool) {
             let name = entry.file_name().to_string_lossy().into_owned();
             let owner = name.strip_prefix(PREFIX).and_then(|rest| rest.split('-').next()?.parse().ok());
             if owner.is_some_and(&of) {
-                for command in ["ip netns del", "ip link del", "nft delete table bridge", "nft delete table netdev"] {
+                for command in ["ip netns del", "ip link del", "nft delete table bridge"] {
                     run(&format!("{command} {name}")).ok();
                 }
             }

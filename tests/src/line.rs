@@ -22,8 +22,6 @@ pub enum Trouble {
     Slow,
     /// Some packets are lost.
     Lossy,
-    /// Some packets arrive more than once.
-    Doubled,
 }
 
 /// What the chaos test does to a connection, whatever that is made of.

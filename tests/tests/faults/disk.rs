@@ -89,18 +89,3 @@ fn scores_wait_for_a_disk_that_is_full_and_that_is_told() {
     let measured = http::sum(&http::metrics(&evaluator.metrics()).unwrap(), "quad_evaluator_episodes_total", "");
     assert_eq!(measured, 8.0, "nothing is measured twice");
 }
-
-#[test]
-fn what_only_scripts_read_is_written_later_if_it_must_be() {
-    let scratch = Scratch::new();
-    // Nothing can be written to a file that is a folder.
-    let obstacle = scratch.path().join("run/endpoints.json.partial");
-    fs::create_dir_all(&obstacle).unwrap();
-    let setting = Setting { steps: 500, eval_interval: 250, ..SETTING };
-    let mut learner = scratch.learner_with("run", setting, &LISTEN);
-    learner.process.wait_for_log("cannot write", PATIENCE);
-    learner.process.wait_for_log("training is done", PATIENCE);
-    fs::remove_dir(&obstacle).unwrap();
-    let _evaluator = scratch.evaluator("one", &learner.endpoint());
-    learner.assert_completes(&setting, PATIENCE);
-}

@@ -8,9 +8,7 @@ use std::time::{Duration, Instant};
 
 use quad_tests::PATIENCE;
 use quad_tests::learner::Learner;
-use quad_tests::router::router;
-use quad_tests::setting::ENDLESS;
-use quad_tests::system::{Scratch, free_endpoint};
+use quad_tests::system::Scratch;
 
 use crate::disk::{LISTEN, SETTING};
 
@@ -30,33 +28,6 @@ fn make_pipe(path: &Path) {
 
 fn pipe(learner: &Learner, step: u64) -> PathBuf {
     learner.snapshot(step).with_extension("safetensors.partial")
-}
-
-#[tokio::test(flavor = "multi_thread")]
-async fn a_run_that_fails_while_the_disk_hangs_says_why_and_ends() {
-    let (scratch, other) = (Scratch::new(), Scratch::new());
-    let mut learner = scratch.learner_with("run", SETTING, &LISTEN);
-    let evaluator = scratch.evaluator("one", &learner.endpoint());
-    learner.wait_for_scores(0);
-    learner.process.terminate(PATIENCE);
-    drop(evaluator);
-    let next = hang(&learner);
-    // With scores, there is a report to write.
-    make_pipe(&learner.run_dir.join("report.json.partial"));
-
-    let endpoint = free_endpoint();
-    let _router = router(&endpoint).await;
-    let first = other.learner_with("run", ENDLESS, &["--connect", &endpoint]);
-    first.process.wait_for_log("its metrics at", PATIENCE);
-    let mut learner = scratch.learner_with("run", SETTING, &["--connect", &endpoint, "--checkpoint-seconds", "0"]);
-    learner.process.wait_for_log("there is another learner of run run", PATIENCE);
-    let begin = Instant::now();
-    let status = learner.process.wait(PATIENCE);
-    let took = begin.elapsed();
-    assert!(!learner.snapshot(next).exists(), "the disk did not hang");
-    assert_eq!(status.code(), Some(1), "{}", learner.process.log());
-    assert!((10..25).contains(&took.as_secs()), "it took {took:?} to give the disk up");
-    assert!(learner.process.log().contains("the disk did not take"), "{}", learner.process.log());
 }
 
 #[test]

@@ -22,7 +22,7 @@ const MOST_TOKENS: usize = 1000;
 enum Flood {
     Progress,
     Claims,
-    /// With a return that is not a number.
+    /// Whose return is not a number.
     Reports,
     /// Of another version of the protocol, and of noise.
     Garbage,

@@ -158,35 +158,3 @@ async fn at_a_learner_that_listens_only_evaluators_progress_passes() {
         Some(())
     });
 }
-
-/// Messages that are larger than any of their kind.
-#[tokio::test(flavor = "multi_thread")]
-async fn what_is_too_large_ends_at_the_router() {
-    let roles = ["learner", "evaluator", "monitor"];
-    let Some((_router, [learner, evaluator, monitor])) = at_the_router(roles).await else { return };
-    let (sender, arrived) = std::sync::mpsc::channel();
-    let told = sender.clone();
-    let watch = monitor.declare_subscriber("quad/run/progress/*");
-    let _watch = watch.callback(move |put| told.send(put.payload().len()).unwrap()).await.unwrap();
-    let mut held = Vec::new();
-    for key in ["jobs", "scores", "weights/*"] {
-        let asked = sender.clone();
-        let callback = move |query: Query| asked.send(query.payload().map_or(0, |payload| payload.len())).unwrap();
-        held.push(learner.declare_queryable(format!("quad/run/{key}")).callback(callback).await.unwrap());
-    }
-    sleep(LULL).await;
-    let sizes = [("progress/e", 1 << 12), ("weights/1", 1 << 12), ("jobs", 30 << 10), ("scores", 30 << 10)];
-    for (key, largest) in sizes {
-        let key = format!("quad/run/{key}");
-        for size in [largest + 1, largest] {
-            match key.contains("progress") {
-                true => evaluator.put(&key, vec![0; size]).await.unwrap(),
-                false => evaluator.get(&key).payload(vec![0; size]).callback(drop).await.unwrap(),
-            }
-            // Slowly enough for a router that limits how many there may be.
-            sleep(Duration::from_millis(250)).await;
-        }
-        assert_eq!(arrived.recv_timeout(PATIENCE), Ok(largest), "{key}");
-    }
-    assert!(arrived.try_recv().is_err());
-}

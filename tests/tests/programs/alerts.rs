@@ -5,9 +5,7 @@ use std::fs;
 use std::path::{Path, PathBuf};
 use std::process::Command;
 
-use quad_tests::setting::{SHORT, Setting};
-use quad_tests::system::Scratch;
-use quad_tests::{PATIENCE, eventually, peers, prometheus};
+use quad_tests::peers;
 
 fn repository(path: &str) -> PathBuf {
     Path::new(env!("CARGO_MANIFEST_DIR")).join("..").join(path)
@@ -51,18 +49,4 @@ fn each_is_tested_and_explained_and_asks_for_what_is_documented() {
         let documented = [format!("`{metric}`"), format!("`{metric}{{")].iter().any(|name| metrics.contains(name));
         assert!(documented, "docs/metrics.md has no {metric}");
     }
-}
-
-#[test]
-fn a_run_without_evaluators_is_noticed() {
-    if !peers::has_prometheus() {
-        return;
-    }
-    let scratch = Scratch::new();
-    let learner = scratch.learner("lonely", Setting { steps: 40, ..SHORT });
-    let (_process, prometheus) = prometheus::start(&scratch, &[("learner", &[learner.metrics()])]);
-    let alert = "ALERTS{alertname=\"QuadNoEvaluators\", run=\"lonely\", alertstate=\"pending\"}";
-    eventually("the alert waits for its time", PATIENCE, || prometheus.value(alert));
-    let _evaluator = scratch.evaluator("late", &learner.endpoint());
-    eventually("the alert is gone", PATIENCE, || prometheus.query(alert)?.is_empty().then_some(()));
 }

@@ -20,27 +20,6 @@ fn refused(arguments: &[&str], code: i32, words: &[&str]) {
 }
 
 #[test]
-fn help_says_what_there_is() {
-    for (program, arguments, words) in [
-        ("learner", &["--help"][..], &["train", "presets", "report", "doctor"][..]),
-        (
-            "learner",
-            &["train", "--help"],
-            &["--preset", "--dataset", "--run-dir", "--guidance", "--set", "--listen", "--connect"],
-        ),
-        ("evaluator", &["--help"], &["serve", "score", "collect", "verify-dataset", "doctor"]),
-        ("evaluator", &["serve", "--help"], &["--connect", "--metrics", "tcp/127.0.0.1:7447"]),
-    ] {
-        let output = run(program, arguments);
-        let text = String::from_utf8_lossy(&output.stdout);
-        assert_eq!(output.status.code(), Some(0), "{program} {arguments:?}");
-        for word in words {
-            assert!(text.contains(word), "{word} is not in {program} {arguments:?}:\n{text}");
-        }
-    }
-}
-
-#[test]
 fn a_wrong_command_line_exits_with_2() {
     for (program, arguments) in [
         ("learner", &[][..]),

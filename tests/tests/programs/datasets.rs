@@ -37,39 +37,26 @@ fn a_run_by_name_fetches_its_dataset_once_and_records_its_checksum() {
     let content = fs::read(scratch.dataset()).unwrap();
     let server = FileServer::start("hopper_random-v2.hdf5", content);
     let preset = scratch.preset("tiny", SHORT);
+    let file = cache.join("hopper_random-v2.hdf5");
     for run in ["first", "second"] {
         let run_dir = scratch.path().join(run);
-        let output = learner(
-            &cache,
-            &server.url,
-            &[
-                "train",
-                "--preset",
-                preset.to_str().unwrap(),
-                "--dataset",
-                "hopper-random-v2",
-                "--eval-interval",
-                "0",
-                "--run-dir",
-                run_dir.to_str().unwrap(),
-            ],
-        );
+        let paths = ["--preset", preset.to_str().unwrap(), "--run-dir", run_dir.to_str().unwrap()];
+        let rest = ["--dataset", "hopper-random-v2", "--eval-interval", "0"];
+        let output = learner(&cache, &server.url, &[&["train"], &paths[..], &rest].concat());
         assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
         let config = fs::read_to_string(run_dir.join("config.toml")).unwrap();
-        let file = cache.join("hopper_random-v2.hdf5");
-        let coreutils = Command::new("sha256sum").arg(&file).output().unwrap();
-        let sha256 = stdout(&coreutils).split_whitespace().next().unwrap().to_owned();
+        let sha256 = stdout(&Command::new("sha256sum").arg(&file).output().unwrap());
         for line in [
             "dataset = \"hopper-random-v2\"".to_owned(),
             format!("path = {:?}", file.to_str().unwrap()),
-            format!("sha256 = {sha256:?}"),
+            format!("sha256 = {:?}", sha256.split_whitespace().next().unwrap()),
         ] {
             assert!(config.lines().any(|found| found == line), "no {line} in:\n{config}");
         }
         assert_eq!(server.requests(), 1, "the second run finds it in the cache");
     }
     let fetched = learner(&cache, &server.url, &["datasets", "fetch", "hopper-random-v2"]);
-    assert_eq!(stdout(&fetched).trim_end(), cache.join("hopper_random-v2.hdf5").to_str().unwrap());
+    assert_eq!(stdout(&fetched).trim_end(), file.to_str().unwrap());
     assert_eq!(server.requests(), 1);
 }
 
@@ -78,23 +65,15 @@ fn the_list_says_what_there_is_and_what_is_here() {
     let folder = tempfile::tempdir().unwrap();
     fs::write(folder.path().join("hopper_random-v2.hdf5"), "").unwrap();
     fs::write(folder.path().join("hopper_medium-v2.hdf5"), "half of it").unwrap();
-    fs::write(folder.path().join("walker2d_medium-v2.hdf5.partial"), "half of it").unwrap();
     let output = learner(folder.path(), "", &["datasets", "list"]);
     assert!(output.status.success());
     let text = stdout(&output);
-    let row = |name: &str| text.lines().find(|line| line.starts_with(&format!("{name} "))).unwrap().to_owned();
-    let columns = row("dataset").find("environment");
-    for (name, environment, state) in [
-        ("hopper-random-v2", "hopper", "yes"),
-        ("hopper-medium-v2", "hopper", "another file of 10 bytes"),
-        ("walker2d-medium-v2", "walker2d", "10 B of it"),
-        ("antmaze-large-diverse-v0", "antmaze-large-v0", "no"),
+    for (name, state) in [
+        ("hopper-random-v2 ", "  yes"),
+        ("hopper-medium-v2 ", "  another file of 10 bytes"),
+        ("antmaze-large-diverse-v0 ", "  no"),
     ] {
-        let row = row(name);
-        assert!(
-            row.ends_with(&format!("  {state}")) && row.find(&format!(" {environment} ")).map(|at| at + 1) == columns,
-            "{text}"
-        );
+        assert!(text.lines().any(|line| line.starts_with(name) && line.ends_with(state)), "{name}:\n{text}");
     }
     assert!(text.ends_with(&format!("cache folder: {}\n", folder.path().display())), "{text}");
 }
@@ -102,19 +81,14 @@ fn the_list_says_what_there_is_and_what_is_here() {
 #[test]
 fn what_cannot_be_had_is_explained() {
     let folder = tempfile::tempdir().unwrap();
-    let page = b"<!DOCTYPE html><title>Sign in</title>".to_vec();
-    let server = FileServer::start("Ant_maze_u-maze_noisy_multistart_False_multigoal_False_sparse.hdf5", page);
+    let file = "Ant_maze_u-maze_noisy_multistart_False_multigoal_False_sparse.hdf5";
+    let server = FileServer::start(file, b"<!DOCTYPE html><title>Sign in</title>".to_vec());
     let text = failure(&learner(folder.path(), &server.url, &["datasets", "fetch", "antmaze-umaze-v0"]));
-    let file = folder.path().join("Ant_maze_u-maze_noisy_multistart_False_multigoal_False_sparse.hdf5");
-    for words in [
-        format!("\n  {}/Ant_maze_u-maze", server.url),
-        "37 bytes, but must have 232533093".to_owned(),
-        "\n  http://rail.eecs.berkeley.edu/".to_owned(),
-        format!("put it at {}", file.display()),
-    ] {
-        assert!(text.contains(&words), "no {words} in:\n{text}");
+    let path = folder.path().join(file);
+    for words in [&server.url, "232533093", "\n  http://rail.eecs.berkeley.edu/", path.to_str().unwrap()] {
+        assert!(text.contains(words), "no {words} in:\n{text}");
     }
-    assert_eq!(fs::read_dir(folder.path()).unwrap().count(), 0);
+    assert!(!path.exists());
 }
 
 #[test]
@@ -123,19 +97,14 @@ fn what_makes_no_sense_is_refused_before_anything_is_fetched() {
     let server = FileServer::start("", Vec::new());
     let train =
         |preset, dataset| learner(folder.path(), &server.url, &["train", "--preset", preset, "--dataset", dataset]);
+    let fetch = |cache: &Path, dataset| learner(cache, &server.url, &["datasets", "fetch", dataset]);
     for (output, words) in [
         (train("hopper-demo", "hopper-medium-reply-v2"), "hopper-medium-replay-v2"),
-        (
-            train("hopper-demo", "walker2d-medium-v2"),
-            "walker2d-medium-v2 is a dataset of walker2d, but the policy is for hopper",
-        ),
+        (train("hopper-demo", "walker2d-medium-v2"), "is a dataset of walker2d, but the policy is for hopper"),
         (train("hopper-demo", "data/halfcheetah_medium-v2.hdf5"), "halfcheetah-medium-v2 is a dataset of halfcheetah"),
         (train("hopper-demo", "minari:none/has-this-v0"), "minari download none/has-this-v0"),
-        (learner(folder.path(), &server.url, &["datasets", "fetch", "hoper-medium-v2"]), "hopper-medium-v2"),
-        (
-            learner(Path::new("/proc/version/cache"), &server.url, &["datasets", "fetch", "hopper-random-v2"]),
-            "/proc/version/cache",
-        ),
+        (fetch(folder.path(), "hoper-medium-v2"), "hopper-medium-v2"),
+        (fetch(Path::new("/proc/version/cache"), "hopper-random-v2"), "/proc/version/cache"),
     ] {
         let text = failure(&output);
         assert!(text.contains(words), "{text}");

@@ -120,14 +120,6 @@ fn folders_that_cannot_be_written_to() {
     assert_found(&text, "FAIL", "run folder", &["No space left", "hint: make room"]);
 }
 
-#[test]
-fn thread_settings_that_slow_down() {
-    let mut command = Command::new(binary("learner"));
-    command.args(["doctor", "--run-dir"]).arg(std::env::temp_dir());
-    let output = command.env("RAYON_NUM_THREADS", "100000").output().unwrap();
-    assert_found(&findings(&output).0, "warn", "threads", &["RAYON_NUM_THREADS"]);
-}
-
 /// What may be wrong with certificates is tested where programs refuse them.
 #[test]
 fn certificates_that_are_good_and_that_are_not() {

@@ -76,34 +76,6 @@ fn a_snapshot_gets_the_scores_that_its_run_has() {
 }
 
 #[test]
-fn neither_threads_nor_batches_change_a_score() {
-    let scratch = Scratch::new();
-    let learner = run(&scratch, "batches", "f32");
-    let (first, last) = (learner.snapshot(20), learner.snapshot(40));
-    let flags = ["--precision", "f32", "--json", "--candidates", "1,4"];
-    let few = json(&score("1", &[&first], &[&flags[..], &["--episodes", "3"]].concat()));
-    let many = json(&score("3", &[&first, &last], &[&flags[..], &["--episodes", "40"]].concat()));
-    let setting = |scored: &Value| (scored["step"].as_u64().unwrap(), scored["candidates"].as_u64().unwrap());
-    assert_eq!(many.iter().map(setting).collect::<Vec<_>>(), [(20, 1), (20, 4), (40, 1), (40, 4)]);
-    for (few, many) in few.iter().zip(&many) {
-        assert_eq!(setting(few), setting(many));
-        assert_eq!((episodes(few).len(), episodes(many).len()), (3, 40));
-        assert_eq!(episodes(few)[..], episodes(many)[..3]);
-    }
-    let seeds = |scored: &Value| episodes(scored).iter().map(|episode| episode.0).collect::<Vec<_>>();
-    assert_eq!(seeds(&many[0]), seeds(&many[1]), "all numbers of candidates have the same episodes");
-    assert_ne!(episodes(&many[0]), episodes(&many[1]), "and come to something else");
-    let other = json(&score("2", &[&first], &[&flags[..], &["--seed", "6"]].concat()));
-    assert_ne!(seeds(&other[0]), seeds(&many[0])[..SETTING.episodes as usize], "another seed, other episodes");
-
-    let table = score("2", &[&first, &last], &["--candidates", "1,4"]);
-    let table = String::from_utf8(table.stdout).unwrap();
-    for words in ["1 candidate ", "4 candidates", "mean of 2 snapshots", last.to_str().unwrap()] {
-        assert!(table.contains(words), "{words}: {table}");
-    }
-}
-
-#[test]
 fn what_cannot_be_scored_is_said_in_a_sentence() {
     let scratch = Scratch::new();
     let mut learner = scratch.learner_with("unscored", SETTING, &["--eval-interval", "0"]);
@@ -120,20 +92,13 @@ fn what_cannot_be_scored_is_said_in_a_sentence() {
         [&snapshot[..at], to.as_bytes(), &snapshot[at + to.len()..]].concat()
     };
     let whole = write("whole.safetensors", &snapshot);
-    let earlier = write("earlier.safetensors", &with("\"origin\"", "\"origen\""));
     let moon = write("moon.safetensors", &with("hopper", "onmoon"));
-    let forged = write("forged.safetensors", &with("episodes", "episoden"));
     let cut = write("cut.safetensors", &snapshot[..snapshot.len() / 2]);
-    let noise = write("noise.safetensors", b"not a policy");
     let missing = scratch.path().join("missing.safetensors");
     for (path, flags, words) in [
-        (&noise, &[][..], "is not a saved policy"),
-        (&cut, &[], "is not a saved policy"),
+        (&cut, &[][..], "is not a saved policy"),
         (&missing, &[], "cannot read"),
         (&moon, &[], "unknown environment `onmoon`"),
-        (&forged, &[], "is not a snapshot of a run"),
-        (&earlier, &[], "does not say which environment"),
-        (&earlier, &["--env", "hopper"], "does not say which environment"),
         (&whole, &["--env", "walker2d"], "walker2d"),
     ] {
         let output = score("1", &[path], flags);
@@ -142,8 +107,6 @@ fn what_cannot_be_scored_is_said_in_a_sentence() {
         let told = text.contains(words) && text.contains(path.to_str().unwrap()) && text.contains("hint:");
         assert!(told && output.stdout.is_empty(), "{path:?}: {text}");
     }
-    for (path, flags) in [(&moon, &["--env", "hopper"][..]), (&earlier, &["--env", "hopper", "--seed", "5"])] {
-        let scored = json(&score("1", &[path], &[flags, &["--episodes", "2", "--json"]].concat()));
-        assert_eq!(episodes(&scored[0]).len(), 2, "{path:?}");
-    }
+    let scored = json(&score("1", &[&moon], &["--env", "hopper", "--episodes", "2", "--json"]));
+    assert_eq!(episodes(&scored[0]).len(), 2);
 }

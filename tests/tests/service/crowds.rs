@@ -2,7 +2,7 @@
 //! nothing, so that hundreds fit beside the learner on one machine.
 
 use std::thread;
-use std::time::{Duration, Instant};
+use std::time::Duration;
 
 use quad_tests::crowd::{Crowd, Measured, Pace, longest_job};
 use quad_tests::learner::Learner;
@@ -98,24 +98,12 @@ impl Scene {
         assert_eq!((measured.unanswered, measured.refused), (0, 0), "questions without an answer, and refused reports");
         (measured, share)
     }
-
-    /// What they can do at most, for a short time.
-    fn hurry(&self, phase: Duration) {
-        self.crowd.set(Pace::Instant);
-        thread::sleep(SETTLE);
-        self.crowd.measured();
-        let begin = Instant::now();
-        thread::sleep(phase);
-        tell("as fast as it goes", &self.crowd.measured(), begin.elapsed());
-        self.crowd.set(Pace::Still);
-    }
 }
 
 /// Lets them work; gives the slowest of a hundred claims, and training's speed as a share of its speed alone.
 fn work(size: &Size) -> (Duration, f64) {
     let scene = Scene::new(BUSY, size);
     let (measured, share) = scene.work(size);
-    scene.hurry(size.phase);
     let memory = scene.learner.process.peak_memory().unwrap();
     let scores = scene.learner.assert_scores_are_distinct().len();
     eprintln!("memory: {} MiB alone, at most {} MiB with all", scene.alone >> 20, memory >> 20);

@@ -6,6 +6,5 @@
 
 mod crowds;
 mod leaving;
-mod lives;
 mod names;
 mod runs;

@@ -54,22 +54,24 @@ fn an_evaluator_waits_for_its_learner_and_serves_the_next_one() {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn scores_measured_while_cut_off_are_delivered_later() {
+async fn scores_measured_while_cut_off_are_delivered_to_the_learners_next_life() {
     let scratch = Scratch::new();
     let endpoint = free_endpoint();
     let setting = Setting { steps: 10, eval_interval: 10, episodes: 20, candidates: 1000, hidden: 256, seed: 1 };
     let session = router_without_scores(&endpoint, None).await;
-    let mut learner = scratch.learner_with("run", setting, &["--connect", &endpoint]);
+    let mut first = scratch.learner_with("run", setting, &["--connect", &endpoint]);
     let evaluator = scratch.evaluator("cut-off", &endpoint);
     evaluator.process.wait_for_log("evaluating", PATIENCE);
     session.close().await.unwrap();
     drop(session);
     // It finds out that there is no answer when it has the scores.
     evaluator.process.wait_for_log("quad/run/scores", PATIENCE);
-    assert!(learner.scores().is_empty());
+    assert!(first.scores().is_empty());
+    first.process.kill();
 
     let _session = router(&endpoint).await;
-    learner.assert_completes(&setting, PATIENCE);
+    let mut second = scratch.learner_with("run", setting, &["--connect", &endpoint]);
+    second.assert_completes(&setting, PATIENCE);
     let page = http::metrics(&evaluator.metrics()).unwrap();
     let measured = http::sum(&page, "quad_evaluator_episodes_total", "");
     assert_eq!(measured, f64::from(setting.episodes), "nothing was measured twice");
