@@ -1,5 +1,6 @@
 //! From a preset and flags to one validated experiment, and what a run saves of it.
 
+pub mod device;
 mod error;
 
 use std::path::PathBuf;
@@ -10,10 +11,10 @@ use serde::{Deserialize, Serialize};
 use toml::{Table, Value};
 
 use crate::algorithms::{self, Definition, Hyperparameters};
-use crate::device::Device;
 use crate::presets;
 use crate::schedule::Schedule;
 
+use device::Device;
 pub use error::ConfigError;
 
 /// Most episodes in one evaluation, and most candidates per state: far above any use, low enough for evaluators' memory.

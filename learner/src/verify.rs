@@ -6,7 +6,7 @@ use std::path::Path;
 
 use quad_protocol::{Hash, episode_seeds};
 
-use crate::run_dir::{RunDir, RunDirError, ScoreLine};
+use crate::run::{RunDir, RunDirError, ScoreLine};
 use crate::settings;
 
 /// Findings of one kind that are listed one by one; the rest is counted.

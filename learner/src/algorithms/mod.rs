@@ -4,11 +4,13 @@
 //! state as named tensors, and a table of metrics. A new one is a file here, a line in [`ALGORITHMS`] and a preset.
 
 mod iql;
+pub mod optimiser;
 pub mod quad;
+mod random;
 
-use crate::optimiser::{Adam, AdamStep};
 use candle_core::backprop::GradStore;
 use candle_core::{Device, Result, Tensor};
+use optimiser::{Adam, AdamStep};
 use quad_dataset::Batch;
 use quad_policy::{Description, PolicyError, Precision, Tensors};
 use serde::de::DeserializeOwned;

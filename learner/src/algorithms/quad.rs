@@ -6,9 +6,9 @@ mod config;
 #[allow(clippy::unwrap_used)]
 mod golden;
 
+use super::optimiser::{Adam, AdamStep, cosine_decay, follow};
+use super::random::{Purpose, stream};
 use super::{Algorithm, AlgorithmError, Definition, Metric, Minibatch, Setting, numbers};
-use crate::optimiser::{Adam, AdamStep, cosine_decay, follow};
-use crate::random::{Purpose, stream};
 use candle_core::{DType, Device, Result, Tensor};
 use candle_nn::loss::mse;
 use config::{Guidance, Quad as Config, TargetReduce};

@@ -9,7 +9,7 @@ use quad_service::parse_endpoint;
 use toml::{Table, Value};
 
 use super::parse_preset;
-use crate::device::Device;
+use crate::config::device::Device;
 use crate::presets;
 
 pub(super) const EXAMPLES: &str = "\

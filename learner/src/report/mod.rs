@@ -16,7 +16,7 @@ use std::path::PathBuf;
 
 use serde::Serialize;
 
-use crate::run_dir::RunDirError;
+use crate::run::RunDirError;
 pub use run::RunReport;
 pub use seeds::GroupReport;
 use table::{Style, Table, cell, spread};

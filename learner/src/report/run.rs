@@ -12,7 +12,7 @@ use super::table::{Style, Table, spread};
 use super::{FINAL_STEPS, Spread};
 use crate::algorithms::Hyperparameters;
 use crate::config::RunConfig;
-use crate::run_dir::{RunDir, RunDirError, ScoreLine};
+use crate::run::{RunDir, RunDirError, ScoreLine};
 
 /// One snapshot's episodes.
 #[derive(Clone, Debug, PartialEq, Serialize)]

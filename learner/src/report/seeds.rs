@@ -8,8 +8,8 @@ use serde::Serialize;
 use super::Spread;
 use super::published::{self, Published};
 use super::run::RunReport;
+use crate::config::device::Device;
 use crate::config::{self, Experiment};
-use crate::device::Device;
 use crate::settings::{self, Settings, differences};
 
 /// Runs that differ in their seed alone: in preset, data, device, precision and every hyper-parameter they agree.
