@@ -1,4 +1,4 @@
-//! Tells the binaries where libmujoco lies, so that nobody has to set LD_LIBRARY_PATH.
+//! Tells the binaries where libmujoco lies, so that no user has to set LD_LIBRARY_PATH.
 
 use std::path::Path;
 

@@ -6,8 +6,8 @@
 use candle_core::Device;
 use criterion::{BatchSize, Criterion, criterion_group, criterion_main};
 use quad_dataset::environment::find;
-use quad_evaluator::environment::{make, simulated};
-use quad_evaluator::rollout::Rollout;
+use quad_evaluator::sim::Rollout;
+use quad_evaluator::sim::{make, simulated};
 use quad_policy::{
     ActionNoise, Description, DiffusionPolicy, DiffusionShape, Ensemble, Layout, NoisePredictor, Policy, Precision,
     Weights, load_policy,

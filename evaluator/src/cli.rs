@@ -8,11 +8,11 @@ use quad_dataset::EnvironmentSpec;
 use quad_dataset::environment;
 use quad_service::Hint;
 
-use crate::collect::{self, CollectError, Summary};
 use crate::doctor::{self, DoctorArgs};
-use crate::score::{self, ScoreArgs};
 use crate::serve::{self, ServeArgs};
-use crate::verify::{self, Report, VerifyError};
+use crate::tools::collect::{self, CollectError, Summary};
+use crate::tools::score::{self, ScoreArgs};
+use crate::tools::verify::{self, Report, VerifyError};
 
 /// Runs policies in MuJoCo, and records datasets there.
 #[derive(Debug, Parser)]

@@ -2,23 +2,18 @@
 //!
 //! # Layout
 //!
-//! In reading order:
+//! Three rooms, of which the later two use the first and never each other:
 //!
-//! - [`environment`]: the tasks, with the semantics that D4RL's scores are defined by.
-//! - [`rollout`]: many episodes as one batch, one policy call per step.
-//! - [`collect`]: trains behaviour from random to competent and records it as a dataset.
-//! - [`verify`]: replays a recorded dataset and measures how far the simulation is from it.
-//! - [`score`]: scores saved policies, on this machine alone.
-//! - [`serve`]: finds runs on the network, evaluates their snapshots; [`metrics`]: its Prometheus metrics.
-//! - [`doctor`]: checks this machine before it is trusted with any of that.
-//! - [`cli`]: the command line.
+//! - [`sim`]: the tasks and whole batches of their episodes.
+//! - `serve`: finds runs on the network, evaluates their snapshots, delivers the scores.
+//! - [`tools`]: records datasets, replays them, scores saved policies, on this machine alone.
+//!
+//! Beside them: [`cli`], the command line; `doctor`, which checks this machine before it evaluates anything; `metrics`, what
+//! Prometheus is told.
 
 pub mod cli;
-pub mod collect;
-pub mod doctor;
-pub mod environment;
-pub mod metrics;
-pub mod rollout;
-pub mod score;
-pub mod serve;
-pub mod verify;
+mod doctor;
+mod metrics;
+mod serve;
+pub mod sim;
+pub mod tools;

@@ -1,5 +1,7 @@
 //! An evaluator's Prometheus metrics; docs/metrics.md explains each of them.
 
+use prometheus::core::Collector;
+use prometheus::process_collector::ProcessCollector;
 use prometheus::{Counter, Histogram, HistogramOpts, IntCounter, IntCounterVec, IntGauge, Opts, Registry};
 
 /// How a job ended.
@@ -54,53 +56,48 @@ impl Metrics {
     /// Registers every metric, and the process's own (`process_…`).
     pub fn new() -> prometheus::Result<Metrics> {
         let registry = Registry::new();
+        registry.register(Box::new(ProcessCollector::for_self()))?;
+        let counter = |name: &str, help: &str| register(&registry, IntCounter::new(name, help)?);
+        let seconds = |name: &str, help: &str| register(&registry, Counter::new(name, help)?);
+        let histogram = |name: &str, help: &str, buckets: &[f64]| {
+            let options = HistogramOpts::new(name, help).buckets(buckets.to_vec());
+            register(&registry, Histogram::with_opts(options)?)
+        };
+        let labelled = |name: &str, help: &str, label: &str| {
+            register(&registry, IntCounterVec::new(Opts::new(name, help), &[label])?)
+        };
         let metrics = Metrics {
-            episodes: IntCounter::new("quad_evaluator_episodes_total", "Episodes finished")?,
-            environment_steps: IntCounter::new("quad_evaluator_environment_steps_total", "Environment steps taken")?,
-            snapshots_received: IntCounter::new(
+            episodes: counter("quad_evaluator_episodes_total", "Episodes finished")?,
+            environment_steps: counter("quad_evaluator_environment_steps_total", "Environment steps taken")?,
+            snapshots_received: counter(
                 "quad_evaluator_snapshots_received_total",
                 "Weight snapshots received whole and verified",
             )?,
-            episode_score: Histogram::with_opts(
-                // 100 is an expert by the normalisation; the fine buckets are where training starts.
-                HistogramOpts::new("quad_evaluator_episode_score", "Normalised score of each scored episode")
-                    .buckets(vec![1.0, 2.0, 5.0, 10.0, 20.0, 30.0, 40.0, 50.0, 60.0, 70.0, 80.0, 90.0, 100.0, 110.0]),
+            // 100 is an expert by the normalisation; the fine buckets are where training starts.
+            episode_score: histogram(
+                "quad_evaluator_episode_score",
+                "Normalised score of each scored episode",
+                &[1.0, 2.0, 5.0, 10.0, 20.0, 30.0, 40.0, 50.0, 60.0, 70.0, 80.0, 90.0, 100.0, 110.0],
             )?,
-            job_duration: Histogram::with_opts(
-                HistogramOpts::new(
-                    "quad_evaluator_job_duration_seconds",
-                    "Time from a job's hand-out to the end of its last episode",
-                )
-                .buckets(vec![0.1, 0.25, 0.5, 1.0, 2.5, 5.0, 10.0, 25.0, 50.0, 100.0, 250.0]),
+            job_duration: histogram(
+                "quad_evaluator_job_duration_seconds",
+                "Time from a job's hand-out to the end of its last episode",
+                &[0.1, 0.25, 0.5, 1.0, 2.5, 5.0, 10.0, 25.0, 50.0, 100.0, 250.0],
             )?,
-            select_seconds: Counter::new("quad_evaluator_select_seconds_total", "Time spent choosing actions")?,
-            physics_seconds: Counter::new("quad_evaluator_physics_seconds_total", "Time spent in the physics")?,
-            runs: IntGauge::new("quad_evaluator_runs", "Runs that are being served")?,
-            jobs: IntCounterVec::new(Opts::new("quad_evaluator_jobs_total", "Jobs by how they ended"), &["outcome"])?,
-            rejected_messages: IntCounterVec::new(
-                Opts::new(
-                    "quad_evaluator_rejected_messages_total",
-                    "Messages from the wire that were not used, by reason",
-                ),
-                &["reason"],
+            select_seconds: seconds("quad_evaluator_select_seconds_total", "Time spent choosing actions")?,
+            physics_seconds: seconds("quad_evaluator_physics_seconds_total", "Time spent in the physics")?,
+            runs: register(&registry, IntGauge::new("quad_evaluator_runs", "Runs that are being served")?)?,
+            jobs: labelled("quad_evaluator_jobs_total", "Jobs by how they ended", "outcome")?,
+            rejected_messages: labelled(
+                "quad_evaluator_rejected_messages_total",
+                "Messages from the wire that were not used, by reason",
+                "reason",
             )?,
-            registry,
+            registry: registry.clone(),
         };
         for outcome in JobOutcome::ALL {
             metrics.jobs.with_label_values(&[outcome.label()]);
         }
-        let registry = &metrics.registry;
-        registry.register(Box::new(metrics.episodes.clone()))?;
-        registry.register(Box::new(metrics.environment_steps.clone()))?;
-        registry.register(Box::new(metrics.snapshots_received.clone()))?;
-        registry.register(Box::new(metrics.episode_score.clone()))?;
-        registry.register(Box::new(metrics.job_duration.clone()))?;
-        registry.register(Box::new(metrics.select_seconds.clone()))?;
-        registry.register(Box::new(metrics.physics_seconds.clone()))?;
-        registry.register(Box::new(metrics.runs.clone()))?;
-        registry.register(Box::new(metrics.jobs.clone()))?;
-        registry.register(Box::new(metrics.rejected_messages.clone()))?;
-        registry.register(Box::new(prometheus::process_collector::ProcessCollector::for_self()))?;
         Ok(metrics)
     }
 
@@ -113,10 +110,10 @@ impl Metrics {
     pub fn rejected(&self, reason: &'static str) {
         self.rejected_messages.with_label_values(&[reason]).inc();
     }
+}
 
-    /// How often that was the reason.
-    #[cfg(test)]
-    pub fn counted(&self, reason: &str) -> u64 {
-        self.rejected_messages.with_label_values(&[reason]).get()
-    }
+/// Adds a metric to what `/metrics` shows.
+fn register<M: Collector + Clone + 'static>(registry: &Registry, metric: M) -> prometheus::Result<M> {
+    registry.register(Box::new(metric.clone()))?;
+    Ok(metric)
 }

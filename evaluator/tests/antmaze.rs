@@ -4,7 +4,7 @@
 use mujoco_rs::wrappers::mj_data::MjData;
 use mujoco_rs::wrappers::mj_model::MjModel;
 use quad_dataset::environment::find;
-use quad_evaluator::environment::{Environment, Step, make, mjcf};
+use quad_evaluator::sim::{Environment, Step, make, mjcf};
 use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 

@@ -5,8 +5,8 @@ use std::path::{Path, PathBuf};
 
 use quad_dataset::environment::find;
 use quad_dataset::{D4rlWriter, EnvironmentSpec, Metadata, RecordedRows};
-use quad_evaluator::collect::{Summary, collect};
-use quad_evaluator::verify::{environment_of, verify};
+use quad_evaluator::tools::collect::{Summary, collect};
+use quad_evaluator::tools::verify::{environment_of, verify};
 use tempfile::TempDir;
 
 const TRANSITIONS: usize = 2000;

@@ -7,7 +7,7 @@ use std::path::{Path, PathBuf};
 use std::process::{Command, Stdio};
 
 use quad_dataset::environment::find;
-use quad_evaluator::environment::{make, mjcf};
+use quad_evaluator::sim::{make, mjcf};
 use serde::Deserialize;
 use serde::de::DeserializeOwned;
 

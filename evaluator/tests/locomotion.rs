@@ -2,7 +2,7 @@
 #![allow(clippy::unwrap_used)]
 
 use quad_dataset::environment::find;
-use quad_evaluator::environment::{Environment, Step, make};
+use quad_evaluator::sim::{Environment, Step, make};
 
 const ROBOTS: [&str; 3] = ["hopper", "halfcheetah", "walker2d"];
 
@@ -112,6 +112,27 @@ fn the_bonus_is_paid_on_the_terminating_step_too() {
     let step = hopper.step(&[0.0; 3]);
     assert!(step.terminated && !step.truncated);
     assert!((step.reward - 1.0).abs() < 1e-3, "{}", step.reward);
+}
+
+#[test]
+fn a_hopper_is_healthy_within_its_bounds() {
+    let mut hopper = hopper();
+    // The legs lie level, so that no part of them is in the floor.
+    for (z, pitch, velocity, terminated) in [
+        (0.71, 0.0, 0.0, false),
+        (0.69, 0.0, 0.0, true),
+        (1.5, 0.19, 0.0, false),
+        (1.5, -0.19, 0.0, false),
+        (1.5, 0.21, 0.0, true),
+        (1.5, -0.21, 0.0, true),
+        (1.5, 0.0, 150.0, true),
+    ] {
+        let (mut qpos, mut qvel) = (AT_REST, AT_REST);
+        (qpos[1], qpos[2], qpos[3]) = (z, pitch, -1.57);
+        qvel[0] = velocity;
+        hopper.set_state(&qpos, &qvel);
+        assert_eq!(hopper.step(&[0.0; 3]).terminated, terminated, "z {z}, pitch {pitch}, {velocity} m/s");
+    }
 }
 
 #[test]

@@ -5,8 +5,8 @@ use std::collections::BTreeMap;
 use std::convert::Infallible;
 
 use quad_dataset::environment::{EnvironmentSpec, find};
-use quad_evaluator::environment::{make, simulated};
-use quad_evaluator::rollout::{EpisodeOutcome, Rollout};
+use quad_evaluator::sim::{EpisodeOutcome, Rollout};
+use quad_evaluator::sim::{make, simulated};
 use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 

@@ -4,7 +4,7 @@
 use std::path::Path;
 
 use quad_dataset::environment::find;
-use quad_evaluator::verify::{VerifyError, environment_of, verify};
+use quad_evaluator::tools::verify::{VerifyError, environment_of, verify};
 
 /// Median and 99th percentile of the error that the reference implementation itself has, replaying the same file; rows
 /// whose next observation is known.

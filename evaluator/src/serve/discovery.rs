@@ -2,35 +2,28 @@
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::convert::Infallible;
-use std::sync::Arc;
-use std::sync::atomic::{AtomicBool, Ordering::Relaxed};
-use std::time::{Duration, Instant};
+use std::time::Duration;
 
 use anyhow::Context;
 use quad_protocol::{Name, keys};
 use quad_service::{Certificates, Endpoints, open_session};
 use tokio::sync::watch;
 use tokio::task::JoinSet;
-use tracing::{debug, info, warn};
-use zenoh::Session;
-use zenoh::query::Reply;
+use tracing::{info, warn};
 use zenoh::sample::{Sample, SampleKind};
+use zenoh::{Session, Wait};
 
+use super::query::may_block;
 use crate::metrics::Metrics;
 
-/// Most runs that are served at a time, and most learners of one run that are told apart: for floods of made-up ones.
-const MOST_RUNS: usize = 256;
-const MOST_LIVES: usize = 8;
-/// Where there is no room, a run that has come to nothing for this long gives its place to another one.
-const CHANCE: Duration = Duration::from_secs(30);
-/// A run that there was no room for is looked for again after this long.
-const LOOK_AGAIN: Duration = Duration::from_secs(10);
-/// The label of a key that names no learner.
-const INVALID: &str = "invalid_name";
+/// Most learners that are followed, over all runs and endpoints: it bounds memory, far above any use.
+const MOST_LEARNERS: usize = 1024;
+/// How often a session is looked at that may have closed.
+const GLANCE: Duration = Duration::from_secs(10);
 
 /// A run as one endpoint shows it: the endpoint's place on the command line, and the run's name.
 ///
-/// Seen through two endpoints, a run is served through both: either may fail on its own.
+/// A run that two endpoints show is served through both: either may fail on its own.
 pub type RunKey = (usize, Name);
 
 /// A run whose learner is there.
@@ -41,10 +34,6 @@ pub struct Found {
     /// The incarnations that announce themselves, at least one: a learner that was cut off or killed may still seem to be
     /// there when the next one starts.
     pub lives: BTreeSet<u64>,
-    /// Since when it is served.
-    pub since: Instant,
-    /// Whether its learner has ever accepted scores.
-    pub proven: Arc<AtomicBool>,
 }
 
 /// The runs that are there.
@@ -57,7 +46,7 @@ pub struct Discovery {
 }
 
 impl Discovery {
-    /// Starts to watch; endpoints that nobody listens at yet are waited for.
+    /// Starts to watch. An endpoint at which nothing listens yet is waited for.
     ///
     /// Each endpoint gets a session of its own, because a Zenoh client keeps one connection: with one session,
     /// a second learner's endpoint would only be a spare for the first.
@@ -97,103 +86,48 @@ async fn watch_endpoint(
     let endpoints = Endpoints { connect: vec![endpoint.clone()], certificates, ..Endpoints::default() };
     let session = open_session(&endpoints).await?;
     info!(endpoint, "connected");
-    let failed = || format!("cannot look for learners at {endpoint}");
-    let watch = Arc::new(Watch {
-        index,
-        session: session.clone(),
-        found,
-        metrics,
-        no_room: false.into(),
-        warned: false.into(),
-    });
-    let told = watch.clone();
-    let subscriber = session.liveliness().declare_subscriber(keys::ALL_LEARNERS).history(true);
-    let subscriber = subscriber.callback(move |token| told.take_in(&token));
-    let _subscriber = subscriber.await.map_err(|error| anyhow::anyhow!(error)).with_context(failed)?;
-    loop {
-        tokio::time::sleep(LOOK_AGAIN).await;
-        anyhow::ensure!(!session.is_closed(), "the Zenoh session closed");
-        if watch.no_room.swap(false, Relaxed) {
-            let told = watch.clone();
-            let answer = move |reply: Reply| {
-                if let Ok(token) = reply.result() {
-                    told.take_in(token);
-                }
-            };
-            let looked = session.liveliness().get(keys::ALL_LEARNERS).callback(answer).await;
-            looked.map_err(|error| anyhow::anyhow!(error)).with_context(failed)?;
-        }
-    }
-}
-
-/// What is done with the tokens of one endpoint.
-struct Watch {
-    index: usize,
-    session: Session,
-    found: watch::Sender<Runs>,
-    metrics: Metrics,
-    /// Somebody was turned away who could be served if another one went.
-    no_room: AtomicBool,
-    /// One line in the log for those who are turned away; all are counted.
-    warned: AtomicBool,
-}
-
-impl Watch {
-    fn take_in(&self, token: &Sample) {
-        let (kind, key) = (token.kind(), token.key_expr().as_str());
-        let mut problem = None;
-        self.found.send_if_modified(|runs| {
-            let followed = follow(runs, (self.index, &self.session), kind, key, Instant::now());
-            // Whoever has given its place to another one is looked for as well.
-            self.no_room.fetch_or(runs.len() >= MOST_RUNS, Relaxed);
-            followed.unwrap_or_else(|label| {
-                problem = Some(label);
+    let told = session.clone();
+    let callback = move |token: Sample| {
+        found.send_if_modified(|runs| {
+            take_in(runs, (index, &told), token.kind(), token.key_expr().as_str()).unwrap_or_else(|label| {
+                metrics.rejected(label);
+                warn!(key = token.key_expr().as_str(), label, "a learner is not served");
                 false
             })
         });
-        let Some(label) = problem else { return };
-        self.metrics.rejected(label);
-        self.no_room.fetch_or(label != INVALID, Relaxed);
-        match self.warned.swap(true, Relaxed) {
-            false => warn!(key, label, "a learner is not served; more are only counted"),
-            true => debug!(key, label, "a learner is not served"),
-        }
+    };
+    let declared = session.clone();
+    let declare = move || {
+        let subscriber = declared.liveliness().declare_subscriber(keys::ALL_LEARNERS).history(true);
+        subscriber.callback(callback).wait()
+    };
+    let subscriber = may_block(declare).await;
+    let _subscriber = subscriber.with_context(|| format!("cannot look for learners at {endpoint}"))?;
+    loop {
+        tokio::time::sleep(GLANCE).await;
+        anyhow::ensure!(!session.is_closed(), "the Zenoh session closed");
     }
 }
 
-/// Makes room for another run, if one has come to nothing for long.
-fn make_room(runs: &mut Runs, now: Instant) -> bool {
-    let idle = runs.iter().filter(|(_, run)| !run.proven.load(Relaxed) && now - run.since >= CHANCE);
-    let Some(place) = idle.min_by_key(|(_, run)| run.since).map(|(place, _)| place.clone()) else { return false };
-    debug!(run = %place.1, "gives its place to another run");
-    runs.remove(&place);
-    true
-}
-
-/// Takes in a token; says whether the runs have changed, or why it is not taken in.
-fn follow(
+/// Takes in a token; says whether the runs have changed, or the metric's label of why it is not taken in.
+fn take_in(
     runs: &mut Runs,
     (index, session): (usize, &Session),
     kind: SampleKind,
     key: &str,
-    now: Instant,
 ) -> Result<bool, &'static str> {
-    let (run, incarnation) = keys::run_of(key).zip(keys::incarnation_of(key)).ok_or(INVALID)?;
-    let place = (index, run.clone());
-    let new = kind == SampleKind::Put && !runs.contains_key(&place);
-    if new && runs.len() >= MOST_RUNS && !make_room(runs, now) {
-        return Err("too_many_runs");
-    }
+    let (run, incarnation) = keys::run_of(key).zip(keys::incarnation_of(key)).ok_or("invalid_name")?;
+    let learners: usize = runs.values().map(|found| found.lives.len()).sum();
+    let place = (index, run);
+    let run = &place.1;
     match (kind, runs.get_mut(&place)) {
+        (SampleKind::Put, _) if learners >= MOST_LEARNERS => Err("too_many_runs"),
+        (SampleKind::Put, Some(found)) => Ok(found.lives.insert(incarnation)),
         (SampleKind::Put, None) => {
             info!(%run, incarnation, "found a run");
-            let (session, lives) = (session.clone(), BTreeSet::from([incarnation]));
-            runs.insert(place, Found { session, lives, since: now, proven: Arc::default() });
+            runs.insert(place, Found { session: session.clone(), lives: BTreeSet::from([incarnation]) });
             Ok(true)
         }
-        (SampleKind::Put, Some(found)) if found.lives.contains(&incarnation) => Ok(false),
-        (SampleKind::Put, Some(found)) if found.lives.len() >= MOST_LIVES => Err("too_many_learners"),
-        (SampleKind::Put, Some(found)) => Ok(found.lives.insert(incarnation)),
         (SampleKind::Delete, None) => Ok(false),
         (SampleKind::Delete, Some(found)) => {
             let changed = found.lives.remove(&incarnation);
@@ -211,40 +145,25 @@ mod tests {
     use super::*;
 
     #[tokio::test(flavor = "multi_thread")]
-    async fn so_many_runs_and_lives_are_followed_and_no_more() {
+    async fn learners_are_followed_up_to_a_bound() {
         let endpoints = Endpoints { listen: vec!["tcp/127.0.0.1:0".to_owned()], ..Endpoints::default() };
         let session = open_session(&endpoints).await.unwrap();
         let mut runs = Runs::new();
-        let start = Instant::now();
         let mut tell = |kind, run: usize, life: usize| {
-            let key = format!("quad/run-{run}/live/learner/{life}");
-            let result = follow(&mut runs, (0, &session), kind, &key, start);
+            let result = take_in(&mut runs, (0, &session), kind, &format!("quad/run-{run}/live/learner/{life}"));
             (result, runs.len())
         };
-        for run in 0..MOST_RUNS {
-            assert_eq!(tell(SampleKind::Put, run, 1), (Ok(true), run + 1));
+        assert_eq!(tell(SampleKind::Put, 0, 1), (Ok(true), 1));
+        assert_eq!(tell(SampleKind::Put, 0, 1), (Ok(false), 1), "it is known");
+        assert_eq!(tell(SampleKind::Put, 0, 2), (Ok(true), 1), "the next life, while the first seems to be there");
+        for run in 2..MOST_LEARNERS {
+            assert_eq!(tell(SampleKind::Put, run, 1), (Ok(true), run));
         }
-        assert_eq!(tell(SampleKind::Put, MOST_RUNS, 1), (Err("too_many_runs"), MOST_RUNS));
-        for life in 2..=MOST_LIVES {
-            assert_eq!(tell(SampleKind::Put, 0, life), (Ok(true), MOST_RUNS));
-        }
-        assert_eq!(tell(SampleKind::Put, 0, 99), (Err("too_many_learners"), MOST_RUNS));
-        assert_eq!(tell(SampleKind::Put, 0, 1).0, Ok(false), "it is known");
-        for life in 1..=MOST_LIVES {
-            assert_eq!(tell(SampleKind::Delete, 0, life).0, Ok(true));
-        }
-        assert_eq!(tell(SampleKind::Delete, MOST_RUNS, 1), (Ok(false), MOST_RUNS - 1));
-        assert_eq!(tell(SampleKind::Put, MOST_RUNS, 1), (Ok(true), MOST_RUNS), "there is room again");
-
-        // Later, whoever has come to nothing gives way, and nobody else.
-        runs.values().skip(3).for_each(|run| run.proven.store(true, Relaxed));
-        let kept = Vec::from_iter(runs.keys().skip(3).cloned());
-        let mut tell = |run: usize, seconds| {
-            let (key, now) = (format!("quad/late-{run}/live/learner/1"), start + Duration::from_secs(seconds));
-            follow(&mut runs, (0, &session), SampleKind::Put, &key, now)
-        };
-        assert_eq!(tell(0, CHANCE.as_secs() - 1), Err("too_many_runs"));
-        assert_eq!([1, 2, 3, 4].map(|run| tell(run, CHANCE.as_secs()).is_ok()), [true, true, true, false]);
-        assert!(kept.iter().all(|place| runs.contains_key(place)));
+        assert_eq!(tell(SampleKind::Put, MOST_LEARNERS, 1).0, Err("too_many_runs"));
+        assert_eq!(tell(SampleKind::Put, 0, 3).0, Err("too_many_runs"));
+        assert_eq!(tell(SampleKind::Delete, 0, 1), (Ok(true), MOST_LEARNERS - 1));
+        assert_eq!(tell(SampleKind::Delete, 0, 2), (Ok(true), MOST_LEARNERS - 2), "the last life is gone");
+        assert_eq!(tell(SampleKind::Delete, MOST_LEARNERS, 1), (Ok(false), MOST_LEARNERS - 2));
+        assert_eq!(tell(SampleKind::Put, MOST_LEARNERS, 1), (Ok(true), MOST_LEARNERS - 1), "there is room again");
     }
 }

@@ -6,11 +6,11 @@ use std::time::{Duration, Instant};
 
 use anyhow::Context;
 use quad_dataset::environment::{self, EnvironmentSpec, UnknownEnvironment};
-use quad_policy::{ActionNoise, Cost, Policy};
-use quad_protocol::{EpisodeScore, Job, Name};
+use quad_policy::{ActionNoise, Policy};
+use quad_protocol::{EpisodeScore, Job};
 
 use crate::metrics::{JobOutcome, Metrics};
-use crate::rollout::{EpisodeOutcome, Rollout};
+use crate::sim::{EnvironmentError, EpisodeOutcome, Rollout};
 
 /// Most rows (episodes × candidates) of one network call. The paper's job has 100.
 const MAX_ROWS: usize = 65_536;
@@ -19,15 +19,10 @@ const MAX_EPISODES: usize = 256;
 /// Most memory that one network call may take, bytes: far more than the paper's few megabytes, and far less than an evaluator's
 /// container may have (1 GiB, in docker-compose.yml), of which snapshots and policy take their part.
 const MAX_BYTES: u64 = 256 << 20;
-/// Most multiplications of one network call, which cannot be broken off: a minute on a slow core. The paper's have 10⁹.
-const MAX_PRODUCTS: u64 = 1 << 40;
 
 /// Why a job is not run.
 #[derive(Debug, thiserror::Error)]
 pub enum JobError {
-    /// It belongs to another run than the one whose learner was asked.
-    #[error("it is for run {0}")]
-    Run(Name),
     /// It is empty, or larger than this evaluator runs.
     #[error(
         "it has {episodes} episodes with {candidates} candidates; at most {MAX_EPISODES} episodes and {MAX_ROWS} \
@@ -39,16 +34,9 @@ pub enum JobError {
         /// Candidates per state.
         candidates: u32,
     },
-    /// Its policy would take more memory or time for each step of the episodes than this evaluator gives.
-    #[error(
-        "each of its steps takes {bytes} bytes and {products} multiplications; {MAX_BYTES} and {MAX_PRODUCTS} are given"
-    )]
-    Cost {
-        /// Memory, bytes.
-        bytes: u64,
-        /// Multiplications.
-        products: u64,
-    },
+    /// Its policy would take more memory than this evaluator gives.
+    #[error("each of its steps takes {0} bytes of memory, more than {MAX_BYTES}")]
+    Memory(u64),
     /// It took too long.
     #[error("its episodes did not end within {} s", Job::LONGEST.as_secs())]
     TooLong,
@@ -61,8 +49,7 @@ impl JobError {
     /// The reason as a metric's label.
     pub fn label(&self) -> &'static str {
         match self {
-            JobError::Run(_) => "other_run",
-            JobError::Size { .. } | JobError::Cost { .. } => "job_size",
+            JobError::Size { .. } | JobError::Memory(_) => "job_size",
             JobError::TooLong => "too_long",
             JobError::Environment(_) => "schema",
         }
@@ -70,10 +57,7 @@ impl JobError {
 }
 
 /// Checks a job from the wire; gives its environment.
-pub fn check(job: &Job, run: &Name) -> Result<&'static EnvironmentSpec, JobError> {
-    if job.run != *run {
-        return Err(JobError::Run(job.run.clone()));
-    }
+pub fn check(job: &Job) -> Result<&'static EnvironmentSpec, JobError> {
     let (episodes, candidates) = (job.seeds.len(), job.candidates);
     let rows = episodes.saturating_mul(candidates as usize);
     if !(1..=MAX_ROWS).contains(&rows) || episodes > MAX_EPISODES {
@@ -82,13 +66,10 @@ pub fn check(job: &Job, run: &Name) -> Result<&'static EnvironmentSpec, JobError
     Ok(environment::find(&job.environment)?)
 }
 
-/// Checks what a job takes with its policy.
-pub fn check_cost(job: &Job, policy: &dyn Policy) -> Result<(), JobError> {
-    let Cost { bytes, products } = policy.cost(job.seeds.len(), job.candidates as usize);
-    if bytes > MAX_BYTES || products > MAX_PRODUCTS {
-        return Err(JobError::Cost { bytes, products });
-    }
-    Ok(())
+/// Checks that a job does not take too much memory with its policy.
+pub fn check_memory(job: &Job, policy: &dyn Policy) -> Result<(), JobError> {
+    let bytes = policy.cost(job.seeds.len(), job.candidates as usize).bytes;
+    if bytes > MAX_BYTES { Err(JobError::Memory(bytes)) } else { Ok(()) }
 }
 
 /// What the thread that runs a job and the task that watches it share.
@@ -113,7 +94,7 @@ impl Running {
         let shared = Arc::new(Shared::default());
         let thread = tokio::task::spawn_blocking({
             let (shared, metrics, job) = (shared.clone(), metrics.clone(), job.clone());
-            // On a thread of the pool: else each parallel part of each step would wake one up and wait for it.
+            // On a thread of rayon's pool: otherwise each parallel part of each step would wake one and wait for it.
             move || rayon::scope(|_| roll_out(spec, &job, policy.as_ref(), &shared, &metrics, Job::LONGEST))
         });
         Running { shared, metrics, started: Instant::now(), thread: Some(thread) }
@@ -166,7 +147,7 @@ fn roll_out(
     longest: Duration,
 ) -> anyhow::Result<Option<Vec<EpisodeOutcome>>> {
     let started = Instant::now();
-    let mut rollout = Rollout::new(spec, job.instance, &job.seeds, ActionNoise::new)?;
+    let mut rollout = episodes(spec, job)?;
     let candidates = job.candidates as usize;
     while !rollout.is_done() {
         if shared.cancelled.load(Relaxed) {
@@ -193,6 +174,11 @@ fn roll_out(
     Ok(Some(rollout.into_outcomes()))
 }
 
+/// The job's episodes, at their beginning.
+fn episodes(spec: &'static EnvironmentSpec, job: &Job) -> Result<Rollout<ActionNoise>, EnvironmentError> {
+    Rollout::new(spec, job.instance, &job.seeds, ActionNoise::new)
+}
+
 fn episode_score(outcome: &EpisodeOutcome) -> EpisodeScore {
     let EpisodeOutcome { seed, episode_return, length, score, .. } = *outcome;
     EpisodeScore { seed, episode_return, length, score }
@@ -200,46 +186,23 @@ fn episode_score(outcome: &EpisodeOutcome) -> EpisodeScore {
 
 #[cfg(test)]
 mod tests {
-    use quad_policy::{
-        DiffusionPolicy, DiffusionShape, Ensemble, Layout, NoisePredictor, Precision, Weights, load_policy,
-    };
-    use quad_protocol::{Hash, Lease};
+    use quad_policy::{DiffusionShape, Precision, load_policy};
 
+    use super::super::fixtures::{self, SMALLEST, tensors};
     use super::*;
+    use crate::sim;
 
-    fn job(episodes: usize, candidates: u32) -> Job {
-        Job {
-            id: 1,
-            lease: Lease::random(),
-            run: Name::new("run").unwrap(),
-            incarnation: 1,
-            step: 1,
-            weights: Hash::of(b""),
-            environment: "hopper".to_owned(),
-            instance: 1,
-            seeds: (0..episodes as u64).collect(),
-            candidates,
-            progress_milliseconds: 300,
-        }
+    fn job(episodes: u64, candidates: u32) -> Job {
+        Job { seeds: (0..episodes).collect(), candidates, ..fixtures::job() }
     }
 
-    fn policy(hidden: usize, critics: usize, diffusion_steps: usize) -> Box<dyn Policy> {
-        let shape = DiffusionShape { observation_dim: 11, action_dim: 3, hidden, critics, diffusion_steps };
-        let zeros = |layout: Layout| {
-            let values = candle_core::Tensor::zeros(layout.count(), candle_core::DType::F32, &candle_core::Device::Cpu);
-            Weights::constant(layout, values.unwrap())
-        };
-        let actor = NoisePredictor::new(shape.actor(), zeros(shape.actor().layout()), Precision::F32);
-        let ensemble = Ensemble::new(shape.critics(), zeros(shape.critics().layout()), Precision::F32);
-        let tensors = DiffusionPolicy::tensors(&actor, &ensemble).unwrap();
-        load_policy(&quad_policy::Description::Diffusion(shape).to_safetensors(&tensors).unwrap(), Precision::F32)
-            .unwrap()
+    fn policy(hidden: usize, critics: usize) -> Box<dyn Policy> {
+        load_policy(&tensors(DiffusionShape { hidden, critics, ..SMALLEST }), Precision::F32).unwrap()
     }
 
     #[test]
-    fn a_job_has_a_size_that_somebody_can_mean() {
-        let run = Name::new("run").unwrap();
-        let label = |episodes, candidates| check(&job(episodes, candidates), &run).err().map(|error| error.label());
+    fn a_job_that_is_empty_or_huge_is_refused() {
+        let label = |episodes, candidates| check(&job(episodes, candidates)).err().map(|error| error.label());
         assert_eq!([label(1, 1), label(10, 50), label(256, 256)], [None; 3]);
         for (episodes, candidates) in [(0, 1), (1, 0), (1, u32::MAX), (256, 257), (257, 1), (65_536, 1)] {
             assert_eq!(label(episodes, candidates), Some("job_size"), "{episodes} × {candidates}");
@@ -248,27 +211,33 @@ mod tests {
 
     #[test]
     fn a_job_has_a_longest_time() {
-        let (job, policy, metrics) = (job(2, 1), policy(8, 2, 2), Metrics::new().unwrap());
-        let spec = check(&job, &job.run).unwrap();
+        let (job, policy, metrics) = (job(2, 1), policy(8, 2), Metrics::new().unwrap());
+        let spec = check(&job).unwrap();
         let run = |longest| roll_out(spec, &job, policy.as_ref(), &Shared::default(), &metrics, longest);
         assert_eq!(run(Job::LONGEST).unwrap().unwrap().len(), 2);
         let error = run(Duration::ZERO).unwrap_err();
         assert!(matches!(error.downcast_ref(), Some(JobError::TooLong)), "{error}");
     }
 
+    #[test]
+    fn episodes_have_the_goal_of_the_instance_that_the_job_names() {
+        let spec = environment::find("antmaze-umaze-v0").unwrap();
+        let goals = |instance| -> Vec<Vec<f64>> {
+            let rollout = episodes(spec, &Job { instance, ..job(2, 1) }).unwrap();
+            rollout.environments().map(|environment| environment.goal().unwrap().to_vec()).collect()
+        };
+        let (one, other) = (goals(5), goals(6));
+        assert!(one[0] == one[1] && other[0] == other[1], "the goal is kept over the episodes");
+        assert_ne!(one, other);
+        assert_eq!(one[0], sim::make(spec, 5).unwrap().goal().unwrap());
+    }
+
     /// A file of some megabytes asks for 17 GB: a value of each of 65,535 tiny critics for each of 65,536 candidates.
     #[test]
-    fn memory_and_time_of_a_policy_are_known_before_they_are_spent() {
-        assert!(check_cost(&job(10, 50), policy(256, 10, 5).as_ref()).is_ok(), "the paper's");
-        assert!(check_cost(&job(1, 1), policy(1, 65_535, 1).as_ref()).is_ok());
-        let many_critics = check_cost(&job(256, 256), policy(1, 65_535, 1).as_ref());
-        assert!(matches!(many_critics, Err(JobError::Cost { bytes: 17_000_000_000.., .. })), "{many_critics:?}");
-        let many_critics = check_cost(&job(256, 256), policy(1, 3_500, 1).as_ref());
-        assert!(
-            matches!(many_critics, Err(JobError::Cost { bytes: 900_000_000..1_000_000_000, .. })),
-            "{many_critics:?}"
-        );
-        let slow = check_cost(&job(256, 256), policy(512, 1, 1000).as_ref());
-        assert!(matches!(slow, Err(JobError::Cost { products: 10_000_000_000_000.., .. })), "{slow:?}");
+    fn the_memory_of_a_policy_is_known_before_it_is_taken() {
+        assert!(check_memory(&job(10, 50), policy(256, 10).as_ref()).is_ok(), "the paper's");
+        assert!(check_memory(&job(1, 1), policy(1, 65_535).as_ref()).is_ok());
+        let many_critics = check_memory(&job(256, 256), policy(1, 65_535).as_ref());
+        assert!(matches!(many_critics, Err(JobError::Memory(17_000_000_000..))), "{many_critics:?}");
     }
 }

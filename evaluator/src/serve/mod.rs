@@ -1,33 +1,35 @@
-//! `evaluator serve`: finds runs, evaluates the snapshots that they publish, delivers the scores.
+//! Serving: finds runs, evaluates the snapshots that their learners publish, delivers the scores.
+//!
+//! Owns the sessions, one for each endpoint, and everything that is between this evaluator and the learners; nothing of it must
+//! last. One task does it all in turn, on the main thread; a job's episodes run on a thread of their own and on rayon's,
+//! calls of Zenoh that may block on tokio's, and Zenoh's threads decode what comes in. Only the command line calls it; it uses
+//! `sim`. When the evaluator is told to leave, it hands its job back; if it is killed, the job goes to another evaluator
+//! when the lease runs out.
 //!
 //! # Layout
 //!
 //! In reading order:
 //!
 //! - `discovery`: finds the runs, by their learners' liveliness tokens.
-//! - `worker`: the main loop, which serves the runs in turn; `turns`: whose turn it is.
-//! - `run`: everything that is exchanged with the learner of one run; `query`: a query to a learner; `hand_back`: a job that
-//!   is not done goes back.
-//! - `snapshots`: keeps the newest snapshot of a run, within a `budget`; `loading`: makes a policy of one.
-//! - `job`: all episodes of a job, as one batch.
-//!
-//! An evaluator has no state that must last. When it is told to leave, it hands its job back; if it is killed, the job goes to
-//! another evaluator when the lease runs out.
+//! - `worker`: the main loop, which serves the runs in turn; `scheduler`: whose turn it is.
+//! - `client`: everything that is exchanged with the learner of one run; `query`: a query to a learner.
+//! - `snapshot`: keeps the newest snapshots; `policy`: makes a policy of one.
+//! - `evaluate`: one job, from its policy to its scores; `job`: all of its episodes, as one batch.
 
-mod budget;
+mod client;
 mod discovery;
-mod hand_back;
+mod evaluate;
+#[cfg(test)]
+mod fixtures;
 mod job;
-mod loading;
+mod policy;
 mod query;
-mod run;
-mod snapshots;
-mod turns;
+mod scheduler;
+mod snapshot;
 mod worker;
 
 use std::net::SocketAddr;
 use std::path::{Path, PathBuf};
-use std::sync::PoisonError;
 use std::time::Duration;
 
 use anyhow::Context;
@@ -38,25 +40,24 @@ use quad_service::{
     Certificates, CertificatesError, Endpoints, Health, Hint, Role, SessionError, default_endpoint, parse_endpoint,
 };
 use rand::Rng;
-use tokio::task::JoinSet;
 use tracing::{info, warn};
 
 use crate::metrics::Metrics;
 use discovery::Discovery;
-pub(crate) use query::take_turn;
+use evaluate::Evaluator;
 use worker::Worker;
 
 const AFTER_HELP: &str = "\
-Runs are found by themselves, also those that start later; several are served in turn. Stop it at any time
-(Ctrl-C or SIGTERM): the job that it had is handed to another evaluator.
+The evaluator finds all runs at its endpoints, also those that start later, and serves them in turn. Stop it at any time
+(Ctrl-C or SIGTERM): its job goes to another evaluator.
 
 Examples:
   evaluator serve                                       the learner of this machine
   evaluator serve --connect tcp/learner.example:7447    a learner or router elsewhere
-  evaluator serve --connect tls/learner.example:7447 --certificates certificates/box7    … that asks who comes
+  evaluator serve --connect tls/learner.example:7447 --certificates certificates/box7    the same, by TLS
   evaluator serve --metrics 127.0.0.1:9101              with http://127.0.0.1:9101/metrics
 
-RAYON_NUM_THREADS bounds the processor cores that are used; without it, all are.";
+RAYON_NUM_THREADS sets how many processor cores are used; without it, all are.";
 
 /// Measure the weights that learners publish, until told to stop
 #[derive(Args, Debug)]
@@ -66,7 +67,8 @@ pub struct ServeArgs {
     /// [default: tcp/127.0.0.1:7447, or tls/… with --certificates]
     #[arg(long, value_name = "ENDPOINT", value_parser = parse_endpoint)]
     connect: Vec<String>,
-    /// Folder with ca.pem, cert.pem and key.pem: who this evaluator is for endpoints like tls/HOST:PORT (docs/security.md)
+    /// Folder with ca.pem, cert.pem and key.pem, with which this evaluator proves who it is at endpoints like tls/HOST:PORT
+    /// (docs/security.md)
     #[arg(long, value_name = "DIR", env = "QUAD_CERTIFICATES")]
     certificates: Option<PathBuf>,
     /// Where to serve /metrics and /healthz; port 0 takes a free one
@@ -82,12 +84,10 @@ pub struct ServeArgs {
 
 /// Where a learner of this machine listens by default.
 pub(crate) const DEFAULT_PORT: u16 = 7447;
-/// When it is told to stop, it hands its job back within this time.
-const HAND_BACK: Duration = Duration::from_secs(2);
-/// Then the process waits this long for its threads and for the session to close.
+/// When all is done, the process waits this long for its threads.
 const LEAVE: Duration = Duration::from_secs(1);
 
-/// The worker counts as stuck when it has got nowhere for this long. It waits up to half a minute for weights.
+/// The evaluator counts as stuck when it has got nowhere for this long. It waits up to half a minute for weights.
 const STUCK: Duration = Duration::from_secs(60);
 
 /// Serves until SIGINT or SIGTERM.
@@ -127,20 +127,16 @@ async fn serve_until_stopped(args: ServeArgs) -> anyhow::Result<()> {
         None => None,
     };
     let mut discovery = Discovery::start(endpoints.connect, endpoints.certificates.as_ref(), &metrics);
-    let worker = Worker::new(name, precision, metrics.clone(), discovery.runs(), health.part("worker", STUCK))?;
-    let held = worker.held();
-    let mut work = std::pin::pin!(worker.run());
-    let result = tokio::select! {
-        biased;
-        () = stop => Ok(()),
-        // Before the worker, which fails as a consequence when this has failed.
-        error = discovery.failed() => Err(error),
-        error = &mut work => Err(error),
+    let evaluator = Evaluator::new(name, precision, metrics.clone(), health.part("worker", STUCK));
+    let worker = Worker::new(evaluator, metrics.clone(), discovery.runs());
+    let end = async {
+        tokio::select! {
+            biased;
+            () = stop => Ok(()),
+            error = discovery.failed() => Err(error),
+        }
     };
-    // While the worker still is there, and with it what announces this evaluator: without, the job would count as lost.
-    let jobs = std::mem::take(&mut *held.lock().unwrap_or_else(PoisonError::into_inner));
-    let ends = JoinSet::from_iter(jobs.into_values().map(|job| job.send(HAND_BACK)));
-    ends.join_all().await;
+    let result = worker.run(end).await;
     let (episodes, steps) = (metrics.episodes.get(), metrics.environment_steps.get());
     info!(episodes, steps, "leaving");
     result

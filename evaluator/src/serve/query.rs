@@ -1,96 +1,57 @@
-//! A query to a learner.
+//! A query to a learner, and other calls of Zenoh that may block.
 
-use std::collections::BTreeMap;
-use std::sync::{Arc, Mutex, PoisonError};
-use std::time::{Duration, Instant};
+use std::time::Duration;
 
 use quad_protocol::{Message, decode_from};
-use tokio::sync::oneshot;
-use tracing::{debug, warn};
-use zenoh::Session;
+use tokio::sync::mpsc;
 use zenoh::query::{ConsolidationMode, QueryTarget, Reply};
+use zenoh::{Session, Wait};
 
 use crate::metrics::Metrics;
 
-/// Why a question brought no answer.
+/// Most answers to one query that wait to be looked at; one is enough, and few peers answer.
+const MOST_ANSWERS: usize = 64;
+/// Most bytes of a learner's error that are shown.
+const LONGEST_ERROR: usize = 200;
+
+/// Why a query brought no answer.
 #[derive(Debug, thiserror::Error)]
 pub enum AskError {
-    /// No learner, no network, or the answer took too long.
-    #[error("nobody answered {key}")]
+    /// There is no learner or no network, or the answer took too long.
+    #[error("no answer at {key}")]
     Silent {
         /// The key that was asked.
         key: String,
     },
-    /// What came was not the answer of the learner that was asked.
+    /// A learner answered, but with an error, or with something that is not the answer to this query.
     #[error("unusable answer at {key}: {reason}")]
     Unusable {
         /// The key that was asked.
         key: String,
-        /// What is wrong with the answer.
+        /// The learner's error, or what is wrong with the answer.
         reason: String,
     },
-    /// Zenoh could not send the question.
-    #[error("cannot ask {key}: {source}")]
+    /// Zenoh could not send the query.
+    #[error("cannot ask {key}: {reason}")]
     Send {
         /// The key that was asked.
         key: String,
         /// Zenoh's own words.
-        source: zenoh::Error,
+        reason: String,
     },
 }
 
-/// After an answer, at least so much time passes before the next question of its kind. A router drops those that come closer
-/// together (`downsampling` in its configuration, deploy/zenoh/router.json5): those of a stranger's flood, and it would drop
-/// those of an evaluator of many runs.
-const APART: Duration = Duration::from_millis(50);
-/// The same for weights, of which it lets fewer through.
-const WEIGHTS_APART: Duration = Duration::from_millis(250);
-
-/// When the last question of each kind was asked or, later, over.
-static LAST: Mutex<BTreeMap<String, Instant>> = Mutex::new(BTreeMap::new());
-
-/// What is asked for at `key`, which a router counts for all runs together: `jobs`, `scores` or `weights`.
-fn kind(key: &str) -> &str {
-    key.split('/').nth(2).unwrap_or_default()
+/// Runs a call of Zenoh on a thread that may block. Zenoh's `get` and declarations do all their work in the first poll of their
+/// futures, and while a peer does not read, that takes until Zenoh closes the connection: two seconds, in which the task that
+/// awaits them could do nothing else.
+pub async fn may_block<T: Send + 'static>(
+    call: impl FnOnce() -> zenoh::Result<T> + Send + 'static,
+) -> anyhow::Result<T> {
+    tokio::task::spawn_blocking(call).await?.map_err(|error| anyhow::anyhow!(error))
 }
 
-/// The right to ask a question of its kind, until that is over.
-pub struct Turn(String);
-
-/// Waits until this process may ask its next question of the kind of `key`.
-pub async fn take_turn(key: &str) -> Turn {
-    let turn = Turn(kind(key).to_owned());
-    let apart = if turn.0 == "weights" { WEIGHTS_APART } else { APART };
-    tokio::time::sleep_until(turn.note(apart).into()).await;
-    turn
-}
-
-impl Turn {
-    /// Of a question that is asked so long after the last one, or of one that is over.
-    fn note(&self, after: Duration) -> Instant {
-        let mut last = LAST.lock().unwrap_or_else(PoisonError::into_inner);
-        let now = Instant::now();
-        let turn = last.get(&self.0).map_or(now, |&last| now.max(last + after));
-        last.insert(self.0.clone(), turn);
-        turn
-    }
-}
-
-impl Drop for Turn {
-    fn drop(&mut self) {
-        self.note(Duration::ZERO);
-    }
-}
-
-/// What one question gathers.
-struct Gathered<A> {
-    /// Gone as soon as there is an answer.
-    tell: Option<oneshot::Sender<A>>,
-    unusable: Option<String>,
-}
-
-/// Sends `question` to everybody at `key` and gives the first answer that can be decoded and is `fitting`, which gives the
-/// metric's label of what is wrong with one that is not. Whoever else answers, or never does, is not waited for.
+/// Sends `question` to every learner at `key` and gives the first answer that can be decoded and is `fitting`, which gives the
+/// metric's label of what is wrong with one that is not. It does not wait for further answers.
 pub async fn ask<A: Message + Send + 'static>(
     session: &Session,
     key: String,
@@ -99,53 +60,38 @@ pub async fn ask<A: Message + Send + 'static>(
     metrics: &Metrics,
     fitting: impl Fn(&A) -> Result<(), &'static str> + Send + Sync + 'static,
 ) -> Result<A, AskError> {
-    let _turn = take_turn(&key).await;
-    let (tell, told) = oneshot::channel();
-    let gathered = Arc::new(Mutex::new(Gathered { tell: Some(tell), unusable: None }));
-    let callback = {
-        // Only the callback holds the sender, so that it goes when nobody can answer any more.
-        let (gathered, metrics, key) = (gathered.clone(), metrics.clone(), key.clone());
-        let end = EndOfAnswers(gathered.clone());
-        move |reply: Reply| {
-            let gathered = &mut *end.0.lock().unwrap_or_else(PoisonError::into_inner);
-            if gathered.tell.is_none() {
-                return;
-            }
-            match read(&reply, &key, &metrics, &fitting) {
-                Ok(answer) => {
-                    // The asker may have gone.
-                    gathered.tell.take().and_then(|tell| tell.send(answer).ok());
+    let (tell, mut told) = mpsc::channel(MOST_ANSWERS);
+    let get = {
+        let (session, metrics, key) = (session.clone(), metrics.clone(), key.clone());
+        move || {
+            let callback = move |reply: Reply| {
+                if !tell.is_closed() {
+                    tell.try_send(read(&reply, &metrics, &fitting)).ok();
                 }
-                Err(reason) => gathered.unusable = Some(reason),
-            }
+            };
+            // All targets: the best matching one would be any peer that claims to be complete. No consolidation, which would
+            // hold answers back until every peer has answered.
+            let get = session.get(key).payload(question).timeout(timeout);
+            get.target(QueryTarget::All).consolidation(ConsolidationMode::None).callback(callback).wait()
         }
     };
-    // All, not the best matching: that would be whoever claims to be complete. None, because consolidation would hold
-    // answers back until everybody has answered.
-    let get = session.get(&key).payload(question).timeout(timeout);
-    let sent = get.target(QueryTarget::All).consolidation(ConsolidationMode::None).callback(callback).await;
-    sent.map_err(|source| AskError::Send { key: key.clone(), source })?;
-    match told.await {
-        Ok(answer) => Ok(answer),
-        Err(_) => match gathered.lock().unwrap_or_else(PoisonError::into_inner).unusable.take() {
-            Some(reason) => Err(AskError::Unusable { key, reason }),
-            None => Err(AskError::Silent { key }),
-        },
+    may_block(get).await.map_err(|error| AskError::Send { key: key.clone(), reason: error.to_string() })?;
+    let mut unusable = None;
+    // Zenoh drops the callback, and with it the channel's other end, after the last answer or the timeout.
+    while let Some(answer) = told.recv().await {
+        match answer {
+            Ok(answer) => return Ok(answer),
+            Err(reason) => unusable = Some(reason),
+        }
     }
-}
-
-/// Dropped with the callback, after the last answer or the timeout: ends the asker's wait.
-struct EndOfAnswers<A>(Arc<Mutex<Gathered<A>>>);
-
-impl<A> Drop for EndOfAnswers<A> {
-    fn drop(&mut self) {
-        self.0.lock().unwrap_or_else(PoisonError::into_inner).tell = None;
-    }
+    Err(match unusable {
+        Some(reason) => AskError::Unusable { key, reason },
+        None => AskError::Silent { key },
+    })
 }
 
 fn read<A: Message>(
     reply: &Reply,
-    key: &str,
     metrics: &Metrics,
     fitting: &impl Fn(&A) -> Result<(), &'static str>,
 ) -> Result<A, String> {
@@ -157,32 +103,61 @@ fn read<A: Message>(
             })?;
             fitting(&answer).map_err(|label| {
                 metrics.rejected(label);
-                debug!(key, label, "an answer that is not for this question");
                 format!("it is not from the learner that was asked ({label})")
             })?;
             Ok(answer)
         }
         Err(error) => {
             let text = error.payload().to_bytes();
-            let text = String::from_utf8_lossy(&text[..text.len().min(200)]).into_owned();
-            warn!(key, "the learner answered with an error: {text}");
-            Err(text)
+            Err(String::from_utf8_lossy(&text[..text.len().min(LONGEST_ERROR)]).into_owned())
         }
     }
 }
 
 #[cfg(test)]
 mod tests {
-    use quad_protocol::{Name, keys};
+    use std::time::Instant;
 
-    use super::kind;
+    use quad_protocol::JobReply;
+    use quad_service::{Endpoints, open_session, reachable_at};
 
-    #[test]
-    fn a_kind_is_what_is_asked_for_whatever_the_run() {
-        let [one, other] = ["one", "other"].map(|run| Name::new(run).unwrap());
-        let kinds =
-            |run| [keys::jobs(run), keys::scores(run), keys::weights_at(run, 7)].map(|key| kind(&key).to_owned());
-        assert_eq!(kinds(&one), ["jobs", "scores", "weights"]);
-        assert_eq!(kinds(&other), kinds(&one));
+    use super::*;
+
+    /// Longest time between two ticks of a clock in the task that awaits `work`.
+    async fn longest_pause(work: impl Future) -> Duration {
+        let (mut work, mut last, mut longest) = (std::pin::pin!(work), Instant::now(), Duration::ZERO);
+        loop {
+            let over = tokio::select! {
+                _ = &mut work => true,
+                () = tokio::time::sleep(Duration::from_millis(10)) => false,
+            };
+            longest = longest.max(last.elapsed());
+            last = Instant::now();
+            if over {
+                return longest;
+            }
+        }
+    }
+
+    #[tokio::test(flavor = "multi_thread")]
+    async fn a_peer_that_does_not_read_does_not_stop_the_task_that_asks() {
+        let listen = Endpoints { listen: vec!["tcp/127.0.0.1:0".to_owned()], ..Endpoints::default() };
+        let learner = open_session(&listen).await.unwrap();
+        // As long as this callback has not returned, the learner's session reads nothing.
+        let stalled = |_| std::thread::sleep(Duration::from_secs(10));
+        let _stalled = learner.declare_subscriber("flood").callback(stalled).await.unwrap();
+        let _jobs = learner.declare_queryable("quad/run/jobs").callback(|_| ()).await.unwrap();
+        let connect = Endpoints { connect: reachable_at(&learner, &listen).await.unwrap(), ..Endpoints::default() };
+        let evaluator = open_session(&connect).await.unwrap();
+        tokio::time::sleep(Duration::from_secs(1)).await;
+        for _ in 0..20 {
+            // More than the connection's buffers hold.
+            evaluator.put("flood", vec![0; 1 << 20]).await.unwrap();
+        }
+        let metrics = Metrics::new().unwrap();
+        let (key, timeout) = ("quad/run/jobs".to_owned(), Duration::from_secs(1));
+        let asked = ask(&evaluator, key, Vec::new(), timeout, &metrics, |_: &JobReply| Ok(()));
+        let pause = longest_pause(asked).await;
+        assert!(pause < Duration::from_millis(500), "the task stood still for {pause:?}");
     }
 }

@@ -10,13 +10,13 @@
 //!   the clipped action. The 1 is paid at every step, also at the one that ends the episode.
 //! - The episode is terminated where the robot is not healthy any more, and truncated after `max_episode_steps`.
 //!
-//! What Gymnasium leaves to chance ends the episode here, with no reward for that step: a simulation that diverged,
+//! Two cases that Gymnasium does not handle end the episode here, with no reward for that step: a simulation that diverged,
 //! and an action that is not a number (which is not applied). So a return is finite whatever the policy does.
 
 use quad_dataset::environment::EnvironmentSpec;
 
+use super::environment::{Environment, EnvironmentError, Step};
 use super::physics::{self, Noise, Physics};
-use super::{Environment, EnvironmentError, Step};
 
 /// What tells one robot from another.
 pub(super) struct Robot {

@@ -10,7 +10,7 @@ use rayon::prelude::*;
 use serde::Serialize;
 use thiserror::Error;
 
-use crate::environment::{self, Environment, EnvironmentError};
+use crate::sim::{self, Environment, EnvironmentError};
 
 /// Rewards differ when they are further apart than this, relative to 1 or to the recorded one, whichever is larger, and
 /// further than the next observation.
@@ -123,8 +123,7 @@ pub fn verify(path: &Path, spec: &'static EnvironmentSpec) -> Result<Report, Ver
     let rows = RecordedRows::read(path, spec)?;
     let threads = rayon::current_num_threads();
     let share = rows.len().div_ceil(threads);
-    let mut environments =
-        (0..threads).map(|_| environment::make(spec, 0)).collect::<Result<Vec<_>, EnvironmentError>>()?;
+    let mut environments = (0..threads).map(|_| sim::make(spec, 0)).collect::<Result<Vec<_>, EnvironmentError>>()?;
     let errors: Vec<RowError> = environments
         .par_iter_mut()
         .enumerate()

@@ -1,6 +1,6 @@
 //! Linear policies over normalised observations.
 
-/// a = M · (s - mean) / deviation, to be clipped by whoever applies it.
+/// a = M · (s - mean) / deviation. The environment clips it.
 #[derive(Clone, Debug)]
 pub struct LinearPolicy {
     /// M, action_dim × observation_dim.

@@ -14,7 +14,7 @@ use tracing::info;
 
 use super::linear::{LinearPolicy, Moments};
 use super::recipe::Recipe;
-use crate::environment::{self, Environment, EnvironmentError};
+use crate::sim::{self, Environment, EnvironmentError};
 
 /// N: directions tried in one iteration, each forwards and backwards.
 const DIRECTIONS: usize = 8;
@@ -77,7 +77,7 @@ impl Search {
         let policy = LinearPolicy::zero(spec.observation_dim, spec.action_dim);
         let trial = |_| {
             Ok(Trial {
-                environment: environment::make(spec, 0)?,
+                environment: sim::make(spec, 0)?,
                 policy: policy.clone(),
                 action: vec![0.0; spec.action_dim],
                 moments: Moments::new(spec.observation_dim),

@@ -11,7 +11,7 @@ use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 use rand_distr::{Distribution, StandardNormal};
 
-use super::{EnvironmentError, RESET_STREAM};
+use super::environment::{EnvironmentError, RESET_STREAM};
 
 /// The model of a simulation, compiled from the text that `mjcf` writes if the process does not have it yet.
 pub(super) fn model(simulation: &'static str, mjcf: impl FnOnce() -> String) -> Result<Arc<MjModel>, EnvironmentError> {
@@ -28,12 +28,12 @@ pub(super) fn model(simulation: &'static str, mjcf: impl FnOnce() -> String) -> 
     Ok(Arc::clone(models.entry(simulation).or_insert(Arc::new(model))))
 }
 
-/// MuJoCo's messages go where ours go; left alone it appends to a `MUJOCO_LOG.TXT` in the working directory.
+/// Writes MuJoCo's messages to this program's log. MuJoCo's own handler appends to `MUJOCO_LOG.TXT` in the working directory.
 fn log(message: &MjLogMessage) {
     tracing::debug!(target: "mujoco", "{}", message.subject());
 }
 
-/// What an episode's beginning differs in from the model's initial state: added to each position and velocity.
+/// Noise on the initial state: added to each position and velocity that the model begins with.
 #[derive(Clone, Copy)]
 pub(super) enum Noise {
     /// Uniform within ± this.
@@ -121,9 +121,8 @@ impl Physics {
 
     /// Holds `action` for one control period; ±1, to which it is clipped, are the ends of each motor's control range.
     ///
-    /// False when that could not be done: an action that is not a number is not applied at all; and when a simulation
-    /// diverges, MuJoCo puts its initial state in the place of the one it could not integrate, which is not to be taken
-    /// for what the task did.
+    /// False if the step failed: an action that is not a number is not applied at all; and when a simulation diverges, MuJoCo
+    /// puts the initial state in the place of the one that it could not integrate.
     #[must_use]
     pub(super) fn step(&mut self, action: &[f32]) -> bool {
         if action.iter().any(|value| value.is_nan()) {

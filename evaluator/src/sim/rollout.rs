@@ -5,7 +5,8 @@ use std::time::{Duration, Instant};
 use quad_dataset::environment::EnvironmentSpec;
 use rayon::prelude::*;
 
-use crate::environment::{self, Environment, EnvironmentError};
+use super::environment::{Environment, EnvironmentError};
+use super::simulations::make;
 
 /// A batch of episodes that advance together: one policy call and one control period per [`step`](Rollout::step).
 ///
@@ -52,7 +53,12 @@ pub struct EpisodeOutcome {
 }
 
 impl<N> Rollout<N> {
-    /// Makes one environment per seed, each with what the seed `instance` gives once for all, and resets it; `noise` makes each episode's noise out of its seed.
+    /// Makes one environment for each seed and resets it to that seed. `instance` is as in [`make`], the same for all; `noise`
+    /// makes an episode's noise out of its seed.
+    ///
+    /// # Errors
+    ///
+    /// The environment cannot be made.
     pub fn new(
         spec: &'static EnvironmentSpec,
         instance: u64,
@@ -61,7 +67,7 @@ impl<N> Rollout<N> {
     ) -> Result<Self, EnvironmentError> {
         let mut live = Vec::with_capacity(seeds.len());
         for (index, &seed) in seeds.iter().enumerate() {
-            let mut environment = environment::make(spec, instance)?;
+            let mut environment = make(spec, instance)?;
             environment.reset(seed);
             live.push(Episode { environment, index, seed, episode_return: 0.0, length: 0, ended: false });
         }
@@ -122,6 +128,12 @@ impl<N> Rollout<N> {
                 self.outcomes.push(EpisodeOutcome { index, seed, episode_return, length, score });
             }
         }
+    }
+
+    /// The environments of the episodes that have not ended.
+    #[cfg(test)]
+    pub(crate) fn environments(&self) -> impl Iterator<Item = &dyn Environment> {
+        self.live.iter().map(|episode| episode.environment.as_ref())
     }
 
     /// Whether every episode has ended.

@@ -17,8 +17,8 @@ use quad_dataset::environment::{EnvironmentSpec, Goal};
 use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 
+use super::environment::{Environment, EnvironmentError, GOAL_STREAM, Step};
 use super::physics::{self, Noise, Physics};
-use super::{Environment, EnvironmentError, GOAL_STREAM, Step};
 
 /// The ant on its floor; the walls go where it has [`WALLS`].
 const ANT: &str = include_str!("../../assets/ant.xml");
@@ -71,7 +71,7 @@ impl Maze {
         })
     }
 
-    /// The model: the ant, the floor, and a box for each wall, as high as it is half a cell.
+    /// The model: the ant, the floor, and a box for each wall, half a cell high.
     pub fn mjcf(&self) -> String {
         let walls: String =
             self.centres(b'1').map(|[x, y]| format!("<geom class=\"wall\" pos=\"{x} {y} 1\"/>\n    ")).collect();
@@ -143,6 +143,10 @@ impl Environment for AntMaze {
         self.goal.copy_from_slice(goal);
     }
 
+    fn goal(&self) -> Option<&[f64]> {
+        Some(&self.goal)
+    }
+
     fn step(&mut self, action: &[f32]) -> Step {
         self.steps += 1;
         let truncated = self.steps >= self.max_episode_steps;
@@ -170,7 +174,6 @@ impl Environment for AntMaze {
 }
 
 #[cfg(test)]
-#[allow(clippy::unwrap_used)]
 mod tests {
     use quad_dataset::environment::find;
 

@@ -7,10 +7,10 @@ use rand_distr::{Distribution, StandardNormal};
 use rayon::prelude::*;
 use tracing::info;
 
-use super::CollectError;
+use super::error::CollectError;
 use super::linear::LinearPolicy;
 use super::recipe::Recipe;
-use crate::environment::{self, Environment, EnvironmentError, Step};
+use crate::sim::{self, Environment, EnvironmentError, Step};
 
 /// Each episode adds Gaussian noise to its actions (which span ±1), of a standard deviation drawn uniformly from this
 /// range: enough to show what other actions in a state lead to, up to more than most gaits survive.
@@ -92,7 +92,7 @@ impl Recorder {
     fn new(spec: &'static EnvironmentSpec) -> Result<Self, EnvironmentError> {
         Ok(Self {
             spec,
-            environment: environment::make(spec, 0)?,
+            environment: sim::make(spec, 0)?,
             observations: Vec::new(),
             qpos: Vec::new(),
             qvel: Vec::new(),

@@ -1,9 +1,61 @@
-//! Scores as a table.
+//! What policies came to, and that as a table.
 
 use std::collections::BTreeSet;
 use std::fmt;
+use std::path::PathBuf;
 
-use super::Scored;
+use serde::Serialize;
+
+use crate::sim::EpisodeOutcome;
+
+/// What one policy came to with one number of candidates.
+#[derive(Clone, Debug, PartialEq, Serialize)]
+pub struct Scored {
+    /// The file.
+    pub snapshot: PathBuf,
+    /// BLAKE3 of the file.
+    pub weights: String,
+    /// Environment that it acted in.
+    pub environment: String,
+    /// Gradient step that it was saved after; absent if the file does not say.
+    pub step: Option<u64>,
+    /// Seed that the episodes follow from, with the step.
+    pub seed: u64,
+    /// Actions sampled per state.
+    pub candidates: u32,
+    /// Arithmetic of the networks, as in `scores.jsonl`.
+    pub precision: String,
+    /// In the order of their seeds.
+    pub episodes: Vec<Episode>,
+}
+
+/// What one episode came to.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize)]
+pub struct Episode {
+    /// Seed of its initial state and of the policy's noise.
+    pub seed: u64,
+    /// Sum of its rewards, undiscounted.
+    #[serde(rename = "return")]
+    pub episode_return: f64,
+    /// Its environment steps.
+    pub length: u32,
+    /// D4RL's normalised score.
+    pub score: f64,
+}
+
+impl Scored {
+    /// The normalised score of each episode.
+    pub fn scores(&self) -> Vec<f64> {
+        self.episodes.iter().map(|episode| episode.score).collect()
+    }
+}
+
+impl From<&EpisodeOutcome> for Episode {
+    fn from(outcome: &EpisodeOutcome) -> Self {
+        let EpisodeOutcome { seed, episode_return, length, score, .. } = *outcome;
+        Self { seed, episode_return, length, score }
+    }
+}
 
 /// Mean and sample standard deviation (n - 1) of some values.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -83,9 +135,9 @@ fn aligned(rows: &[Vec<String>]) -> String {
 
 #[cfg(test)]
 mod tests {
-    use super::*;
-    use crate::score::Episode;
     use std::path::Path;
+
+    use super::*;
 
     fn scored(snapshot: &str, candidates: u32, scores: &[f64]) -> Scored {
         let episode = |&score| Episode { seed: 1, episode_return: 0.0, length: 7, score };

@@ -1,24 +1,24 @@
 //! Records a dataset of mediocre behaviour, so that a fresh machine needs no download.
 //!
-//! For an environment's [`recipe`], [`search`] trains [`linear`] policies, and [`record`] mixes episodes of all of them, from the first to the last, into
-//! one file in D4RL's layout: something like D4RL's "medium-replay", the replay buffer of a policy that was learning.
-//! The file is a function of the number of transitions and the seed; the number of threads does not change it.
+//! As an environment's `recipe` says, `search` trains `linear` policies, and `record` mixes episodes of all of them, from the
+//! first to the last, into one file in D4RL's layout: something like D4RL's "medium-replay", the replay buffer of a policy that
+//! was learning. The file is a function of the number of transitions and the seed; the number of threads does not change it.
 
-pub mod linear;
-pub mod recipe;
-pub mod record;
-pub mod search;
+mod error;
+mod linear;
+mod recipe;
+mod record;
+mod search;
 
 use std::path::Path;
 use std::time::Instant;
 
-use quad_dataset::{D4rlWriter, DatasetError, EnvironmentSpec, Metadata};
+use quad_dataset::{D4rlWriter, EnvironmentSpec, Metadata};
 use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;
-use thiserror::Error;
 
-use self::recipe::Recipe;
-use crate::environment::EnvironmentError;
+pub use error::CollectError;
+use recipe::Recipe;
 
 /// The streams of the file's seed: one for recording, the next ones for the searches.
 const RECORD_STREAM: u64 = 0;
@@ -40,34 +40,6 @@ pub struct Summary {
     pub seconds: f64,
 }
 
-/// Why nothing was recorded.
-#[derive(Debug, Error)]
-pub enum CollectError {
-    /// The file could not be written.
-    #[error(transparent)]
-    Dataset(#[from] DatasetError),
-    /// Nothing is recorded in that environment.
-    #[error("nothing can be recorded in {environment}: linear policies learn {} alone", Recipe::environments())]
-    NoRecipe {
-        /// The environment.
-        environment: String,
-    },
-    /// The environment could not be made.
-    #[error(transparent)]
-    Environment(#[from] EnvironmentError),
-}
-
-impl CollectError {
-    /// What to do about it.
-    pub fn hint(&self) -> &'static str {
-        match self {
-            Self::NoRecipe { .. } => "`learner datasets list` names files of other environments",
-            Self::Dataset(_) => "--out names a file in a folder that you may write in",
-            Self::Environment(_) => "deploy/setup.sh installs the version of MuJoCo that this program was built for",
-        }
-    }
-}
-
 /// Trains, then records at least `transitions` transitions, in whole episodes, to `path`.
 pub fn collect(
     spec: &'static EnvironmentSpec,
@@ -76,7 +48,8 @@ pub fn collect(
     seed: u64,
 ) -> Result<Summary, CollectError> {
     let start = Instant::now();
-    let recipe = Recipe::of(spec)?;
+    let no_recipe = || CollectError::NoRecipe { environment: spec.name.clone() };
+    let recipe = Recipe::of(spec).ok_or_else(no_recipe)?;
     let mut writer = D4rlWriter::create(path, spec)?;
 
     let policies = search::train(spec, recipe, transitions, |index| stream(seed, RECORD_STREAM + 1 + index))?;

@@ -1,0 +1,300 @@
+//! Everything that is exchanged with the learner of one run: jobs, snapshots, progress, scores.
+
+use std::collections::BTreeSet;
+use std::sync::Arc;
+use std::time::{Duration, Instant};
+
+use anyhow::Context;
+use quad_protocol::{Job, JobReply, JobRequest, Name, Progress, ScoreReply, ScoreReport, Snapshot, encode, keys};
+use rand::Rng;
+use tracing::{debug, info, warn};
+use zenoh::liveliness::LivelinessToken;
+use zenoh::qos::CongestionControl;
+use zenoh::{Session, Wait};
+
+use super::discovery::Found;
+use super::query::{AskError, ask, may_block};
+use super::scheduler::Turn;
+use super::snapshot::{Listener, Snapshots, is_named_by};
+use crate::metrics::{JobOutcome, Metrics};
+
+/// A learner answers in milliseconds; one that takes this long hangs, and other runs wait behind it.
+pub const ANSWER_TIMEOUT: Duration = Duration::from_secs(5);
+/// The same for a snapshot, which has megabytes to carry over whatever network there is.
+const WEIGHTS_TIMEOUT: Duration = Duration::from_secs(30);
+/// Bounds of the pause that a learner without work may ask for, so that it gets no flood of queries and loses no evaluator.
+const PAUSE: [Duration; 2] = [Duration::from_millis(20), Duration::from_secs(60)];
+/// An evaluator that leaves tries this long to deliver its scores, and half as long to hand a job back.
+const LEAVE: Duration = Duration::from_secs(2);
+/// Scores that the learner answers with an error are then delivered again after this time.
+const AGAIN: Duration = Duration::from_millis(100);
+/// Longest reason that a learner is told, characters: it takes no large messages.
+const LONGEST_REASON: usize = 1000;
+
+/// What an evaluator owes a learner. While it owes anything, it claims nothing new.
+enum Owed {
+    /// The episodes of a job.
+    Episodes { job: u64, incarnation: u64 },
+    /// Scores that the learner has not acknowledged.
+    Scores(ScoreReport),
+}
+
+/// An evaluator's side of one run.
+pub struct RunClient {
+    run: Name,
+    evaluator: Name,
+    session: Session,
+    metrics: Metrics,
+    snapshots: Snapshots,
+    listener: Listener,
+    /// Whose answers are believed.
+    incarnation: u64,
+    /// Of the claim that has no answer yet.
+    attempt: Option<u64>,
+    owed: Option<Owed>,
+    /// When it is to be served next.
+    pub turn: Turn,
+    /// Since when its learner is gone.
+    pub gone: Option<Instant>,
+    /// What was last complained about, so that it is not said again and again.
+    complaint: String,
+    _token: LivelinessToken,
+}
+
+impl RunClient {
+    /// Subscribes to the run's snapshots and announces the evaluator in the run.
+    pub async fn attach(
+        run: Name,
+        found: &Found,
+        evaluator: Name,
+        snapshots: Snapshots,
+        metrics: Metrics,
+    ) -> anyhow::Result<RunClient> {
+        let session = found.session.clone();
+        let listener = Listener::start(&session, run.clone(), snapshots.clone(), metrics.clone()).await;
+        let listener = listener.with_context(|| format!("cannot listen to the snapshots of run {run}"))?;
+        let (declared, key) = (session.clone(), keys::live_evaluator(&run, &evaluator));
+        let token = may_block(move || declared.liveliness().declare_token(key).wait()).await;
+        let token = token.with_context(|| format!("cannot announce this evaluator in run {run}"))?;
+        let mut client = RunClient {
+            run,
+            evaluator,
+            session,
+            metrics,
+            snapshots,
+            listener,
+            incarnation: 0,
+            attempt: None,
+            owed: None,
+            turn: Turn::new(Instant::now()),
+            gone: None,
+            complaint: String::new(),
+            _token: token,
+        };
+        client.follow(&found.lives);
+        Ok(client)
+    }
+
+    /// Follows the learner that it follows already, if that is among these lives; else the one that was started first, because
+    /// of two learners of one name the later one stops.
+    pub fn follow(&mut self, lives: &BTreeSet<u64>) {
+        if self.gone.take().is_some() {
+            self.turn.wake(Instant::now());
+        }
+        if let Some(&first) = lives.first()
+            && !lives.contains(&self.incarnation)
+        {
+            self.turn_to(first);
+        }
+    }
+
+    /// Follows the next of several lives, because this one does not answer.
+    pub fn follow_next(&mut self, lives: &BTreeSet<u64>) {
+        let next = lives.range(self.incarnation.saturating_add(1)..).next().or(lives.first());
+        if let Some(&next) = next.filter(|next| **next != self.incarnation) {
+            self.turn_to(next);
+        }
+    }
+
+    fn turn_to(&mut self, incarnation: u64) {
+        debug!(run = %self.run, incarnation, "following a learner");
+        self.incarnation = incarnation;
+        self.attempt = None;
+        self.listener.follow(incarnation);
+        self.turn.wake(Instant::now());
+    }
+
+    /// Makes the run ready if its learner has published a snapshot.
+    pub fn wake_for_snapshot(&mut self) {
+        if self.listener.take_news() {
+            self.turn.nudge(Instant::now());
+        }
+    }
+
+    /// Leaves the learner alone for a while, which is longer each time. Says why, unless it is the same as the last time.
+    pub fn back_off(&mut self, error: &anyhow::Error) {
+        let complaint = format!("{error:#}");
+        match self.complaint == complaint {
+            false => warn!(run = %self.run, "{complaint}"),
+            true => debug!(run = %self.run, "{complaint}"),
+        }
+        self.complaint = complaint;
+        self.turn.failed(Instant::now());
+    }
+
+    /// Whether scores wait for an acknowledgement.
+    pub fn has_scores(&self) -> bool {
+        matches!(self.owed, Some(Owed::Scores(_)))
+    }
+
+    /// Asks for a job in one of these environments; `None` when there is none now.
+    pub async fn claim(&mut self, environments: Vec<String>) -> anyhow::Result<Option<Job>> {
+        // The same number until there is an answer: if only that was lost, the job is not.
+        let attempt = *self.attempt.get_or_insert_with(|| rand::rng().random());
+        let request = encode(&JobRequest::Claim { evaluator: self.evaluator.clone(), attempt, environments })?;
+        let (run, incarnation) = (self.run.clone(), self.incarnation);
+        let fitting = move |reply: &JobReply| match reply {
+            JobReply::Job(job) if job.run != run => Err("other_run"),
+            JobReply::HandedBack { .. } => Err("unexpected"),
+            _ => is_from(incarnation, reply.incarnation()),
+        };
+        let key = keys::jobs(&self.run);
+        let answer = ask(&self.session, key, request, ANSWER_TIMEOUT, &self.metrics, fitting).await?;
+        self.attempt = None;
+        match answer {
+            JobReply::Job(job) => {
+                self.owed = Some(Owed::Episodes { job: job.id, incarnation: job.incarnation });
+                Ok(Some(job))
+            }
+            JobReply::Wait { milliseconds, .. } => {
+                self.complaint.clear();
+                let pause = Duration::from_millis(milliseconds).clamp(PAUSE[0], PAUSE[1]);
+                // Evaluators that a snapshot has woken together do not come back together.
+                self.turn.done(Instant::now(), pause.mul_f64(rand::random_range(0.5..1.0)));
+                Ok(None)
+            }
+            JobReply::HandedBack { .. } => Ok(None),
+        }
+    }
+
+    /// The snapshot that `job` names: as it was published, or asked for if that was missed.
+    pub async fn snapshot(&self, job: &Job) -> anyhow::Result<Arc<Snapshot>> {
+        if let Some(snapshot) = self.snapshots.get(job) {
+            return Ok(snapshot);
+        }
+        let (key, wanted) = (keys::weights_at(&self.run, job.step), job.clone());
+        let fitting = move |found: &Snapshot| is_named_by(&wanted, found).then_some(()).ok_or("other_snapshot");
+        let snapshot: Snapshot = ask(&self.session, key, Vec::new(), WEIGHTS_TIMEOUT, &self.metrics, fitting).await?;
+        self.metrics.snapshots_received.inc();
+        Ok(Arc::new(snapshot))
+    }
+
+    /// Tells the learner how far `job` is. A message that is lost does not matter: the next one says the same and more. So
+    /// Zenoh drops it when the connection takes nothing, and this call does not wait.
+    pub fn tell(&self, job: &Job, steps_done: u64, episodes_done: u32) {
+        let progress = Progress {
+            steps_done,
+            episodes_done,
+            environment_steps: self.metrics.environment_steps.get(),
+            episodes: self.metrics.episodes.get(),
+            ..Progress::of(job, self.evaluator.clone())
+        };
+        let Ok(message) = encode(&progress) else { return };
+        let put = self.session.put(keys::progress(&self.run, &self.evaluator), message);
+        if let Err(error) = put.congestion_control(CongestionControl::Drop).wait() {
+            debug!(run = %self.run, "cannot publish progress: {error}");
+        }
+    }
+
+    /// Takes the scores of the job that was claimed, to deliver them.
+    pub fn keep(&mut self, report: ScoreReport) {
+        self.owed = Some(Owed::Scores(report));
+    }
+
+    /// Delivers the scores that are kept, to the life of the learner that is followed now. After an error they are still kept.
+    pub async fn deliver(&mut self, timeout: Duration) -> anyhow::Result<()> {
+        let Some(Owed::Scores(report)) = &self.owed else { return Ok(()) };
+        let incarnation = self.incarnation;
+        let fitting = move |reply: &ScoreReply| is_from(incarnation, reply.incarnation());
+        let key = keys::scores(&self.run);
+        let answer = ask(&self.session, key, encode(report)?, timeout, &self.metrics, fitting).await?;
+        let (run, step) = (&self.run, report.step);
+        match answer {
+            ScoreReply::Recorded { new, duplicates, .. } => {
+                let scores = report.episodes.iter().map(|episode| episode.score);
+                let mean = scores.clone().sum::<f64>() / report.episodes.len().max(1) as f64;
+                info!(%run, step, new, duplicates, "scores delivered, mean {mean:.2}");
+                scores.for_each(|score| self.metrics.episode_score.observe(score));
+                self.metrics.job(JobOutcome::Scored);
+            }
+            ScoreReply::Refused { reason, .. } => {
+                warn!(%run, step, "the learner refused the scores: {reason}");
+                self.metrics.job(JobOutcome::Abandoned);
+            }
+        }
+        self.owed = None;
+        self.complaint.clear();
+        self.turn.done(Instant::now(), Duration::ZERO);
+        Ok(())
+    }
+
+    /// Hands back the job that was claimed, which could not be done.
+    pub async fn fail(&mut self, reason: &str) {
+        self.metrics.job(JobOutcome::Failed);
+        self.hand_back(Some(reason.chars().take(LONGEST_REASON).collect())).await;
+    }
+
+    /// Settles what is owed before this evaluator ends: delivers the scores, or hands the job back, as well as it can.
+    pub async fn leave(mut self) {
+        let until = Instant::now() + LEAVE;
+        let mut answered = false;
+        while self.has_scores() {
+            let Err(error) = self.deliver(LEAVE / 2).await else { return };
+            info!(run = %self.run, "scores are not acknowledged: {error:#}");
+            // A learner that answers has the scores, and may still save them: if it could not yet, it says why. If the job went
+            // back now, other evaluators would measure it again.
+            let unusable = matches!(error.downcast_ref(), Some(AskError::Unusable { .. }));
+            answered |= unusable;
+            if !unusable || Instant::now() + AGAIN > until {
+                break;
+            }
+            tokio::time::sleep(AGAIN).await;
+        }
+        if !answered {
+            self.hand_back(None).await;
+        }
+    }
+
+    async fn hand_back(&mut self, failed: Option<String>) {
+        let (id, incarnation) = match self.owed.take() {
+            Some(Owed::Episodes { job, incarnation }) => (job, incarnation),
+            Some(Owed::Scores(report)) => (report.job, report.incarnation),
+            None => return,
+        };
+        let fitting = move |reply: &JobReply| match reply {
+            JobReply::HandedBack { incarnation: of, .. } => is_from(incarnation, *of),
+            _ => Err("unexpected"),
+        };
+        let request = JobRequest::HandBack { evaluator: self.evaluator.clone(), job: id, failed };
+        let Ok(request) = encode(&request) else { return };
+        let (run, key) = (&self.run, keys::jobs(&self.run));
+        match ask(&self.session, key, request, LEAVE / 2, &self.metrics, fitting).await {
+            Ok(JobReply::HandedBack { accepted: true, .. }) => info!(%run, "a job was handed back"),
+            other => debug!(%run, ?other, "a job was not taken back"),
+        }
+    }
+
+    /// Stops serving the run; scores that were not acknowledged are lost.
+    pub fn give_up(self) {
+        self.snapshots.forget(&self.run);
+        if let Some(Owed::Scores(report)) = &self.owed {
+            warn!(run = %self.run, step = report.step, "the learner did not come back for its scores");
+            self.metrics.job(JobOutcome::Abandoned);
+        }
+    }
+}
+
+/// Whether a reply is from the learner that is followed; if not, the metric's label of that.
+fn is_from(followed: u64, incarnation: u64) -> Result<(), &'static str> {
+    if incarnation == followed { Ok(()) } else { Err("other_incarnation") }
+}

@@ -1,0 +1,182 @@
+//! Evaluates jobs, one at a time: loads the policy that a job names, runs its episodes, tells the learner how far they are.
+
+use std::sync::Arc;
+use std::time::Duration;
+
+use quad_dataset::EnvironmentSpec;
+use quad_policy::{Policy, Precision};
+use quad_protocol::{EpisodeScore, Hash, Job, Name, ScoreReport};
+use quad_service::Beat;
+use tracing::info;
+
+use super::client::RunClient;
+use super::job::{self, Running};
+use super::policy::load;
+use crate::metrics::Metrics;
+
+/// Bounds of the time between two reports of progress that a learner may ask for.
+const HEARTBEAT: [Duration; 2] = [Duration::from_millis(50), Duration::from_secs(20)];
+
+/// What evaluates jobs.
+pub struct Evaluator {
+    /// Its name in every run.
+    pub name: Name,
+    precision: Precision,
+    metrics: Metrics,
+    /// The policy of the last job, by its weights and its environment: the next job is often about the same.
+    policy: Option<(Hash, &'static str, Arc<dyn Policy>)>,
+    /// Says that it is not stuck.
+    pub beat: Beat,
+}
+
+impl Evaluator {
+    /// An evaluator that computes policies in `precision`.
+    pub fn new(name: Name, precision: Precision, metrics: Metrics, beat: Beat) -> Evaluator {
+        Evaluator { name, precision, metrics, policy: None, beat }
+    }
+
+    /// Runs all episodes of `job`, which the learner of `client` has given out, on one snapshot.
+    pub async fn evaluate(&mut self, job: &Job, client: &RunClient) -> anyhow::Result<ScoreReport> {
+        let metrics = self.metrics.clone();
+        let spec = job::check(job).inspect_err(|error| metrics.rejected(error.label()))?;
+        let policy = {
+            // The learner grants some time for this, as long as it hears that the evaluator is at it.
+            client.tell(job, 0, 0);
+            let mut loading = std::pin::pin!(self.policy(job, spec, client));
+            loop {
+                tokio::select! {
+                    policy = &mut loading => break policy?,
+                    () = tokio::time::sleep(heartbeat(job)) => client.tell(job, 0, 0),
+                }
+            }
+        };
+        job::check_memory(job, policy.as_ref()).inspect_err(|error| metrics.rejected(error.label()))?;
+        info!(run = %job.run, step = job.step, episodes = job.seeds.len(), "evaluating");
+        let episodes = self.roll_out(job, spec, policy, |steps, episodes| client.tell(job, steps, episodes)).await?;
+        Ok(ScoreReport::of(job, self.name.clone(), Name::new(self.precision.arithmetic())?, episodes))
+    }
+
+    /// The policy that `job` names, from the last job or from a snapshot.
+    async fn policy(
+        &mut self,
+        job: &Job,
+        spec: &'static EnvironmentSpec,
+        client: &RunClient,
+    ) -> anyhow::Result<Arc<dyn Policy>> {
+        let name = spec.name.as_str();
+        if let Some((.., policy)) = self.policy.as_ref().filter(|last| (last.0, last.1) == (job.weights, name)) {
+            return Ok(policy.clone());
+        }
+        // Freed before the next one is built: an evaluator holds one policy.
+        self.policy = None;
+        let (snapshot, precision) = (client.snapshot(job).await?, self.precision);
+        let loaded = tokio::task::spawn_blocking(move || load(&snapshot, spec, precision)).await?;
+        let policy: Arc<dyn Policy> = loaded.inspect_err(|error| self.metrics.rejected(error.label()))?.into();
+        self.policy = Some((job.weights, name, policy.clone()));
+        Ok(policy)
+    }
+
+    /// Runs the episodes, and tells of progress as long as there is any: the job of a stuck simulation goes to another
+    /// evaluator.
+    async fn roll_out(
+        &self,
+        job: &Job,
+        spec: &'static EnvironmentSpec,
+        policy: Arc<dyn Policy>,
+        tell: impl Fn(u64, u32),
+    ) -> anyhow::Result<Vec<EpisodeScore>> {
+        let mut running = Running::start(job, spec, policy, self.metrics.clone());
+        let mut told = 0;
+        loop {
+            if let Some(episodes) = running.finished_within(heartbeat(job)).await {
+                return episodes;
+            }
+            let steps = running.steps_done();
+            if steps > told {
+                self.beat.alive();
+            }
+            // That no step is done yet is told, too: the first step of a large policy takes its time.
+            if steps > told || steps == 0 {
+                told = steps;
+                tell(steps, running.episodes_done());
+            }
+        }
+    }
+}
+
+fn heartbeat(job: &Job) -> Duration {
+    Duration::from_millis(job.progress_milliseconds).clamp(HEARTBEAT[0], HEARTBEAT[1])
+}
+
+#[cfg(test)]
+mod tests {
+    use std::sync::atomic::{AtomicU32, Ordering::Relaxed};
+
+    use quad_policy::{ActionNoise, Cost, PolicyError};
+    use quad_service::Health;
+
+    use super::super::fixtures::job;
+    use super::*;
+
+    const LIMIT: Duration = Duration::from_secs(1);
+
+    /// Acts slowly, and once very slowly.
+    struct Sleeper {
+        stuck_at: u32,
+        calls: AtomicU32,
+    }
+
+    impl Policy for Sleeper {
+        fn kind(&self) -> &'static str {
+            "sleeper"
+        }
+
+        fn observation_dim(&self) -> usize {
+            11
+        }
+
+        fn action_dim(&self) -> usize {
+            3
+        }
+
+        fn samples_candidates(&self) -> bool {
+            false
+        }
+
+        fn cost(&self, _: usize, _: usize) -> Cost {
+            Cost { bytes: 0, products: 0 }
+        }
+
+        fn act(&self, _: &[f32], _: usize, _: &mut [ActionNoise], actions: &mut [f32]) -> Result<(), PolicyError> {
+            let stuck = self.calls.fetch_add(1, Relaxed) == self.stuck_at;
+            std::thread::sleep(if stuck { 4 * LIMIT } else { LIMIT / 60 });
+            actions.fill(0.0);
+            Ok(())
+        }
+    }
+
+    #[tokio::test(flavor = "multi_thread")]
+    async fn a_long_job_is_well_and_a_stuck_one_is_not() {
+        let job = job();
+        for (stuck_at, expected) in [(u32::MAX, false), (3, true)] {
+            let health = Health::default();
+            let (name, metrics) = (Name::new("evaluator").unwrap(), Metrics::new().unwrap());
+            let evaluator = Evaluator::new(name, Precision::F32, metrics, health.part("worker", LIMIT));
+            let policy = Arc::new(Sleeper { stuck_at, calls: AtomicU32::new(0) });
+            let spec = super::job::check(&job).unwrap();
+            let mut work = std::pin::pin!(evaluator.roll_out(&job, spec, policy, |_, _| ()));
+            let (begin, mut was_stuck) = (std::time::Instant::now(), false);
+            loop {
+                tokio::select! {
+                    scores = &mut work => {
+                        assert_eq!(scores.unwrap().len(), 2);
+                        break;
+                    }
+                    () = tokio::time::sleep(LIMIT / 20) => was_stuck |= !health.problems().is_empty(),
+                }
+            }
+            assert!(begin.elapsed() > LIMIT, "the job took longer than the limit");
+            assert_eq!(was_stuck, expected, "stuck at {stuck_at}");
+        }
+    }
+}

@@ -1,0 +1,178 @@
+//! Snapshots: each that a learner publishes is decoded and verified once, when it comes, and the newest are kept.
+
+use std::collections::VecDeque;
+use std::sync::atomic::{AtomicBool, AtomicU64, Ordering::Relaxed};
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+
+use quad_protocol::{Job, Name, Snapshot, decode_from, keys};
+use tokio::sync::Notify;
+use tracing::{debug, warn};
+use zenoh::pubsub::Subscriber;
+use zenoh::sample::Sample;
+use zenoh::{Session, Wait};
+
+use super::query::may_block;
+use crate::metrics::Metrics;
+
+/// Most memory for the snapshots that are kept, of all runs together, bytes; the largest that there may be fits.
+const MOST_BYTES: usize = 256 << 20;
+
+/// Whether `snapshot` is exactly the one that `job` names. Its hash was verified when it was decoded.
+pub fn is_named_by(job: &Job, snapshot: &Snapshot) -> bool {
+    let named = (&job.run, job.incarnation, job.step, job.weights);
+    named == (&snapshot.run, snapshot.incarnation, snapshot.step, snapshot.hash)
+}
+
+/// The newest snapshot of each run, as far as there is memory. Clones share them.
+#[derive(Clone, Default)]
+pub struct Snapshots {
+    /// In the order in which they came.
+    kept: Arc<Mutex<VecDeque<Arc<Snapshot>>>>,
+    arrived: Arc<Notify>,
+}
+
+impl Snapshots {
+    /// Keeps a snapshot in place of the run's last one. Where memory is short, those go that came first.
+    fn keep(&self, snapshot: Snapshot) {
+        self.forget(&snapshot.run);
+        let mut kept = self.lock();
+        kept.push_back(Arc::new(snapshot));
+        while kept.iter().map(|snapshot| snapshot.tensors.len()).sum::<usize>() > MOST_BYTES {
+            kept.pop_front();
+        }
+        drop(kept);
+        self.arrived.notify_one();
+    }
+
+    /// Frees what is kept of a run.
+    pub fn forget(&self, run: &Name) {
+        self.lock().retain(|snapshot| snapshot.run != *run);
+    }
+
+    /// The snapshot that `job` names, if it is kept.
+    pub fn get(&self, job: &Job) -> Option<Arc<Snapshot>> {
+        self.lock().iter().find(|snapshot| is_named_by(job, snapshot)).cloned()
+    }
+
+    /// Waits for the next snapshot of any run.
+    pub async fn arrival(&self) {
+        self.arrived.notified().await;
+    }
+
+    fn lock(&self) -> MutexGuard<'_, VecDeque<Arc<Snapshot>>> {
+        self.kept.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+}
+
+/// Listens to what the learner of one run publishes, for as long as it lives.
+pub struct Listener {
+    state: Arc<State>,
+    _subscriber: Subscriber<()>,
+}
+
+#[derive(Default)]
+struct State {
+    /// Whose snapshots are kept.
+    incarnation: AtomicU64,
+    has_news: AtomicBool,
+    /// One bad snapshot is a line in the log; all are counted.
+    warned: AtomicBool,
+}
+
+impl Listener {
+    /// Listens to `quad/<run>/weights` and puts into `snapshots` what the [followed](Self::follow) learner publishes.
+    ///
+    /// Zenoh's thread that receives also decodes and verifies: that takes milliseconds, in which no other message comes in.
+    pub async fn start(
+        session: &Session,
+        run: Name,
+        snapshots: Snapshots,
+        metrics: Metrics,
+    ) -> anyhow::Result<Listener> {
+        let state = Arc::new(State::default());
+        let (session, key, shared) = (session.clone(), keys::weights(&run), state.clone());
+        let callback = move |sample: Sample| match read(&sample, &run, &shared) {
+            Ok(snapshot) => {
+                metrics.snapshots_received.inc();
+                debug!(%run, step = snapshot.step, "weights arrived");
+                shared.has_news.store(true, Relaxed);
+                snapshots.keep(snapshot);
+            }
+            Err((label, problem)) => {
+                metrics.rejected(label);
+                match shared.warned.swap(true, Relaxed) {
+                    false => {
+                        warn!(%run, "ignored what was published as weights (the next such will only be counted): {problem}");
+                    }
+                    true => debug!(%run, "ignored what was published as weights: {problem}"),
+                }
+            }
+        };
+        let declare = move || session.declare_subscriber(key).callback(callback).wait();
+        Ok(Listener { state, _subscriber: may_block(declare).await? })
+    }
+
+    /// From now on keeps only what this incarnation of the learner publishes.
+    pub fn follow(&self, incarnation: u64) {
+        self.state.incarnation.store(incarnation, Relaxed);
+    }
+
+    /// Whether a snapshot has come since the last call.
+    pub fn take_news(&self) -> bool {
+        self.state.has_news.swap(false, Relaxed)
+    }
+}
+
+/// A snapshot of the learner that is followed; or the metric's label of what is wrong with it, and that in words.
+fn read(sample: &Sample, run: &Name, state: &State) -> Result<Snapshot, (&'static str, String)> {
+    let payload = sample.payload();
+    let snapshot: Snapshot =
+        decode_from(payload.len(), payload.reader()).map_err(|error| (error.label(), error.to_string()))?;
+    if snapshot.run != *run {
+        return Err(("other_run", format!("it is of run {}", snapshot.run)));
+    }
+    if snapshot.incarnation != state.incarnation.load(Relaxed) {
+        return Err(("other_incarnation", "it is from another learner than the one that is followed".to_owned()));
+    }
+    Ok(snapshot)
+}
+
+#[cfg(test)]
+mod tests {
+    use quad_protocol::Hash;
+
+    use super::super::fixtures::{job, snapshot};
+    use super::*;
+
+    #[test]
+    fn the_newest_of_each_run_is_kept_as_long_as_there_is_memory() {
+        let snapshots = Snapshots::default();
+        let keep = |run: &str, step, bytes| {
+            let run = Name::new(run).unwrap();
+            snapshots.keep(Snapshot { run, step, tensors: vec![0; bytes], ..snapshot(Vec::new()) });
+            snapshots.lock().iter().map(|snapshot| snapshot.step).collect::<Vec<u64>>()
+        };
+        assert_eq!(keep("one", 1, MOST_BYTES / 3), [1]);
+        assert_eq!(keep("other", 2, MOST_BYTES / 3), [1, 2]);
+        assert_eq!(keep("one", 3, MOST_BYTES / 3), [2, 3], "it takes the place of the one before");
+        assert_eq!(keep("large", 4, MOST_BYTES / 2), [3, 4], "the one that came first makes room");
+        snapshots.forget(&Name::new("one").unwrap());
+        assert_eq!(keep("large", 5, 0), [5]);
+    }
+
+    #[test]
+    fn a_job_gets_exactly_the_snapshot_that_it_names() {
+        let snapshots = Snapshots::default();
+        snapshots.keep(snapshot(b"tensors".to_vec()));
+        let job = Job { weights: Hash::of(b"tensors"), ..job() };
+        assert!(snapshots.get(&job).is_some());
+        for other in [
+            Job { run: Name::new("other").unwrap(), ..job.clone() },
+            Job { incarnation: 2, ..job.clone() },
+            Job { step: 8, ..job.clone() },
+            Job { weights: Hash::of(b"others"), ..job.clone() },
+        ] {
+            assert!(snapshots.get(&other).is_none(), "{other:?}");
+        }
+    }
+}

@@ -1,0 +1,25 @@
+//! Simulation: the tasks that a policy acts in, and whole batches of their episodes.
+//!
+//! Owns the compiled MuJoCo models, which the process shares. Everything runs on the calling thread; a rollout shares the
+//! physics among rayon's threads. `serve` and `tools` call it; it calls neither, and knows nothing of the network.
+//!
+//! # Layout
+//!
+//! In reading order:
+//!
+//! - `environment`: what an environment is, whatever moves it.
+//! - `locomotion` (Hopper, HalfCheetah, Walker2d), `antmaze`: the tasks, with the rules that D4RL's scores are defined by;
+//!   `physics`: drives MuJoCo for them.
+//! - `simulations`: makes an environment by its name in the dataset crate's table.
+//! - `rollout`: many episodes as one batch, one policy call for each step.
+
+mod antmaze;
+mod environment;
+mod locomotion;
+mod physics;
+mod rollout;
+mod simulations;
+
+pub use environment::{Environment, EnvironmentError, Step};
+pub use rollout::{EpisodeOutcome, Rollout};
+pub use simulations::{make, mjcf, simulated};

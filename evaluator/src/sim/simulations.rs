@@ -1,0 +1,81 @@
+//! Makes environments by their names in the dataset crate's table
+//! ([`EnvironmentSpec`](quad_dataset::environment::EnvironmentSpec)), which has a task's sizes, time limit and score references.
+
+use quad_dataset::environment::{self, EnvironmentSpec};
+
+use super::antmaze::{AntMaze, MAZES, Maze};
+use super::environment::{Environment, EnvironmentError};
+use super::locomotion::{Locomotion, ROBOTS, Robot};
+
+/// How an environment moves.
+enum Simulation {
+    Locomotion(&'static Robot),
+    AntMaze(&'static Maze),
+}
+
+impl Simulation {
+    fn of(spec: &EnvironmentSpec) -> Result<Self, EnvironmentError> {
+        let name = spec.simulation();
+        let robot = ROBOTS.iter().find(|robot| robot.name == name).map(Self::Locomotion);
+        let maze = MAZES.iter().find(|maze| maze.name == name).map(Self::AntMaze);
+        robot.or(maze).ok_or_else(|| EnvironmentError::NotSimulated(name.to_owned()))
+    }
+}
+
+/// The environments of the table that [`make`] makes.
+pub fn simulated() -> impl Iterator<Item = &'static EnvironmentSpec> {
+    environment::all().iter().filter(|spec| Simulation::of(spec).is_ok())
+}
+
+/// Makes an environment. Those of one simulation share one compiled model, so the second costs little.
+///
+/// `instance` is the seed of what the environment draws once and keeps over all episodes, if there is any such thing.
+///
+/// # Errors
+///
+/// There is no simulation of the environment, or MuJoCo fails.
+pub fn make(spec: &EnvironmentSpec, instance: u64) -> Result<Box<dyn Environment>, EnvironmentError> {
+    Ok(match Simulation::of(spec)? {
+        Simulation::Locomotion(robot) => Box::new(Locomotion::new(robot, spec)?),
+        Simulation::AntMaze(maze) => Box::new(AntMaze::new(maze, spec, instance)?),
+    })
+}
+
+/// The MJCF text that an environment's model is compiled from.
+///
+/// # Errors
+///
+/// There is no simulation of the environment.
+pub fn mjcf(spec: &EnvironmentSpec) -> Result<String, EnvironmentError> {
+    Ok(match Simulation::of(spec)? {
+        Simulation::Locomotion(robot) => robot.mjcf.to_owned(),
+        Simulation::AntMaze(maze) => maze.mjcf(),
+    })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn every_environment_of_the_table_is_simulated() {
+        let names: Vec<&str> = simulated().map(|spec| spec.name.as_str()).collect();
+        assert_eq!(names, environment::names());
+        for spec in simulated() {
+            let environment = make(spec, 0).unwrap();
+            let sizes = (environment.observation().len(), environment.qpos().len(), environment.qvel().len());
+            assert_eq!(sizes, (spec.observation_dim, spec.qpos_dim, spec.qvel_dim), "{}", spec.name);
+        }
+    }
+
+    #[test]
+    fn an_environment_without_simulation_is_refused() {
+        let spec: EnvironmentSpec = serde_json::from_value(serde_json::json!({
+            "name": "cartpole", "observation_dim": 4, "action_dim": 1, "qpos_dim": 2, "qvel_dim": 2,
+            "max_episode_steps": 200, "reference_returns": [0.0, 1.0], "reward": "locomotion",
+        }))
+        .unwrap();
+        let error = make(&spec, 0).err().unwrap();
+        assert!(matches!(&error, EnvironmentError::NotSimulated(name) if name == "cartpole"), "{error}");
+    }
+}

@@ -1,0 +1,70 @@
+//! `evaluator score`: scores saved policies, on this machine alone.
+//!
+//! `args`: what is asked for; `subject`: a policy, and which episodes are its own; `results`: what they came to, as a table.
+
+mod args;
+mod results;
+mod subject;
+
+use anyhow::Context;
+use quad_policy::{ActionNoise, Precision};
+use quad_protocol::episode_seeds;
+use rayon::prelude::*;
+use tracing::{info, warn};
+
+use crate::sim::{EpisodeOutcome, Rollout};
+pub(crate) use args::ScoreArgs;
+use results::{Episode, Scored, Spread, table};
+use subject::Subject;
+
+/// Episodes in a batch. It bounds memory; a larger batch is hardly faster.
+const BATCH: usize = 16;
+
+/// Scores what the command line names; gives what is to be printed.
+///
+/// # Errors
+/// A file that is no policy of an environment that can be simulated here; nothing is scored then. Or a policy that cannot
+/// act.
+pub(crate) fn score(args: &ScoreArgs) -> anyhow::Result<String> {
+    if args.precision.is_some_and(|wanted| !wanted.is_available()) {
+        warn!("{}", Precision::UNAVAILABLE);
+    }
+    let subjects =
+        args.snapshots.iter().map(|path| Subject::read(path, args)).collect::<anyhow::Result<Vec<Subject>>>()?;
+    let tasks: Vec<(&Subject, u32)> = subjects
+        .iter()
+        .flat_map(|subject| subject.candidates.iter().map(move |&candidates| (subject, candidates)))
+        .collect();
+    info!("scoring {} policies", subjects.len());
+    let scored = tasks.into_par_iter().with_max_len(1).map(|(subject, candidates)| measure(subject, candidates));
+    let scored = scored.collect::<anyhow::Result<Vec<Scored>>>()?;
+    Ok(if args.json { serde_json::to_string(&scored)? } else { table(&scored) })
+}
+
+/// Runs a policy's episodes. What one comes to depends on neither the batch it is in nor the number of threads.
+fn measure(subject: &Subject, candidates: u32) -> anyhow::Result<Scored> {
+    let Subject { path, weights, spec, seed, step, episodes, precision, policy, .. } = subject;
+    let batch = |seeds: &[u64]| -> anyhow::Result<Vec<EpisodeOutcome>> {
+        let mut rollout = Rollout::new(spec, *seed, seeds, ActionNoise::new)?;
+        while !rollout.is_done() {
+            rollout
+                .step(|observations, noise, actions| policy.act(observations, candidates as usize, noise, actions))
+                .with_context(|| format!("{}: the policy cannot act", path.display()))?;
+        }
+        Ok(rollout.into_outcomes())
+    };
+    let seeds = episode_seeds(*seed, step.unwrap_or_default(), *episodes);
+    let batches = seeds.par_chunks(BATCH).with_max_len(1).map(batch).collect::<anyhow::Result<Vec<_>>>()?;
+    let scored = Scored {
+        snapshot: path.clone(),
+        weights: weights.to_string(),
+        environment: spec.name.clone(),
+        step: *step,
+        seed: *seed,
+        candidates,
+        precision: precision.arithmetic(),
+        episodes: batches.iter().flatten().map(Episode::from).collect(),
+    };
+    info!("{}, {candidates} candidates: {}", path.display(), Spread::of(&scored.scores()));
+    Ok(scored)
+}

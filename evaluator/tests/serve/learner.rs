@@ -1,0 +1,202 @@
+//! A learner that has one job and writes down what an evaluator says; and the evaluator's process.
+
+use std::process::{Child, Command, ExitStatus};
+use std::sync::{Arc, Mutex};
+use std::time::{Duration, Instant};
+
+use candle_core::Device;
+use quad_policy::{Description, DiffusionPolicy, DiffusionShape, Ensemble, Layout, NoisePredictor, Precision, Weights};
+use quad_protocol::{
+    Hash, Job, JobReply, JobRequest, Message, Name, Schema, ScoreReply, ScoreReport, Snapshot, decode, encode, keys,
+};
+use quad_service::{Endpoints, open_session, reachable_at};
+use rand::SeedableRng;
+use rand_chacha::ChaCha8Rng;
+use zenoh::query::Query;
+use zenoh::{Session, Wait};
+
+const PATIENCE: Duration = Duration::from_secs(60);
+const INCARNATION: u64 = 7;
+
+/// What an evaluator has said.
+#[derive(Clone, Debug, PartialEq)]
+pub enum Heard {
+    Claim,
+    Weights,
+    Progress,
+    Scores(ScoreReport),
+    HandedBack(Option<String>),
+}
+
+/// What becomes of scores.
+#[derive(Clone, Copy)]
+pub enum Answer {
+    Recorded,
+    DiskFull,
+    Nothing,
+}
+
+/// A learner that has one job.
+pub struct Learner {
+    pub session: Session,
+    endpoint: String,
+    pub heard: Arc<Mutex<Vec<Heard>>>,
+    answer: Arc<Mutex<Answer>>,
+    /// Given out until it is done or handed back.
+    job: Arc<Mutex<Option<Job>>>,
+    pub snapshot: Snapshot,
+}
+
+/// A small diffusion policy for Hopper with random weights.
+pub fn tensors() -> Vec<u8> {
+    let shape = DiffusionShape { observation_dim: 11, action_dim: 3, hidden: 8, critics: 2, diffusion_steps: 5 };
+    let mut generator = ChaCha8Rng::seed_from_u64(0);
+    let mut weights = |layout: Layout| {
+        let values = Weights::initial(&layout, &mut generator, &Device::Cpu).unwrap();
+        Weights::constant(layout, values)
+    };
+    let actor = NoisePredictor::new(shape.actor(), weights(shape.actor().layout()), Precision::F32);
+    let critics = Ensemble::new(shape.critics(), weights(shape.critics().layout()), Precision::F32);
+    let tensors = DiffusionPolicy::tensors(&actor, &critics).unwrap();
+    Description::Diffusion(shape).to_safetensors(&tensors).unwrap()
+}
+
+pub fn name(text: &str) -> Name {
+    Name::new(text).unwrap()
+}
+
+pub fn snapshot(tensors: Vec<u8>) -> Snapshot {
+    let schema =
+        Schema { environment: "hopper".to_owned(), observation_dim: 11, action_dim: 3, policy: "diffusion".to_owned() };
+    Snapshot { run: name("run"), incarnation: INCARNATION, step: 10, schema, hash: Hash::of(&tensors), tensors }
+}
+
+pub fn job(snapshot: &Snapshot) -> Job {
+    Job {
+        id: 1,
+        run: name("run"),
+        incarnation: INCARNATION,
+        step: 10,
+        weights: snapshot.hash,
+        environment: "hopper".to_owned(),
+        instance: 1,
+        seeds: vec![11, 12, 13],
+        candidates: 2,
+        progress_milliseconds: 100,
+    }
+}
+
+fn reply<M: Message>(query: &Query, message: &M) {
+    query.reply(query.key_expr().clone(), encode(message).unwrap()).wait().unwrap();
+}
+
+impl Learner {
+    pub async fn start(snapshot: Snapshot) -> Learner {
+        let listen = Endpoints { listen: vec!["tcp/127.0.0.1:0".to_owned()], ..Endpoints::default() };
+        let session = open_session(&listen).await.unwrap();
+        let endpoint = reachable_at(&session, &listen).await.unwrap().remove(0);
+        let (heard, answer) = (Arc::new(Mutex::new(Vec::new())), Arc::new(Mutex::new(Answer::Recorded)));
+        let learner = Learner { session, endpoint, heard, answer, job: Arc::default(), snapshot };
+        let (heard, job, answer, weights) =
+            (learner.heard.clone(), learner.job.clone(), learner.answer.clone(), learner.snapshot.clone());
+        let callback = move |query: Query| {
+            let message = query.payload().map(|payload| payload.to_bytes().into_owned()).unwrap_or_default();
+            let key = query.key_expr().as_str().to_owned();
+            let mut heard = heard.lock().unwrap();
+            if key == keys::weights_at(&name("run"), 10) {
+                heard.push(Heard::Weights);
+                reply(&query, &snapshot(b"other tensors".to_vec()));
+                reply(&query, &weights);
+            } else if key == keys::scores(&name("run")) {
+                let report: ScoreReport = decode(&message).unwrap();
+                let new = report.episodes.len() as u32;
+                heard.push(Heard::Scores(report));
+                *job.lock().unwrap() = None;
+                match *answer.lock().unwrap() {
+                    Answer::Recorded => {
+                        reply(&query, &ScoreReply::Recorded { incarnation: INCARNATION, new, duplicates: 0 });
+                    }
+                    Answer::DiskFull => query.reply_err("No space left on device").wait().unwrap(),
+                    Answer::Nothing => {}
+                }
+            } else if let JobRequest::HandBack { failed, .. } = decode(&message).unwrap() {
+                heard.push(Heard::HandedBack(failed));
+                *job.lock().unwrap() = None;
+                reply(&query, &JobReply::HandedBack { incarnation: INCARNATION, accepted: true });
+            } else {
+                heard.push(Heard::Claim);
+                let job = job.lock().unwrap().clone().map(JobReply::Job);
+                reply(&query, &job.unwrap_or(JobReply::Wait { incarnation: INCARNATION, milliseconds: 100 }));
+            }
+        };
+        let (told, progress) = (learner.heard.clone(), keys::all_progress(&name("run")));
+        learner.session.declare_queryable("quad/run/**").callback(callback).background().await.unwrap();
+        let told = move |_| told.lock().unwrap().push(Heard::Progress);
+        learner.session.declare_subscriber(progress).callback(told).background().await.unwrap();
+        learner
+    }
+
+    pub fn answer(&self, answer: Answer) {
+        *self.answer.lock().unwrap() = answer;
+    }
+
+    pub fn give(&self, job: Job) {
+        *self.job.lock().unwrap() = Some(job);
+    }
+
+    /// Starts an evaluator and announces the learner; with it, one that is dead and was started before.
+    pub async fn evaluator(&self) -> (Evaluator, impl Sized + use<>) {
+        let mut command = Command::new(env!("CARGO_BIN_EXE_evaluator"));
+        command.args(["serve", "--name", "one", "--precision", "f32", "--connect", &self.endpoint]);
+        let child = command.spawn().unwrap();
+        let token =
+            |incarnation| self.session.liveliness().declare_token(keys::live_learner(&name("run"), incarnation));
+        (Evaluator(child), [token(INCARNATION - 1).await.unwrap(), token(INCARNATION).await.unwrap()])
+    }
+
+    pub async fn wait_for<T>(&self, what: impl Fn(&[Heard]) -> Option<T>) -> T {
+        let begin = Instant::now();
+        loop {
+            if let Some(found) = what(&self.heard.lock().unwrap()) {
+                return found;
+            }
+            assert!(begin.elapsed() < PATIENCE, "{:?}", self.heard.lock().unwrap());
+            tokio::time::sleep(Duration::from_millis(20)).await;
+        }
+    }
+
+    pub async fn wait_for_scores(&self, deliveries: usize) -> ScoreReport {
+        let nth = |heard: &[Heard]| reports(heard).into_iter().nth(deliveries - 1);
+        self.wait_for(nth).await
+    }
+
+    pub fn count(&self, what: impl Fn(&Heard) -> bool) -> usize {
+        self.heard.lock().unwrap().iter().filter(|heard| what(heard)).count()
+    }
+}
+
+pub fn reports(heard: &[Heard]) -> Vec<ScoreReport> {
+    let report = |heard: &Heard| if let Heard::Scores(report) = heard { Some(report.clone()) } else { None };
+    heard.iter().filter_map(report).collect()
+}
+
+pub struct Evaluator(Child);
+
+impl Evaluator {
+    /// Tells it to leave, which takes less than nine seconds.
+    pub fn leave(mut self) -> ExitStatus {
+        let begin = Instant::now();
+        // SAFETY: sends a signal to a process that this one has started and not waited for.
+        assert_eq!(unsafe { libc::kill(self.0.id() as i32, libc::SIGTERM) }, 0);
+        let status = self.0.wait().unwrap();
+        assert!(begin.elapsed() < Duration::from_secs(9), "it took {:?}", begin.elapsed());
+        status
+    }
+}
+
+impl Drop for Evaluator {
+    fn drop(&mut self) {
+        self.0.kill().ok();
+        self.0.wait().ok();
+    }
+}

@@ -1,0 +1,122 @@
+//! What `evaluator serve` promises a learner: which scores it delivers, what it does until they are saved, and how it leaves. The
+//! learner is made up (`learner`); the evaluator is the program, and Zenoh is real.
+#![allow(clippy::unwrap_used)]
+
+mod learner;
+
+use std::time::Duration;
+
+use quad_dataset::environment::find;
+use quad_evaluator::sim::Rollout;
+use quad_policy::{ActionNoise, Precision, load_policy};
+use quad_protocol::{EpisodeScore, Job, ScoreReport, encode, keys};
+
+use learner::{Answer, Heard, Learner, job, name, reports, snapshot, tensors};
+
+/// The scores that `job` must have, to the last bit.
+fn expected(job: &Job, tensors: &[u8]) -> Vec<EpisodeScore> {
+    let policy = load_policy(tensors, Precision::F32).unwrap();
+    let mut rollout =
+        Rollout::new(find(&job.environment).unwrap(), job.instance, &job.seeds, ActionNoise::new).unwrap();
+    while !rollout.is_done() {
+        rollout
+            .step(|observations, noise, actions| policy.act(observations, job.candidates as usize, noise, actions))
+            .unwrap();
+    }
+    let outcomes = rollout.into_outcomes().into_iter();
+    outcomes
+        .map(|outcome| EpisodeScore {
+            seed: outcome.seed,
+            episode_return: outcome.episode_return,
+            length: outcome.length,
+            score: outcome.score,
+        })
+        .collect()
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn scores_are_of_exactly_the_weights_and_seeds_that_the_job_names() {
+    for published in [false, true] {
+        let learner = Learner::start(snapshot(tensors())).await;
+        let job = job(&learner.snapshot);
+        let (evaluator, _tokens) = learner.evaluator().await;
+        // At first the evaluator may follow the learner that is dead, which was started first.
+        learner.wait_for(|heard| (heard.len() >= 4).then_some(())).await;
+        if published {
+            learner.session.put(keys::weights(&name("run")), encode(&learner.snapshot).unwrap()).await.unwrap();
+            tokio::time::sleep(Duration::from_millis(500)).await;
+        }
+        learner.give(job.clone());
+        let report = learner.wait_for_scores(1).await;
+        let precision = name(&Precision::F32.arithmetic());
+        assert_eq!(report, ScoreReport::of(&job, name("one"), precision, expected(&job, &learner.snapshot.tensors)));
+        assert_eq!(learner.count(|heard| *heard == Heard::Weights), usize::from(!published));
+        assert!(evaluator.leave().success());
+        assert_eq!(learner.count(|heard| matches!(heard, Heard::HandedBack(_))), 0);
+    }
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn scores_are_sent_again_until_the_learner_has_saved_them() {
+    let learner = Learner::start(snapshot(tensors())).await;
+    learner.answer(Answer::DiskFull);
+    learner.give(job(&learner.snapshot));
+    let (_evaluator, _tokens) = learner.evaluator().await;
+    let report = learner.wait_for_scores(3).await;
+    let claims = learner.count(|heard| *heard == Heard::Claim);
+    learner.answer(Answer::Recorded);
+    let recorded = learner.wait_for_scores(4).await;
+    assert_eq!(recorded, report);
+    learner.wait_for(|heard| (heard.last() == Some(&Heard::Claim)).then_some(())).await;
+    let heard = learner.heard.lock().unwrap();
+    assert_eq!(reports(&heard).len(), 4, "they are not sent once more");
+    let first = heard.iter().position(|heard| matches!(heard, Heard::Scores(_))).unwrap();
+    let before = heard[..first].iter().filter(|heard| **heard == Heard::Claim).count();
+    assert_eq!(before, claims, "nothing new is claimed meanwhile");
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn an_evaluator_that_leaves_hands_its_job_back_unless_its_scores_may_be_saved() {
+    for (answer, handed_back) in [(Answer::DiskFull, 0), (Answer::Nothing, 1)] {
+        let learner = Learner::start(snapshot(tensors())).await;
+        learner.answer(answer);
+        learner.give(job(&learner.snapshot));
+        let (evaluator, _tokens) = learner.evaluator().await;
+        let deliveries = learner.wait_for_scores(1).await.episodes.len();
+        assert!(evaluator.leave().success());
+        assert_eq!(learner.count(|heard| matches!(heard, Heard::HandedBack(_))), handed_back);
+        assert!(learner.count(|heard| matches!(heard, Heard::Scores(_))) > 1, "{deliveries} scores are tried again");
+    }
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn a_job_that_is_not_done_is_handed_back() {
+    let learner = Learner::start(snapshot(tensors())).await;
+    let seeds = (0..256).collect();
+    learner.give(Job { seeds, candidates: 200, ..job(&learner.snapshot) });
+    let (evaluator, _tokens) = learner.evaluator().await;
+    learner.wait_for(|heard| heard.contains(&Heard::Progress).then_some(())).await;
+    assert!(evaluator.leave().success());
+    assert_eq!(learner.heard.lock().unwrap().last(), Some(&Heard::HandedBack(None)));
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn a_job_that_fails_is_handed_back_with_the_reason() {
+    let learner = Learner::start(snapshot(b"no tensors".to_vec())).await;
+    let (_evaluator, _tokens) = learner.evaluator().await;
+    let good = job(&learner.snapshot);
+    for (job, reason) in [
+        (Job { environment: "moon".to_owned(), ..good.clone() }, "moon"),
+        (Job { seeds: Vec::new(), ..good.clone() }, "0 episodes"),
+        (good, "safetensors"),
+    ] {
+        learner.give(job);
+        let told = |heard: &[Heard]| {
+            heard
+                .iter()
+                .any(|heard| matches!(heard, Heard::HandedBack(Some(text)) if text.contains(reason)))
+                .then_some(())
+        };
+        learner.wait_for(told).await;
+    }
+}
