@@ -54,19 +54,6 @@ pub fn median(numbers: impl Iterator<Item = f64>) -> f64 {
     numbers[numbers.len() / 2]
 }
 
-/// Runs `work` on one core, and what it starts, too, where there is `taskset`.
-pub fn on_core<T: Send>(core: usize, work: impl FnOnce() -> T + Send) -> T {
-    let pinned = || {
-        // `…/PID/task/TID`
-        let thread = fs::read_link("/proc/thread-self").expect("Linux says which thread this is");
-        let thread = thread.file_name().and_then(|name| name.to_str()).expect("a number").to_owned();
-        let arguments = ["-p", "-c", &core.to_string(), &thread];
-        std::process::Command::new("taskset").args(arguments).output().ok();
-        work()
-    };
-    thread::scope(|scope| scope.spawn(pinned).join().expect("it does not panic"))
-}
-
 fn steps(learner: &Learner) -> f64 {
     learner.metric("gradient_steps_total", "").expect("the learner runs")
 }

@@ -6,14 +6,9 @@ use zenoh::{Config, Session};
 
 use crate::system::free_port;
 
-/// Listens at a port of its own with deploy/zenoh/router-tls.json5 as it is, and with the router's certificate in
+/// Listens at a port of that address with deploy/zenoh/router-tls.json5 as it is, and with the router's certificate in
 /// `certificates`. Gives the endpoint as well.
-pub async fn protected_router(certificates: &Path) -> (Session, String) {
-    protected_router_at("127.0.0.1", certificates).await
-}
-
-/// The same at another address of this machine.
-pub async fn protected_router_at(address: &str, certificates: &Path) -> (Session, String) {
+pub async fn protected_router(address: &str, certificates: &Path) -> (Session, String) {
     let mut config = configuration("router-tls.json5");
     let endpoint = format!("tls/{address}:{}", free_port());
     config.insert_json5("listen/endpoints", &format!("[{endpoint:?}]")).expect("the setting exists");

@@ -16,15 +16,10 @@ use rand::seq::SliceRandom;
 use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 
-use crate::system::{EVALUATORS, Fault, PROGRAMS, System};
+use crate::system::{EVALUATORS, Fault, Program, System, all_faults};
 
 /// Gradient steps for each fault, so that training goes on until the last of them.
 const STEPS_PER_FAULT: u64 = 12_000;
-
-/// What can happen on the way between programs.
-fn on_lines<L: Line>() -> Vec<Fault> {
-    L::TROUBLES.iter().flat_map(|&trouble| [Fault::EvaluatorsLine(trouble), Fault::LearnersLine(trouble)]).collect()
-}
 
 /// Lets so many faults of those kinds happen.
 fn endure(faults: &[Fault], count: u64, endpoint: &str, lines: Vec<impl Line>) {
@@ -68,13 +63,13 @@ fn endure_on_one_machine(faults: &[Fault], count: u64) {
 #[test]
 fn after_a_few_faults_a_run_ends_as_if_nothing_had_happened() {
     let faults = [
-        Fault::KillEvaluator,
+        Fault::Kill(Program::Evaluator),
+        Fault::Kill(Program::Learner),
+        Fault::Line(Program::Evaluator, Trouble::Cut),
+        Fault::Line(Program::Learner, Trouble::Silent),
         Fault::RestartRouter,
-        Fault::KillLearner,
         Fault::FillDisk,
         Fault::DeliverAgain,
-        Fault::EvaluatorsLine(Trouble::Cut),
-        Fault::LearnersLine(Trouble::Silent),
     ];
     endure_on_one_machine(&faults, faults.len() as u64);
 }
@@ -82,7 +77,7 @@ fn after_a_few_faults_a_run_ends_as_if_nothing_had_happened() {
 #[test]
 #[ignore = "ten minutes"]
 fn after_a_hundred_faults_a_run_ends_as_if_nothing_had_happened() {
-    endure_on_one_machine(&[&PROGRAMS[..], &on_lines::<Link>()].concat(), number("QUAD_FAULTS", 100));
+    endure_on_one_machine(&all_faults::<Link>(), number("QUAD_FAULTS", 100));
 }
 
 #[test]
@@ -94,6 +89,5 @@ fn after_fifty_faults_between_hosts_a_run_ends_as_if_nothing_had_happened() {
         Err(reason) => return eprintln!("skipped, because there can be no network of hosts here: {reason}"),
     };
     let lines = (1..=EVALUATORS as u32 + 1).map(|number| network.host(number, port).unwrap()).collect();
-    let faults = [&PROGRAMS[..], &on_lines::<Host>()].concat();
-    endure(&faults, number("QUAD_FAULTS", 50), &format!("tcp/{}:{port}", network.address), lines);
+    endure(&all_faults::<Host>(), number("QUAD_FAULTS", 50), &format!("tcp/{}:{port}", network.address), lines);
 }

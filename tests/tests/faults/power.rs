@@ -117,13 +117,20 @@ fn keys_of(learner: &Learner) -> BTreeSet<Key> {
     scores.iter().map(|score| (score.key().0, score.key().1, score.text("weights").to_owned())).collect()
 }
 
-/// Cuts the power of a learner at work, again and again.
-fn cut_power_at_work(cuts: u64) {
+/// Cuts the power of a learner at work, again and again. Before some cuts the learner is killed, and another one builds on what it
+/// left.
+fn cut_power(cuts: u64) {
     let mut system = System::start(cuts);
     let mut random = ChaCha8Rng::seed_from_u64(1);
     let mut gone_on = 0;
-    for _ in 0..cuts {
+    for cut in 0..cuts {
         let mut learner = system.run_for_a_while(&mut random);
+        if cut % 2 == 1 && learner.run_dir.join("config.toml").exists() {
+            learner.process.kill();
+            system.promised.extend(keys_of(&learner));
+            learner = system.learner();
+            learner.process.wait_for_log("goes on after step", PATIENCE);
+        }
         system.cut_power(&mut learner);
         let log = learner.process.log();
         gone_on += u64::from(log.contains("goes on after step") && !log.contains("goes on after step 0"));
@@ -136,32 +143,11 @@ fn cut_power_at_work(cuts: u64) {
 
 #[test]
 fn two_power_cuts_take_nothing_that_was_promised() {
-    cut_power_at_work(2);
+    cut_power(2);
 }
 
 #[test]
-#[ignore = "a minute"]
-fn eight_power_cuts_take_nothing_that_was_promised() {
-    cut_power_at_work(8);
-}
-
-#[test]
-#[ignore = "a minute"]
-fn what_a_killed_learner_left_is_on_the_disk_before_another_builds_on_it() {
-    const CUTS: u64 = 8;
-    let mut system = System::start(CUTS);
-    let mut random = ChaCha8Rng::seed_from_u64(2);
-    for _ in 0..CUTS {
-        let mut learner = system.run_for_a_while(&mut random);
-        learner.process.kill();
-        if !learner.run_dir.join("config.toml").exists() {
-            continue;
-        }
-        let left = keys_of(&learner);
-        let mut learner = system.learner();
-        learner.process.wait_for_log("goes on after step", PATIENCE);
-        system.promised.extend(left);
-        system.cut_power(&mut learner);
-    }
-    system.finish();
+#[ignore = "two minutes"]
+fn sixteen_power_cuts_take_nothing_that_was_promised() {
+    cut_power(16);
 }

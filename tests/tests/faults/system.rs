@@ -26,32 +26,31 @@ pub const EVALUATORS: usize = 3;
 const LONGEST_LEAVE: Duration = Duration::from_secs(10);
 
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
+pub enum Program {
+    Learner,
+    Evaluator,
+}
+
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
 pub enum Fault {
-    KillEvaluator,
-    FreezeEvaluator,
-    StopEvaluator,
-    EvaluatorsLine(Trouble),
+    Kill(Program),
+    Stop(Program),
+    Freeze(Program),
+    Line(Program, Trouble),
     RestartRouter,
-    KillLearner,
-    StopLearner,
-    FreezeLearner,
-    LearnersLine(Trouble),
     FillDisk,
     DeliverAgain,
 }
 
-/// What happens to programs and their disk.
-pub const PROGRAMS: [Fault; 9] = [
-    Fault::KillEvaluator,
-    Fault::FreezeEvaluator,
-    Fault::StopEvaluator,
-    Fault::RestartRouter,
-    Fault::KillLearner,
-    Fault::StopLearner,
-    Fault::FreezeLearner,
-    Fault::FillDisk,
-    Fault::DeliverAgain,
-];
+/// All that can happen where lines are of kind `L`.
+pub fn all_faults<L: Line>() -> Vec<Fault> {
+    let of = |program| {
+        let lines = L::TROUBLES.iter().map(move |&trouble| Fault::Line(program, trouble));
+        [Fault::Kill(program), Fault::Stop(program), Fault::Freeze(program)].into_iter().chain(lines)
+    };
+    let others = [Fault::RestartRouter, Fault::FillDisk, Fault::DeliverAgain];
+    of(Program::Learner).chain(of(Program::Evaluator)).chain(others).collect()
+}
 
 /// Each program is at the end of a line of its own.
 pub struct System<L> {
@@ -119,34 +118,30 @@ impl<L: Line> System<L> {
         let a_while = Duration::from_secs_f64(0.1 + 6.9 * random.random::<f64>().powi(2));
         let percent = random.random_range(1..=100);
         let victim = random.random_range(0..EVALUATORS);
-        let (evaluator, line) = &mut self.evaluators[victim];
         match fault {
-            Fault::KillEvaluator => {
-                evaluator.process.kill();
-                self.replace(victim);
+            Fault::Kill(program) => {
+                self.process(program, victim).kill();
+                self.restart(program, victim);
             }
-            Fault::StopEvaluator => {
-                leaves(&mut evaluator.process);
-                self.replace(victim);
+            Fault::Stop(program) => {
+                let (duration, _) = self.process(program, victim).terminate(PATIENCE);
+                assert!(duration < LONGEST_LEAVE, "the {program:?} took {duration:?} to leave");
+                self.restart(program, victim);
             }
-            Fault::FreezeEvaluator => freeze(&evaluator.process, a_while),
-            Fault::EvaluatorsLine(trouble) => line.suffer(trouble, percent, a_while),
+            Fault::Freeze(program) => {
+                let process = self.process(program, victim);
+                process.signal("STOP");
+                sleep(a_while);
+                process.signal("CONT");
+            }
+            Fault::Line(Program::Learner, trouble) => self.learners_line.suffer(trouble, percent, a_while),
+            Fault::Line(Program::Evaluator, trouble) => self.evaluators[victim].1.suffer(trouble, percent, a_while),
             Fault::RestartRouter => {
                 let session = self.router.take().expect("it is there");
                 session.close().wait().ok();
                 sleep(a_while / 4);
                 self.router = Some(self.runtime.block_on(router(&self.endpoint)));
             }
-            Fault::KillLearner => {
-                self.learner.process.kill();
-                self.learner = learner(&self.scratch, self.setting, &self.learners_line);
-            }
-            Fault::StopLearner => {
-                leaves(&mut self.learner.process);
-                self.learner = learner(&self.scratch, self.setting, &self.learners_line);
-            }
-            Fault::FreezeLearner => freeze(&self.learner.process, a_while),
-            Fault::LearnersLine(trouble) => self.learners_line.suffer(trouble, percent, a_while),
             Fault::FillDisk => {
                 let Some(disk) = &self.disk else { return };
                 disk.fill();
@@ -158,10 +153,22 @@ impl<L: Line> System<L> {
         *self.faults.entry(fault).or_default() += 1;
     }
 
-    fn replace(&mut self, index: usize) {
-        let (_, line) = self.evaluators.remove(index);
-        let evaluator = self.evaluator(&line);
-        self.evaluators.insert(index, (evaluator, line));
+    fn process(&mut self, program: Program, index: usize) -> &mut Process {
+        match program {
+            Program::Learner => &mut self.learner.process,
+            Program::Evaluator => &mut self.evaluators[index].0.process,
+        }
+    }
+
+    fn restart(&mut self, program: Program, index: usize) {
+        match program {
+            Program::Learner => self.learner = learner(&self.scratch, self.setting, &self.learners_line),
+            Program::Evaluator => {
+                let (_, line) = self.evaluators.remove(index);
+                let evaluator = self.evaluator(&line);
+                self.evaluators.insert(index, (evaluator, line));
+            }
+        }
     }
 
     /// Delivers scores that are recorded once more, under the name of another evaluator.
@@ -200,15 +207,4 @@ impl<L: Line> System<L> {
 fn learner(scratch: &Scratch, setting: Setting, line: &impl Line) -> Learner {
     let arguments = ["--connect", &line.endpoint(), "--checkpoint-seconds", "1"];
     scratch.learner_through(&line.launcher(), "run", setting, &arguments)
-}
-
-fn freeze(process: &Process, a_while: Duration) {
-    process.signal("STOP");
-    sleep(a_while);
-    process.signal("CONT");
-}
-
-fn leaves(process: &mut Process) {
-    let (duration, _) = process.terminate(PATIENCE);
-    assert!(duration < LONGEST_LEAVE, "it took {duration:?} to leave");
 }

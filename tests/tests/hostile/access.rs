@@ -1,51 +1,48 @@
 //! Which programs may come in: those with a certificate, at the router as it is shipped and at a learner that listens itself.
 
-use std::io::{self, Write};
-use std::path::PathBuf;
-use std::sync::{Mutex, Once};
+use std::fs;
+use std::path::{Path, PathBuf};
+use std::sync::{LazyLock, Mutex};
 
 use quad_tests::certificates::{Certificates, connect};
-use quad_tests::router::{protected_router, protected_router_at};
+use quad_tests::router::protected_router;
 use quad_tests::setting::{ENDLESS, SHORT};
 use quad_tests::system::Scratch;
 use quad_tests::{PATIENCE, eventually};
+use tempfile::NamedTempFile;
 use tokio::time::timeout;
 use zenoh::sample::SampleKind;
 
-/// What Zenoh logs in this process, where the routers are.
-static LOG: Mutex<Vec<u8>> = Mutex::new(Vec::new());
+/// What the router's certificate is for.
+pub const HOST: &str = "127.0.0.1";
 
-struct Log;
-
-impl Write for Log {
-    fn write(&mut self, bytes: &[u8]) -> io::Result<usize> {
-        LOG.lock().unwrap().write(bytes)
-    }
-
-    fn flush(&mut self) -> io::Result<()> {
-        Ok(())
-    }
+/// Where Zenoh logs in this process, which the routers are in.
+fn log() -> &'static Path {
+    static LOG: LazyLock<NamedTempFile> = LazyLock::new(|| {
+        let file = NamedTempFile::new().unwrap();
+        let filter = "zenoh=warn,zenoh::net::routing::interceptor=trace";
+        let log = tracing_subscriber::fmt().with_env_filter(filter).with_ansi(false);
+        log.with_writer(Mutex::new(file.reopen().unwrap())).init();
+        file
+    });
+    LOG.path()
 }
 
 pub fn wait_for_log(text: &str) {
     let what = format!("{text:?} in the router's log");
-    eventually(&what, PATIENCE, || String::from_utf8_lossy(&LOG.lock().unwrap()).contains(text).then_some(()));
+    eventually(&what, PATIENCE, || fs::read_to_string(log()).unwrap().contains(text).then_some(()));
 }
 
 /// `None` if the test is to be skipped.
 pub fn make_certificates() -> Option<Certificates> {
-    static START: Once = Once::new();
-    START.call_once(|| {
-        let filter = "zenoh=warn,zenoh::net::routing::interceptor=trace";
-        tracing_subscriber::fmt().with_env_filter(filter).with_ansi(false).with_writer(|| Log).init();
-    });
+    log();
     Certificates::make()
 }
 
 #[tokio::test(flavor = "multi_thread")]
 async fn a_run_completes_through_the_shipped_router() {
     let Some(certificates) = make_certificates() else { return };
-    let (_router, endpoint) = protected_router(&certificates.of("router")).await;
+    let (_router, endpoint) = protected_router(HOST, &certificates.of("router")).await;
     let scratch = Scratch::new();
     let connect =
         |role| ["--connect".to_owned(), endpoint.clone(), "--certificates".to_owned(), certificates.argument(role)];
@@ -56,16 +53,14 @@ async fn a_run_completes_through_the_shipped_router() {
     learner.assert_completes(&SHORT, PATIENCE);
 }
 
-/// Its certificate is for 127.0.0.1, so that an evaluator which connects elsewhere has met another program.
 #[tokio::test(flavor = "multi_thread")]
 async fn a_router_whose_certificate_is_for_another_host_is_not_believed() {
     let Some(certificates) = make_certificates() else { return };
-    let (_router, endpoint) = protected_router_at("127.0.0.2", &certificates.of("router")).await;
-    let scratch = Scratch::new();
+    let (_router, endpoint) = protected_router("127.0.0.2", &certificates.of("router")).await;
+    let (scratch, folder) = (Scratch::new(), certificates.argument("evaluator"));
     let launcher = ["env", "RUST_LOG=info,zenoh=debug"].map(str::to_owned);
-    let folder = certificates.argument("evaluator");
-    let evaluator =
-        scratch.evaluator_through(&launcher, "careful", &["--connect", &endpoint, "--certificates", &folder]);
+    let arguments = ["--connect", &endpoint, "--certificates", &folder];
+    let evaluator = scratch.evaluator_through(&launcher, "careful", &arguments);
     evaluator.process.wait_for_log("certificate not valid for name", PATIENCE);
     assert!(!evaluator.process.log().contains("Successfully connected"), "{}", evaluator.process.log());
 }
@@ -93,7 +88,7 @@ async fn a_learner_that_listens_itself_asks_who_comes() {
 async fn the_router_refuses_and_logs_those_without_a_valid_certificate() {
     let Some(certificates) = make_certificates() else { return };
     let elsewhere = make_certificates().unwrap();
-    let (_router, endpoint) = protected_router(&certificates.of("router")).await;
+    let (_router, endpoint) = protected_router(HOST, &certificates.of("router")).await;
     let (authority, evaluator) = (certificates.of("router"), certificates.of("evaluator"));
     // In all but the certificate they are what is let in.
     connect(&endpoint, &authority, Some(&evaluator)).await.expect("an evaluator is let in");
@@ -111,7 +106,7 @@ async fn the_router_refuses_and_logs_those_without_a_valid_certificate() {
 
     // The other way round: a router that is not of the evaluator's authority, or only an evaluator, is not talked to.
     assert!(connect(&endpoint, &foreign, Some(&foreign)).await.is_err(), "a foreign router was trusted");
-    let (_impostor, endpoint) = protected_router(&evaluator).await;
+    let (_impostor, endpoint) = protected_router(HOST, &evaluator).await;
     assert!(connect(&endpoint, &authority, Some(&evaluator)).await.is_err(), "an evaluator passed for a router");
 
     // And it says so, instead of waiting in silence.
@@ -142,7 +137,7 @@ async fn expires_and_is_renewed(certificates: &Certificates, scratch: &Scratch, 
 async fn an_expired_certificate_ends_a_connection_and_a_renewed_one_brings_it_back() {
     let Some(certificates) = make_certificates() else { return };
     let (scratch, folder) = (Scratch::new(), certificates.argument("learner"));
-    let (_router, endpoint) = protected_router(&certificates.of("router")).await;
+    let (_router, endpoint) = protected_router(HOST, &certificates.of("router")).await;
     let arguments = ["--connect", &endpoint, "--listen", "tls/127.0.0.1:0", "--certificates", &folder];
     let learner = scratch.learner_with("run", ENDLESS, &arguments);
     let own = learner.endpoint();

@@ -7,7 +7,7 @@ use std::process::{Command, Output};
 use quad_tests::PATIENCE;
 use quad_tests::certificates::Certificates;
 use quad_tests::process::{assert_refused, binary};
-use quad_tests::setting::{ENDLESS, SHORT};
+use quad_tests::setting::SHORT;
 use quad_tests::system::{Scratch, free_port};
 
 /// A program that is stopped with exit code 124 if it starts nevertheless.
@@ -67,19 +67,6 @@ fn certificates_that_do_not_do_are_refused() {
     take(&certificates, "evaluator", "ca.pem");
     take(&certificates, "monitor", "key.pem");
     assert_refused(&with(&mixed), "key.pem is not the key of", "ca.pem");
-}
-
-#[test]
-fn a_learner_for_other_machines_says_that_its_certificate_names_none_of_their_addresses() {
-    let Some(certificates) = Certificates::make() else { return };
-    let scratch = Scratch::new();
-    let certificate = certificates.argument("learner");
-    for (run, listen, warned) in [("all", "tls/0.0.0.0:0", true), ("own", "tls/localhost:0", false)] {
-        let learner = scratch.learner_with(run, ENDLESS, &["--listen", listen, "--certificates", &certificate]);
-        learner.process.wait_for_log("its metrics at", PATIENCE);
-        let log = learner.process.log();
-        assert_eq!(log.contains(&format!("{listen} is for other machines, but")), warned, "{log}");
-    }
 }
 
 #[test]

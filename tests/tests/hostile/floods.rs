@@ -28,24 +28,14 @@ enum Flood {
     Garbage,
     /// Messages that are larger than any of their kind, in each part of a query.
     Large,
-    /// On keys of no run.
-    Elsewhere,
     /// Evaluators that come, ask for work and leave.
     Evaluators,
     /// Of weights.
     Downloads,
 }
 
-const FLOODS: [Flood; 8] = [
-    Flood::Progress,
-    Flood::Claims,
-    Flood::Reports,
-    Flood::Garbage,
-    Flood::Large,
-    Flood::Elsewhere,
-    Flood::Evaluators,
-    Flood::Downloads,
-];
+const FLOODS: [Flood; 7] =
+    [Flood::Progress, Flood::Claims, Flood::Reports, Flood::Garbage, Flood::Large, Flood::Evaluators, Flood::Downloads];
 
 /// A client that sends without a pause.
 struct Client {
@@ -90,10 +80,6 @@ impl Client {
                 self.ask(&keys::jobs(&run), newer).await;
             }
             Flood::Large => self.ask_much(&keys::jobs(&run)).await,
-            Flood::Elsewhere => {
-                self.session.put("somewhere/else", vec![0; 1000]).await.unwrap();
-                self.ask("somewhere/else", vec![0; 1000]).await;
-            }
             Flood::Evaluators => {
                 let evaluator = format!("flood-{number}");
                 let token = keys::live_evaluator(&run, &name(&evaluator));

@@ -14,7 +14,7 @@ use zenoh::pubsub::Subscriber;
 use zenoh::query::{Query, Queryable};
 use zenoh::sample::Sample;
 
-use crate::access::{make_certificates, wait_for_log};
+use crate::access::{HOST, make_certificates, wait_for_log};
 
 /// For what must not happen.
 const LULL: Duration = Duration::from_millis(500);
@@ -22,7 +22,7 @@ const LULL: Duration = Duration::from_millis(500);
 /// Sessions with the certificates of those roles at the shipped router, which stays as long as the first part.
 async fn at_the_router<const N: usize>(roles: [&str; N]) -> Option<(impl Sized, [Session; N])> {
     let certificates = make_certificates()?;
-    let (router, endpoint) = protected_router(&certificates.of("router")).await;
+    let (router, endpoint) = protected_router(HOST, &certificates.of("router")).await;
     let mut sessions = Vec::new();
     for role in roles {
         sessions.push(connect(&endpoint, &certificates.of("router"), Some(&certificates.of(role))).await.unwrap());

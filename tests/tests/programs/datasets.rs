@@ -79,19 +79,6 @@ fn the_list_says_what_there_is_and_what_is_here() {
 }
 
 #[test]
-fn what_cannot_be_had_is_explained() {
-    let folder = tempfile::tempdir().unwrap();
-    let file = "Ant_maze_u-maze_noisy_multistart_False_multigoal_False_sparse.hdf5";
-    let server = FileServer::start(file, b"<!DOCTYPE html><title>Sign in</title>".to_vec());
-    let text = failure(&learner(folder.path(), &server.url, &["datasets", "fetch", "antmaze-umaze-v0"]));
-    let path = folder.path().join(file);
-    for words in [&server.url, "232533093", "\n  http://rail.eecs.berkeley.edu/", path.to_str().unwrap()] {
-        assert!(text.contains(words), "no {words} in:\n{text}");
-    }
-    assert!(!path.exists());
-}
-
-#[test]
 fn what_makes_no_sense_is_refused_before_anything_is_fetched() {
     let folder = tempfile::tempdir().unwrap();
     let server = FileServer::start("", Vec::new());

@@ -1,13 +1,14 @@
 //! Many evaluators at one learner, behind a router. They are light: all that they say on the wire is real, but they simulate
 //! nothing, so that hundreds fit beside the learner on one machine.
 
+use std::process::Command;
 use std::thread;
 use std::time::Duration;
 
 use quad_tests::crowd::{Crowd, Measured, Pace, longest_job};
 use quad_tests::learner::Learner;
 use quad_tests::made_up::name;
-use quad_tests::pace::{BUSY, SETTLE, compare, on_core};
+use quad_tests::pace::{BUSY, SETTLE, compare};
 use quad_tests::router::router;
 use quad_tests::setting::{IDLE, Setting};
 use quad_tests::system::{Scratch, free_endpoint};
@@ -32,16 +33,26 @@ fn tell(what: &str, measured: &Measured, during: Duration) {
 /// How many evaluators there are, and for how long they are measured.
 struct Size {
     count: usize,
+    /// What starts the learner.
+    launcher: &'static [&'static str],
     /// What the longest of their episodes takes.
     episode: Duration,
     rounds: usize,
     phase: Duration,
 }
 
-const SHORT: Size = Size { count: 50, episode: Duration::from_millis(50), rounds: 1, phase: Duration::from_secs(2) };
-const LONG: Size = Size { count: 500, episode: Duration::from_millis(1600), rounds: 3, phase: Duration::from_secs(10) };
+const SHORT: Size =
+    Size { count: 50, launcher: &[], episode: Duration::from_millis(50), rounds: 1, phase: Duration::from_secs(2) };
+/// The learner has a core of its own.
+const LONG: Size = Size {
+    count: 500,
+    launcher: &["taskset", "-c", "1"],
+    episode: Duration::from_millis(1600),
+    rounds: 3,
+    phase: Duration::from_secs(10),
+};
 
-/// A learner on one core; on the other one a router, and a crowd that is connected through it.
+/// A learner, a router, and a crowd that is connected through it.
 struct Scene {
     learner: Learner,
     crowd: Crowd,
@@ -53,10 +64,10 @@ struct Scene {
 }
 
 impl Scene {
-    /// Is called on the second core.
     fn new(setting: Setting, size: &Size) -> Scene {
         let (scratch, endpoint) = (Scratch::new(), free_endpoint());
-        let learner = on_core(1, || scratch.learner_with("run", setting, &["--connect", &endpoint]));
+        let launcher: Vec<_> = size.launcher.iter().map(|&word| word.to_owned()).collect();
+        let learner = scratch.learner_through(&launcher, "run", setting, &["--connect", &endpoint]);
         let runtime = Runtime::new().unwrap();
         let router = runtime.block_on(router(&endpoint));
         learner.metrics();
@@ -114,18 +125,19 @@ fn work(size: &Size) -> (Duration, f64) {
 
 #[test]
 fn fifty_evaluators_are_served_and_each_score_counts_once() {
-    on_core(0, || work(&SHORT));
+    work(&SHORT);
 }
 
 #[test]
 #[ignore = "nine minutes, on two cores of its own"]
 fn five_hundred_evaluators_are_served_and_training_hardly_notices() {
-    on_core(0, || {
-        eprintln!("with nothing to do");
-        let (_, idle) = Scene::new(IDLE, &LONG).work(&LONG);
-        eprintln!("with more to do than they can");
-        let (slowest, busy) = work(&LONG);
-        assert!(slowest <= Duration::from_millis(100), "of a hundred claims one takes {slowest:.1?}");
-        assert!(idle > 0.9 && busy > 0.9, "training at {idle:.3} beside idle evaluators, {busy:.3} beside busy ones");
-    });
+    // All but the learner runs on the other core.
+    let me = std::process::id().to_string();
+    assert!(Command::new("taskset").args(["-a", "-c", "-p", "0", &me]).status().is_ok_and(|status| status.success()));
+    eprintln!("with nothing to do");
+    let (_, idle) = Scene::new(IDLE, &LONG).work(&LONG);
+    eprintln!("with more to do than they can");
+    let (slowest, busy) = work(&LONG);
+    assert!(slowest <= Duration::from_millis(100), "of a hundred claims one takes {slowest:.1?}");
+    assert!(idle > 0.9 && busy > 0.9, "training at {idle:.3} beside idle evaluators, {busy:.3} beside busy ones");
 }

@@ -37,14 +37,11 @@ fn of_two_evaluators_under_one_name_the_learner_warns_once() {
     let scratch = Scratch::new();
     // Jobs of seconds, so that one of them has a job whenever the other one asks.
     let learner = scratch.learner("run", Setting { candidates: 500, hidden: 256, ..ENDLESS });
-    let _both = ["one", "two"].map(|folder| {
-        let other = Scratch::new();
-        (other.evaluator("twin", &learner.endpoint()), other, folder)
-    });
-    let line = learner.process.wait_for_log("twin", PATIENCE);
-    assert!(line.contains("WARN") && line.contains("--name"), "{line}");
+    let folders = [Scratch::new(), Scratch::new()];
+    let _both = folders.each_ref().map(|folder| folder.evaluator("twin", &learner.endpoint()));
+    learner.process.wait_for_log("--name twin", PATIENCE);
     std::thread::sleep(Duration::from_secs(2));
-    let warnings = learner.process.log().lines().filter(|line| line.contains("WARN") && line.contains("twin")).count();
-    assert_eq!(warnings, 1, "{}", learner.process.log());
+    let log = learner.process.log();
+    assert_eq!(log.lines().filter(|line| line.contains("--name twin")).count(), 1, "{log}");
     learner.wait_for_scores(0);
 }
