@@ -16,9 +16,11 @@ mod jobs;
 mod outcomes;
 mod refusal;
 mod scoreboard;
+#[cfg(test)]
+pub(crate) mod tests;
 mod validate;
 
-pub(crate) use outcomes::{Claim, Claimed, Earlier, HandedBack, Lost, OtherWeights, Recorded};
+pub(crate) use outcomes::{Claim, Claimed, Earlier, HandedBack, Lost, OtherWeights};
 pub(crate) use refusal::Refusal;
 pub(crate) use scoreboard::{Rules, Scoreboard};
 pub(crate) use validate::Validated;

@@ -5,7 +5,7 @@ use std::path::{Path, PathBuf};
 
 /// A run folder that cannot be used.
 #[derive(Debug, thiserror::Error)]
-pub(crate) enum RunDirError {
+pub enum RunDirError {
     /// There is a run in it.
     #[error("there is already a run in {0}")]
     Occupied(PathBuf),

@@ -2,7 +2,7 @@
 
 use std::fs::{File, OpenOptions, TryLockError};
 use std::io::{self, Read, Seek, SeekFrom, Write};
-use std::path::{Path, PathBuf};
+use std::path::PathBuf;
 
 use serde::Serialize;
 use tracing::warn;
@@ -44,6 +44,14 @@ impl Log {
         let durable = log.mend().and_then(|()| log.synchronise()).and_then(|()| synchronise_folder(&log.path));
         durable.map_err(io_error("open", &log.path))?;
         Ok(log)
+    }
+
+    /// For tests: any file, neither locked nor looked at.
+    #[cfg(test)]
+    pub fn unchecked(path: PathBuf) -> Self {
+        #[allow(clippy::unwrap_used)]
+        let file = OpenOptions::new().append(true).open(&path).unwrap();
+        Self { path, file, length: 0, torn: false, synchronise: false }
     }
 
     /// Whether there is no whole line in it.

@@ -14,9 +14,11 @@ mod folder;
 mod lines;
 mod log;
 mod resume;
+#[cfg(test)]
+pub(crate) mod tests;
 
 pub(crate) use checkpoints::Checkpoint;
-pub(crate) use error::RunDirError;
+pub use error::RunDirError;
 pub(crate) use folder::RunDir;
 pub(crate) use lines::{RunEndpoints, ScoreLine};
 pub(crate) use log::Log;

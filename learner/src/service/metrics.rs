@@ -122,7 +122,9 @@ impl DiskMetrics {
             trouble: make.counts("disk_trouble", trouble, "what")?,
         };
         // From the beginning, so that the first trouble is a change.
-        Saved::ALL.map(|what| metrics.trouble(what));
+        for what in Saved::ALL {
+            metrics.trouble(what);
+        }
         Ok(metrics)
     }
 

@@ -31,13 +31,14 @@ mod scores;
 mod services;
 mod snapshots;
 mod spawn;
+#[cfg(test)]
+mod tests;
 mod threads;
 mod weights;
 mod wire;
 
 pub(crate) use display::Display;
 pub(crate) use duplicate::Life;
-pub(crate) use events::Event;
 pub(crate) use main_loop::{Ending, MainLoop};
 pub(crate) use metrics::Metrics;
 pub(crate) use network::open_network;

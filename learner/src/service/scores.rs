@@ -20,13 +20,8 @@ use crate::run::{Log, ScoreLine};
 /// Most reports that are written together.
 const MOST_TOGETHER: usize = 256;
 
-/// What the thread is given.
-pub(super) enum Delivery {
-    /// An evaluator's report, and the query that it came with.
-    Report(Request, ScoreReport),
-    /// Nothing more will come that is to be waited for.
-    End,
-}
+/// An evaluator's report, and the query that it came with; nothing when no more will come that is to be waited for.
+pub(super) type Delivery = Option<(Request, ScoreReport)>;
 
 /// State of the thread.
 pub(super) struct Scores {
@@ -53,8 +48,8 @@ impl Scores {
             let mut reports = Vec::new();
             for delivery in std::iter::once(first).chain(self.deliveries.try_iter()).take(MOST_TOGETHER) {
                 match delivery {
-                    Delivery::Report(request, report) => reports.push((request, report)),
-                    Delivery::End => ended = true,
+                    Some(report) => reports.push(report),
+                    None => ended = true,
                 }
             }
             while !reports.is_empty() {

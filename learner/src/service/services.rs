@@ -62,7 +62,7 @@ impl Services {
             Ok(report) => {
                 // Until its scores are on the disk.
                 self.coordinator.keep(&report);
-                self.deliveries.try_send(Delivery::Report(request, report)).is_ok()
+                self.deliveries.try_send(Some((request, report))).is_ok()
             }
             Err(rejection) => {
                 let metrics = self.metrics.clone();

@@ -14,7 +14,7 @@ use super::disk::DiskStatus;
 use super::duplicate::Life;
 use super::events::{Events, Saved};
 use super::metrics::Metrics;
-use super::scores::{Delivery, Scores};
+use super::scores::Scores;
 use super::services::Services;
 use super::snapshots::Snapshots;
 use super::spawn::spawn_alive;
@@ -146,7 +146,7 @@ impl Threads {
         self.training.join().ok();
         self.outbox.close();
         self.snapshots.join().ok();
-        self.services.deliveries.send(Delivery::End).ok();
+        self.services.deliveries.send(None).ok();
         self.scores.join().ok();
     }
 }

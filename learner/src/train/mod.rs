@@ -12,9 +12,11 @@ mod metrics;
 mod outbox;
 mod pool;
 mod steps;
+#[cfg(test)]
+mod tests;
 mod training;
 
 pub(crate) use metrics::{Registrar, TrainingMetrics};
 pub(crate) use outbox::{Outbox, TrainedPolicy, Work};
-pub(crate) use steps::{Outcome, Row};
+pub(crate) use steps::Outcome;
 pub(crate) use training::Training;

@@ -1,6 +1,11 @@
-//! Tests: each custom operation against its plain body, values and gradients, at random shapes.
+//! Tests: each custom operation against its plain implementation, values and gradients, at random shapes.
 
-use crate::*;
+use crate::ensemble::Ensemble;
+use crate::noise_predictor::NoisePredictor;
+use crate::precision::Precision;
+use crate::shape::{EnsembleShape, NoiseShape};
+use crate::slices::{has_fast_body, modify};
+use crate::weights::{Layout, Weights};
 use candle_core::{Device, Tensor};
 use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
@@ -46,7 +51,7 @@ fn shape(generator: &mut ChaCha8Rng, outputs: usize) -> EnsembleShape {
 }
 
 #[test]
-fn ensembles_give_the_plain_bodys_values() {
+fn ensembles_give_the_plain_values() {
     for seed in 0..20 {
         let mut generator = ChaCha8Rng::seed_from_u64(seed);
         let outputs = generator.random_range(1..4);
@@ -68,7 +73,7 @@ fn ensembles_give_the_plain_bodys_values() {
 }
 
 #[test]
-fn ensembles_give_the_plain_bodys_gradients() {
+fn ensembles_give_the_plain_gradients() {
     for seed in 0..20 {
         let mut generator = ChaCha8Rng::seed_from_u64(seed);
         let outputs = generator.random_range(1..4);
@@ -99,7 +104,7 @@ fn ensembles_give_the_plain_bodys_gradients() {
 }
 
 #[test]
-fn squared_errors_are_the_plain_bodys() {
+fn squared_errors_are_the_plain_ones() {
     for seed in 0..20 {
         let mut generator = ChaCha8Rng::seed_from_u64(seed);
         let shape = shape(&mut generator, 1);
@@ -120,7 +125,7 @@ fn squared_errors_are_the_plain_bodys() {
 }
 
 #[test]
-fn action_gradients_are_the_plain_bodys() {
+fn action_gradients_are_the_plain_ones() {
     for seed in 0..20 {
         let mut generator = ChaCha8Rng::seed_from_u64(seed);
         let shape = shape(&mut generator, 1);
@@ -142,7 +147,7 @@ fn noise_predictor(generator: &mut ChaCha8Rng) -> NoisePredictor {
 }
 
 #[test]
-fn noise_predictors_give_the_plain_bodys_values_and_gradients() {
+fn noise_predictors_give_the_plain_values_and_gradients() {
     for seed in 0..20 {
         let mut generator = ChaCha8Rng::seed_from_u64(seed);
         let actor = noise_predictor(&mut generator);
@@ -166,7 +171,7 @@ fn noise_predictors_give_the_plain_bodys_values_and_gradients() {
 }
 
 #[test]
-fn the_sampler_draws_what_its_plain_body_draws() {
+fn the_sampler_draws_what_the_plain_one_draws() {
     for seed in 0..10 {
         let mut generator = ChaCha8Rng::seed_from_u64(seed);
         let actor = noise_predictor(&mut generator);

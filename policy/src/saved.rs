@@ -1,4 +1,4 @@
-//! What a forward pass leaves behind for its way back, and the weights' gradient made of it.
+//! What a forward pass leaves behind for its backward pass, and the weights' gradient made of it.
 
 use crate::layers::LayerMut;
 use crate::network::{Activations, TILE};
@@ -8,10 +8,10 @@ use quad_kernels::product::outer;
 use rayon::prelude::*;
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 
-/// Activations of all hidden layers of all members, and their slopes, each `members × rows × hidden`; on the way back the
+/// Activations of all hidden layers of all members, and their slopes, each `members × rows × hidden`; on the backward pass the
 /// gradients before the activations take the slopes' place.
 #[derive(Default)]
-pub(crate) struct Record {
+pub(crate) struct SavedActivations {
     x: [Buffer; 3],
     slope: [Buffer; 3],
     rows: usize,
@@ -29,7 +29,7 @@ pub(crate) struct Tile<'a> {
     pub out: &'a mut [f32],
 }
 
-impl Record {
+impl SavedActivations {
     /// Makes room.
     pub fn resize(&mut self, members: usize, rows: usize, hidden: usize) {
         (self.members, self.rows, self.hidden) = (members, rows, hidden);
@@ -66,12 +66,12 @@ impl Record {
         &buffer.first(self.members * len)[member * len..][..len]
     }
 
-    /// The gradient before a member's first activation, `rows × hidden`, after the way back.
+    /// The gradient before a member's first activation, `rows × hidden`, after the backward pass.
     pub fn first_delta(&self, member: usize) -> &[f32] {
         self.of_member(&self.slope[0], member)
     }
 
-    /// After the way back: the gradients of these layers. `input` is `rows × width`; the first kernel's rows behind the
+    /// After the backward pass: the gradients of these layers. `input` is `rows × width`; the first kernel's rows behind the
     /// first `width` are left to the caller. `output_gradient` is `members × rows × outputs`.
     pub fn weight_gradients(&self, layers: Vec<LayerMut<'_>>, input: &[f32], output_gradient: &[f32]) {
         layers.into_par_iter().for_each(|layer| {
