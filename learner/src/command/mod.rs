@@ -1,5 +1,8 @@
 //! The learner's commands, from the command line to the exit. All of it runs on the main thread.
 
+mod doctor;
+mod train;
+
 use std::fmt::Alignment::{Left, Right};
 
 use quad_dataset::{DatasetError, environment};
@@ -9,10 +12,8 @@ use tracing::{info, warn};
 use crate::cli::{Cli, Command, DatasetsCommand, DoctorArgs, InspectArgs, PresetsArgs, ReportArgs, VerifyArgs, print};
 use crate::config::{self, ConfigError, presets};
 use crate::data::{Source, cache};
-use crate::doctor;
 use crate::report::{Report, Style, Table, learning_curves};
-use crate::run::{RunDir, RunDirError};
-use crate::run::{train, verify};
+use crate::run::{RunDir, RunDirError, verify};
 
 /// Does what the command line says.
 ///

@@ -155,7 +155,7 @@ fn endpoints(args: &TrainArgs, eval_interval: u64) -> anyhow::Result<Endpoints> 
     };
     let endpoints = Endpoints { listen, connect: Vec::from_iter(args.connect.clone()), certificates };
     endpoints.check().hint_of(SessionError::hint)?;
-    if let Some(endpoint) = endpoints.open_to_anybody() {
+    if let Some(endpoint) = endpoints.open_to_all() {
         warn!(
             "every machine that reaches {endpoint} may read weights and send scores: in a network that you do not trust, use \
              --certificates DIR (docs/security.md)"

@@ -148,7 +148,8 @@ fn unlike_runs_are_no_seeds_of_each_other_and_the_report_says_what_differs() {
     for (keys, change) in changes {
         let report = beside_a_plain_run(change);
         let differs: Vec<_> = report.groups.iter().flat_map(|group| &group.differs).collect();
-        assert_eq!((&differs[..], report.groups.len()), (&keys.iter().collect::<Vec<_>>()[..], 1.max(keys.len())));
+        assert_eq!(differs, keys);
+        assert_eq!(report.groups.len(), 1.max(keys.len()));
         assert!(keys.iter().all(|key| report.text().contains(key)), "{}", report.text());
     }
     let report = beside_a_plain_run(|config| config.dataset.sha256 = Some("00".into()));

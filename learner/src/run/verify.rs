@@ -6,8 +6,10 @@ use std::path::Path;
 
 use quad_protocol::{Hash, episode_seeds};
 
+use super::error::RunDirError;
+use super::folder::RunDir;
+use super::lines::ScoreLine;
 use crate::config::settings;
-use crate::run::{RunDir, RunDirError, ScoreLine};
 
 /// Findings of one kind that are listed one by one; the rest is counted.
 const LISTED: usize = 5;
