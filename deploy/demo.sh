@@ -18,10 +18,7 @@ BIN=target/release
 deploy/setup.sh
 cargo build --release --locked --package quad-learner --package quad-evaluator
 
-mkdir -p data runs
-exec 9>runs/.demo.lock
-flock --nonblock 9 || die "a demonstration is running in this clone already"
-
+mkdir -p data
 if [ ! -e "$DATASET" ]; then
   say "recording $DATASET"
   $BIN/evaluator collect --env hopper --out "$DATASET"
@@ -37,7 +34,6 @@ fi
 
 learner=
 evaluators=() # process ids
-names=()      # by process id
 
 # Ends what still runs, also when this script is interrupted.
 stop() {
@@ -49,26 +45,15 @@ trap stop EXIT
 trap 'exit 130' INT
 trap 'exit 143' TERM
 
-# Without the lock's descriptor: whatever outlives this script must not keep the lock.
-start_learner "$RUN" --preset $PRESET --dataset $DATASET "$@" 9>&-
+start_learner "$RUN" --preset $PRESET --dataset $DATASET "$@"
 for ((i = 1; i <= EVALUATORS; i++)); do
-  $BIN/evaluator serve --name "evaluator-$i" --connect "$endpoint" --metrics 127.0.0.1:0 \
-    >"$RUN/evaluator-$i.log" 2>&1 9>&- &
+  $BIN/evaluator serve --name "evaluator-$i" --connect "$endpoint" --metrics 127.0.0.1:0 >"$RUN/evaluator-$i.log" 2>&1 &
   evaluators+=($!)
-  names[$!]=evaluator-$i
 done
 say "evaluators write to $RUN/evaluator-*.log"
 
-while true; do
-  status=0
-  wait -n -p ended "$learner" "${evaluators[@]}" || status=$?
-  [ "$ended" != "$learner" ] || break
-  say "${names[$ended]} ended with status $status; see $RUN/${names[$ended]}.log"
-  unset "names[$ended]"
-  evaluators=("${!names[@]}")
-  [ ${#evaluators[@]} -gt 0 ] || die "no evaluator is left"
-done
-
+status=0
+wait "$learner" || status=$?
 if [ "$status" -ne 0 ]; then
   say "the learner ended with status $status; run this again to go on where it was"
   exit "$status"

@@ -5,7 +5,7 @@
 #                                                   deploy/join.sh tls/192.0.2.10:7447 ~/box7
 #
 # ENDPOINT is where a learner listens (`learner train --listen`) or its router. CERTIFICATES is the folder that was made for
-# this machine by deploy/zenoh/certificates.sh [default: QUAD_CERTIFICATES, or none]. Ctrl-C leaves; nobody's scores get lost.
+# this machine by deploy/zenoh/certificates.sh [default: QUAD_CERTIFICATES, or none]. Ctrl-C leaves; no scores get lost.
 set -euo pipefail
 CERTIFICATES=${2:-${QUAD_CERTIFICATES:-}}
 if [ -n "$CERTIFICATES" ]; then

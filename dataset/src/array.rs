@@ -1,6 +1,6 @@
 //! An array of any format, in memory.
 
-use crate::Problem;
+use crate::error::Problem;
 
 /// N rows of numbers. A row of one number may be stored without an axis of its own.
 pub(crate) struct Array<T> {

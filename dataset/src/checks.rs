@@ -1,10 +1,15 @@
 //! What training refuses to learn from.
 
+use crate::environment::EnvironmentSpec;
+use crate::error::Problem;
 use crate::recording::{Recording, RowKind};
-use crate::{EnvironmentSpec, Problem};
 
 /// Actions may be this far outside [-1, 1]: what rounding explains is clipped, anything more is another scale.
 const ACTION_TOLERANCE: f32 = 1e-3;
+
+/// The largest share of rows inside an episode that may lead elsewhere. D4RL's replay buffers have at most one in a thousand,
+/// where collection was cut off without a timeout; rows in another order than that of recording have nearly all.
+const MOST_STRAYS: f64 = 0.01;
 
 /// Everything that is wrong with a recording as data of that environment, the gravest first.
 pub(crate) fn problems(recording: &Recording, environment: Option<&EnvironmentSpec>) -> Vec<Problem> {
@@ -29,11 +34,23 @@ pub(crate) fn problems(recording: &Recording, environment: Option<&EnvironmentSp
     problems.extend(not_finite(recording, "actions", &recording.actions, a, is_step));
     problems.extend(not_finite(recording, "rewards", &recording.rewards, 1, is_step));
     problems.extend(actions_outside(recording));
+    problems.extend(strays(recording).and_then(|(problem, refused)| refused.then_some(problem)));
     let limit = environment.map_or(0, |environment| environment.max_episode_steps);
     if rows > limit && !recording.ends.contains(&true) && !recording.terminals.contains(&true) {
         problems.push(Problem::Endless { rows });
     }
     problems
+}
+
+/// Rows inside an episode whose stored next observation is not the following row's, and whether they are refused: in a D4RL
+/// file, which is learnt from as if each row led to the following one, where they are too many.
+pub(crate) fn strays(recording: &Recording) -> Option<(Problem, bool)> {
+    let unused = recording.unused_next_observations.as_ref();
+    let stored = recording.next_observations.as_ref().or(unused)?;
+    let mut strays = recording.inside().filter(|&row| recording.jumps(stored, row));
+    let (row, rows) = (strays.next()?, 1 + strays.count());
+    let refused = unused.is_some() && rows as f64 > MOST_STRAYS * recording.inside().count() as f64;
+    Some((Problem::Stray { row, rows }, refused))
 }
 
 fn not_finite(

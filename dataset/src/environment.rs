@@ -4,7 +4,7 @@ use std::sync::LazyLock;
 
 use serde::Deserialize;
 
-use crate::RewardRule;
+use crate::reward::RewardRule;
 
 /// Sizes, limits and reference returns of one environment.
 #[derive(Debug, PartialEq, Deserialize)]
@@ -14,9 +14,9 @@ pub struct EnvironmentSpec {
     pub name: String,
     #[serde(default)]
     simulation: Option<String>,
-    /// What Gymnasium calls it, without version and variant.
+    /// What Gymnasium calls it.
     #[serde(default)]
-    gymnasium: Option<String>,
+    gymnasium: Vec<String>,
     /// Numbers in an observation.
     pub observation_dim: usize,
     /// Numbers in an action, each within ±1.
@@ -84,12 +84,9 @@ pub fn find(name: &str) -> Result<&'static EnvironmentSpec, UnknownEnvironment> 
         .ok_or_else(|| UnknownEnvironment { name: name.to_owned() })
 }
 
-/// The environment that Gymnasium knows by that id, of whatever version and variant: `Hopper-v5`, `AntMaze_Large_Diverse-v4`.
+/// The environment whose simulation Gymnasium has under that id, such as `Hopper-v5`.
 pub(crate) fn find_gymnasium(id: &str) -> Option<&'static EnvironmentSpec> {
-    let name = id.rsplit_once("-v").map_or(id, |(name, _)| name);
-    let is_variant =
-        |known: &str| name.strip_prefix(known).is_some_and(|rest| rest.is_empty() || rest.starts_with('_'));
-    all().iter().find(|environment| environment.gymnasium.as_deref().is_some_and(is_variant))
+    all().iter().find(|environment| environment.gymnasium.iter().any(|known| known == id))
 }
 
 impl EnvironmentSpec {
@@ -130,14 +127,13 @@ mod tests {
     }
 
     #[test]
-    fn ids_of_gymnasium_are_known_in_every_version() {
-        let name = |id| find_gymnasium(id).map(|environment| environment.name.as_str());
-        assert_eq!((name("Hopper-v2"), name("HalfCheetah-v5")), (Some("hopper"), Some("halfcheetah")));
-        assert_eq!(
-            (name("AntMaze_UMaze-v4"), name("AntMaze_Large_Diverse_GR-v4")),
-            (Some("antmaze-umaze"), Some("antmaze-large"))
-        );
-        assert_eq!((name("HopperStand-v0"), name("Ant-v5")), (None, None));
+    fn ids_of_gymnasium_are_known_where_the_simulation_is_ours() {
+        for (id, name) in [("Hopper-v2", "hopper"), ("HalfCheetah-v5", "halfcheetah"), ("Walker2d-v4", "walker2d")] {
+            assert_eq!(find_gymnasium(id).map(|environment| environment.name.as_str()), Some(name));
+        }
+        for id in ["Walker2d-v5", "AntMaze_UMaze-v4", "AntMaze_Large_Diverse_GR-v4", "HopperStand-v0", "Ant-v5"] {
+            assert_eq!(find_gymnasium(id), None, "{id}");
+        }
     }
 
     #[test]

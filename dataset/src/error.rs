@@ -3,6 +3,8 @@
 use std::io;
 use std::path::PathBuf;
 
+use crate::environment;
+
 /// A source that cannot be read or learnt from, or a file that cannot be written.
 #[derive(Debug, thiserror::Error)]
 #[error("{}: {problem}", .path.display())]
@@ -85,6 +87,9 @@ pub enum Problem {
     /// Fewer episodes than Minari's metadata promises.
     #[error("{found} episodes, but metadata.json says {expected}")]
     Episodes { found: usize, expected: usize },
+    /// Minari's Dicts within Dicts, or a file of another layout.
+    #[error("`{array}` is a group of arrays, but must be an array")]
+    Group { array: String },
     /// Recorded in another environment than the one that is asked for.
     #[error("recorded in `{claimed}`, which is not `{expected}`")]
     OtherEnvironment { claimed: String, expected: String },
@@ -92,7 +97,7 @@ pub enum Problem {
     #[error("`{array}` has {found} numbers a row, but `{environment}` has {expected}")]
     Width { array: &'static str, found: usize, expected: usize, environment: String },
     /// NaN or an infinity.
-    #[error("array `{array}`, row {row}: {value} is not a finite float32{}", more(*.rows))]
+    #[error("array `{array}`, row {row}: {value} is not a finite float32{}", such_rows(*.rows))]
     NotFinite {
         array: String,
         row: usize,
@@ -104,12 +109,25 @@ pub enum Problem {
     #[error("array `{array}`, row {row}: {value} is neither 0 nor 1")]
     NotBoolean { array: String, row: usize, value: f32 },
     /// An action that no policy here can take.
-    #[error("array `{array}`, row {row}: the action {value} is outside [-1, 1]{}", more(*.rows))]
+    #[error("array `{array}`, row {row}: the action {value} is outside [-1, 1]{}", such_rows(*.rows))]
     ActionOutside {
         array: String,
         row: usize,
         value: f32,
         /// Rows with such a number.
+        rows: usize,
+    },
+    /// Actions of which each is one of a few, which no policy here can take.
+    #[error("array `{array}` holds whole numbers, as if actions were discrete; only continuous ones can be learnt")]
+    DiscreteActions { array: String },
+    /// A D4RL file whose rows do not follow one another.
+    #[error(
+        "array `next_observations`, row {row}: not the observation of the row that follows, though the episode goes on there{}",
+        such_rows(*.rows)
+    )]
+    Stray {
+        row: usize,
+        /// Rows with such a next observation.
         rows: usize,
     },
     /// All rows make one episode, so that resets would be taken for steps.
@@ -129,7 +147,8 @@ pub enum Problem {
     BadRow { row: usize, array: &'static str, problem: String },
 }
 
-fn more(rows: usize) -> String {
+/// How many rows have what the first of them is named for.
+pub(crate) fn such_rows(rows: usize) -> String {
     match rows {
         0 | 1 => String::new(),
         rows => format!(" ({rows} such rows)"),
@@ -140,6 +159,10 @@ impl Problem {
     /// What to do about it.
     pub fn hint(&self) -> String {
         let hint = match self {
+            Self::OtherEnvironment { claimed, expected } => return other_environment(claimed, expected),
+            Self::Width { .. } => {
+                "choose a dataset of that environment, or the preset of the environment it was recorded in"
+            }
             Self::Io(_) => "check the path and its permissions",
             Self::UnknownFormat => {
                 "a dataset is a D4RL file (.hdf5), a folder of Minari, an OGBench file (.npz), \
@@ -150,7 +173,7 @@ impl Problem {
             }
             Self::Truncated { .. } | Self::DamagedHdf5(_) | Self::DamagedNpz(_) => {
                 "the file was cut off or damaged on its way: fetch or copy it again; \
-                 one of your own must be closed by whoever writes it"
+                 the program that writes one of your own must close it"
             }
             Self::UnreadableHdf5 { .. } | Self::UnreadableNpz { .. } | Self::Oversized { .. } => {
                 "the file is damaged: fetch or copy it again"
@@ -166,17 +189,20 @@ impl Problem {
                 "docs/data.md says which shape and type each array must have; all arrays need the same number of rows"
             }
             Self::Episodes { .. } => "the dataset is incomplete: fetch it again",
-            Self::OtherEnvironment { claimed, .. } => {
-                return format!("choose a preset for {claimed}, or another dataset");
-            }
-            Self::Width { environment, .. } => {
-                return format!(
-                    "choose a dataset of {environment}, or the preset of the environment it was recorded in"
-                );
-            }
             Self::NotFinite { .. } => "leave out or repair these rows: a single one would spoil every weight",
             Self::ActionOutside { .. } => {
                 "scale the actions so that each number lies within [-1, 1], and scale them back where they are applied"
+            }
+            Self::Group { .. } => {
+                "an observation may be an array or a Dict of arrays, but not a Dict of Dicts: write the numbers that you need \
+                 as one array into an HDF5 file of your own, as docs/data.md describes"
+            }
+            Self::DiscreteActions { .. } => {
+                "store continuous actions as float32, scaled so that each number lies within [-1, 1]"
+            }
+            Self::Stray { .. } => {
+                "keep the rows in the order of recording and mark where episodes end in `terminals` and `timeouts`; for \
+                 rows in any other order set the attribute `layout` as docs/data.md describes"
             }
             Self::Endless { .. } => "set `timeouts` to 1 at the last row of each episode that did not terminate",
             Self::NoTransitions { .. } => "record more: a transition needs a row and the one that follows it",
@@ -185,5 +211,15 @@ impl Problem {
             Self::BadRow { .. } => "each row must have the environment's sizes and finite numbers",
         };
         hint.to_owned()
+    }
+}
+
+fn other_environment(claimed: &str, expected: &str) -> String {
+    match environment::find(claimed) {
+        Ok(_) => format!("choose a preset for {claimed}, or another dataset"),
+        Err(_) => format!(
+            "it is another simulation, so a policy that learns from it cannot be scored in {expected}; train under a name of \
+             your own, without evaluations: --preset own-data --set environment=NAME"
+        ),
     }
 }

@@ -1,17 +1,18 @@
-//! Arrays of an HDF5 file, each checked for presence, type, shape and size before anybody uses it.
+//! Arrays of an HDF5 file, each checked for presence, type, shape and size before it is used.
 //!
 //! Damage to HDF5's own structures is libhdf5's to find, and its 1.10 does not survive all of it: a dataset is to come
 //! from a place that is trusted.
 
+use std::fmt::Display;
 use std::fs::File;
 use std::io::Read;
 use std::path::{Path, PathBuf};
 
-use hdf5::H5Type;
-use hdf5::types::{TypeDescriptor, VarLenUnicode};
+use hdf5::types::{FixedAscii, FixedUnicode, TypeDescriptor, VarLenAscii, VarLenUnicode};
+use hdf5::{Container, H5Type};
 
 use crate::array::Array;
-use crate::{DatasetError, Problem};
+use crate::error::{DatasetError, Problem};
 
 /// The first bytes of an HDF5 file.
 pub(crate) const SIGNATURE: &[u8] = b"\x89HDF\r\n\x1a\n";
@@ -21,6 +22,9 @@ const MAX_COMPRESSION: u64 = 1040;
 
 /// The largest number that is read, and the largest integer type that HDF5's own tools use for an enum.
 const MAX_ELEMENT_BYTES: usize = 8;
+
+/// The longest text of fixed length that is read whole.
+const MAX_TEXT: usize = 256;
 
 const NUMBERS: &str = "numbers";
 const FLAGS: &str = "booleans (h5py's enum, or numbers that are 0 or 1)";
@@ -75,16 +79,14 @@ impl Hdf5File {
         Some(names)
     }
 
-    /// A text that stands in the file as an array of its own, without axes.
+    /// A text that stands in the file as an array of its own.
     pub(crate) fn text(&self, array: &str) -> Option<String> {
-        let text = self.file.dataset(array).ok()?.read_scalar::<VarLenUnicode>().ok()?;
-        Some(text.as_str().to_owned())
+        text_in(&*self.file.dataset(array).ok()?)
     }
 
-    /// A text that the file's root has as an attribute.
+    /// A text that the file's root has as an attribute; empty where the attribute is something else.
     pub(crate) fn attribute(&self, name: &str) -> Option<String> {
-        let text = self.file.attr(name).ok()?.read_scalar::<VarLenUnicode>().ok()?;
-        Some(text.as_str().to_owned())
+        Some(text_in(&*self.file.attr(name).ok()?).unwrap_or_default())
     }
 
     /// Rows of an array, and numbers in each.
@@ -100,6 +102,14 @@ impl Hdf5File {
         let shape = self.check_size(&dataset, array)?;
         let values = dataset.read_raw::<T>().map_err(|source| self.unreadable(array, source))?;
         Array::new(array, &shape, values).map_err(|problem| self.error(problem))
+    }
+
+    /// An array of actions: numbers whose type says that they are continuous.
+    pub(crate) fn actions(&self, array: &str) -> Result<Array<f32>, DatasetError> {
+        match self.descriptor(&self.dataset(array)?, array, NUMBERS)? {
+            TypeDescriptor::Float(_) => self.numbers(array),
+            _ => Err(self.error(Problem::DiscreteActions { array: array.to_owned() })),
+        }
     }
 
     /// An array of `rows × width` numbers.
@@ -131,7 +141,10 @@ impl Hdf5File {
         if !self.has(array) {
             return Err(self.error(Problem::Missing { array: array.to_owned() }));
         }
-        self.file.dataset(array).map_err(|source| self.unreadable(array, source))
+        self.file.dataset(array).map_err(|source| match self.file.group(array) {
+            Ok(_) => self.error(Problem::Group { array: array.to_owned() }),
+            Err(_) => self.unreadable(array, source),
+        })
     }
 
     fn descriptor(
@@ -168,6 +181,18 @@ impl Hdf5File {
     fn unreadable(&self, array: &str, source: hdf5::Error) -> DatasetError {
         self.error(Problem::UnreadableHdf5 { array: array.to_owned(), source })
     }
+}
+
+/// The text that an attribute or an array holds, as HDF5's programs write one: of variable or fixed length, ASCII or UTF-8.
+fn text_in(holder: &Container) -> Option<String> {
+    fn as_type<T: H5Type + Display>(holder: &Container) -> Option<String> {
+        let texts = holder.read_raw::<T>().ok()?;
+        (texts.len() == 1).then(|| texts[0].to_string())
+    }
+    as_type::<VarLenUnicode>(holder)
+        .or_else(|| as_type::<VarLenAscii>(holder))
+        .or_else(|| as_type::<FixedUnicode<MAX_TEXT>>(holder))
+        .or_else(|| as_type::<FixedAscii<MAX_TEXT>>(holder))
 }
 
 /// The length that the file's superblock says the file has, of any of its versions with 8-byte addresses.

@@ -2,13 +2,12 @@
 //! written.
 //!
 //! # Layout
-//! In reading order: [`environment`] is what is known of an environment without simulating it; [`task`] is one that may
+//! In reading order: [`environment`] is what is known of an environment without simulating it; `task` is one that may
 //! be unknown. `hdf5_file` and `npz_file` read one `array` of a file and check everything about its form; `formats` has a
-//! file for each format, which turns arrays into a `recording`. [`transitions`] are what is learnt from, unless `checks`
-//! has objections, with [`reward`] and [`statistics`] beside it; [`sampler`] draws mini-batches; [`inspect`](mod@inspect)
-//! describes a source to people, whatever is wrong with it. [`recorded`] is a D4RL file as it was recorded, row by row;
-//! [`writer`] writes such a file; [`catalogue`] lists the files that can be asked for by name; [`error`] is what can go
-//! wrong with any of them.
+//! file for each format, which turns arrays into a `recording`. `transitions` are what is learnt from, unless `checks`
+//! has objections, with `reward` and `statistics` beside it; `sampler` draws mini-batches; `inspect` describes a source to
+//! people, whatever is wrong with it. `recorded` is a D4RL file as it was recorded, row by row; `writer` writes such a file;
+//! [`catalogue`] lists the files that can be asked for by name; `error` is what can go wrong with any of them.
 //!
 //! This crate knows nothing of networks, simulators or the wire.
 
@@ -18,19 +17,19 @@ mod array;
 pub mod catalogue;
 mod checks;
 pub mod environment;
-pub mod error;
+mod error;
 mod formats;
 mod hdf5_file;
-pub mod inspect;
+mod inspect;
 mod npz_file;
-pub mod recorded;
+mod recorded;
 mod recording;
-pub mod reward;
-pub mod sampler;
-pub mod statistics;
-pub mod task;
-pub mod transitions;
-pub mod writer;
+mod reward;
+mod sampler;
+mod statistics;
+mod task;
+mod transitions;
+mod writer;
 
 pub use catalogue::NamedDataset;
 pub use environment::{EnvironmentSpec, Goal, UnknownEnvironment};
@@ -40,8 +39,8 @@ pub use hdf5_file::hdf5_library;
 pub use inspect::{Inspection, inspect};
 pub use recorded::{RecordedRows, Row, environments_of_its_sizes};
 pub use reward::RewardRule;
-pub use sampler::{Batch, BatchSampler};
+pub use sampler::BatchSampler;
 pub use statistics::Statistics;
 pub use task::Task;
-pub use transitions::{ReadOptions, Transitions};
+pub use transitions::{Batch, ReadOptions, Transitions};
 pub use writer::{D4rlWriter, Metadata};

@@ -4,12 +4,12 @@ use std::fs::File;
 use std::io::{self, BufReader};
 use std::path::{Path, PathBuf};
 
-use npyz::{Deserialize, NpyFile, Order, TypeChar};
+use npyz::{DType, Deserialize, NpyFile, Order, TypeChar};
 use zip::ZipArchive;
 use zip::result::ZipError;
 
 use crate::array::Array;
-use crate::{DatasetError, Problem};
+use crate::error::{DatasetError, Problem};
 
 /// The first bytes of a zip file.
 pub(crate) const SIGNATURE: &[u8] = b"PK";
@@ -34,7 +34,12 @@ impl NpzFile {
 
     /// An array of numbers, converted to float32, that may be NaN.
     pub(crate) fn numbers(&mut self, array: &str) -> Result<Array<f32>, DatasetError> {
-        self.read(array).map_err(|problem| self.error(problem))
+        self.read(array, false).map_err(|problem| self.error(problem))
+    }
+
+    /// An array of actions: numbers whose type says that they are continuous.
+    pub(crate) fn actions(&mut self, array: &str) -> Result<Array<f32>, DatasetError> {
+        self.read(array, true).map_err(|problem| self.error(problem))
     }
 
     /// An array of `rows × width` numbers.
@@ -53,7 +58,7 @@ impl NpzFile {
         DatasetError::new(&self.path, problem)
     }
 
-    fn read(&mut self, array: &str) -> Result<Array<f32>, Problem> {
+    fn read(&mut self, array: &str, continuous: bool) -> Result<Array<f32>, Problem> {
         let name = array.to_owned();
         let entry = self.archive.by_name(&entry(array)).map_err(|error| match error {
             ZipError::FileNotFound => Problem::Missing { array: name.clone() },
@@ -63,7 +68,9 @@ impl NpzFile {
         let unreadable = |source| Problem::UnreadableNpz { array: name.clone(), source };
         let mut reader = BufReader::new(entry);
         let file = NpyFile::new(&mut reader).map_err(unreadable)?;
-
+        if continuous && holds_whole_numbers(&file.dtype()) {
+            return Err(Problem::DiscreteActions { array: name });
+        }
         let shape: Vec<usize> = file.shape().iter().map(|&axis| axis as usize).collect();
         let claimed = shape.iter().fold(1u64, |product, &axis| product.saturating_mul(axis as u64));
         if claimed > bytes || shape.first().is_some_and(|&rows| rows > u32::MAX as usize) {
@@ -81,8 +88,13 @@ fn entry(array: &str) -> String {
     format!("{array}.npy")
 }
 
+fn holds_whole_numbers(dtype: &DType) -> bool {
+    let DType::Plain(element) = dtype else { return false };
+    matches!(element.type_char(), TypeChar::Bool | TypeChar::Int | TypeChar::Uint)
+}
+
 fn floats<R: io::Read>(file: NpyFile<R>, array: &str) -> Result<Vec<f32>, Problem> {
-    let npyz::DType::Plain(element) = file.dtype() else {
+    let DType::Plain(element) = file.dtype() else {
         return Err(wrong_type(array, file.dtype().descr()));
     };
     match (element.type_char(), element.size_field()) {

@@ -2,8 +2,9 @@
 
 use std::path::Path;
 
+use crate::environment::{self, EnvironmentSpec};
+use crate::error::{DatasetError, Problem};
 use crate::hdf5_file::Hdf5File;
-use crate::{DatasetError, EnvironmentSpec, Problem, environment};
 
 /// One recorded step, in the simulator's precision.
 #[derive(Clone, Copy, Debug, PartialEq)]

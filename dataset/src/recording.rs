@@ -31,9 +31,11 @@ pub(crate) struct Recording {
     pub rewards: Vec<f32>,
     /// N × o, where the format stores them apart. Else the following row's observation is the next one.
     pub next_observations: Option<Vec<f32>>,
+    /// N × o, where a D4RL file stores them although the following row's observation is the next one.
+    pub unused_next_observations: Option<Vec<f32>>,
     /// N.
     pub kinds: Vec<RowKind>,
-    /// Whether nothing is to be gained after a row, so that its mask is 0; N.
+    /// Whether a row is terminal, so that its mask is 0 and the critics do not bootstrap; N.
     pub terminals: Vec<bool>,
     /// Whether the episode was cut off after a row; N.
     pub timeouts: Vec<bool>,
@@ -86,6 +88,12 @@ impl Recording {
             (self.rewards[row], ends)
         });
         returns(rows)
+    }
+
+    /// Rows to which the following row is said to belong.
+    pub(crate) fn inside(&self) -> impl Iterator<Item = usize> {
+        let last = self.rows().saturating_sub(1);
+        (0..last).filter(|&row| self.kinds[row] != RowKind::LastState && !self.ends[row])
     }
 
     /// Whether `following`, the next row to learn from after `row`, goes on where that one led to.

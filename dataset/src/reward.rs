@@ -15,15 +15,6 @@ pub enum RewardRule {
     /// `r - 1`: IQL's rule for AntMaze. Each step before the goal costs 1.
     #[serde(rename = "subtract-1")]
     Subtract1,
-    /// `(r - 0.5) · 4`: CQL's rule for AntMaze.
-    #[serde(rename = "subtract-0.5-times-4")]
-    SubtractHalfTimes4,
-    /// `r · 100`, in use for AntMaze.
-    #[serde(rename = "times-100")]
-    Times100,
-    /// `(r - 0.25) · 2`, in use for AntMaze.
-    #[serde(rename = "subtract-0.25-times-2")]
-    SubtractQuarterTimes2,
 }
 
 /// Training rewards as a function of recorded ones: `(r - subtract) · times`.
@@ -53,9 +44,6 @@ impl RewardRule {
             }
             Self::AsIs => (0.0, 1.0),
             Self::Subtract1 => (1.0, 1.0),
-            Self::SubtractHalfTimes4 => (0.5, 4.0),
-            Self::Times100 => (0.0, 100.0),
-            Self::SubtractQuarterTimes2 => (0.25, 2.0),
         };
         Some(Scaling { subtract, times })
     }
@@ -71,14 +59,8 @@ mod tests {
         struct Preset {
             reward: RewardRule,
         }
-        for (name, of_0, of_1) in [
-            ("locomotion", 0.0, 250.0), // returns from -1 to 3
-            ("as-is", 0.0, 1.0),
-            ("subtract-1", -1.0, 0.0),
-            ("subtract-0.5-times-4", -2.0, 2.0),
-            ("times-100", 0.0, 100.0),
-            ("subtract-0.25-times-2", -0.5, 1.5),
-        ] {
+        // The returns are from -1 to 3.
+        for (name, of_0, of_1) in [("locomotion", 0.0, 250.0), ("as-is", 0.0, 1.0), ("subtract-1", -1.0, 0.0)] {
             let preset: Preset = toml::from_str(&format!("reward = '{name}'")).unwrap();
             let scaling = preset.reward.scaling(&[3.0, -1.0, 0.5]).unwrap();
             assert_eq!((scaling.apply(0.0), scaling.apply(1.0)), (of_0, of_1), "{name}");

@@ -3,34 +3,7 @@
 use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 
-use crate::Transitions;
-
-/// B transitions, each array row by row. Reused from step to step; make the first one with `Batch::default()`.
-#[derive(Clone, Debug, Default, PartialEq)]
-pub struct Batch {
-    /// s, B × o.
-    pub observations: Vec<f32>,
-    /// a, B × a.
-    pub actions: Vec<f32>,
-    /// r, B.
-    pub rewards: Vec<f32>,
-    /// s', B × o.
-    pub next_observations: Vec<f32>,
-    /// 0 where the episode terminated, else 1; B.
-    pub masks: Vec<f32>,
-    /// B.
-    pub size: usize,
-}
-
-impl Batch {
-    pub(crate) fn clear(&mut self) {
-        for array in
-            [&mut self.observations, &mut self.actions, &mut self.rewards, &mut self.next_observations, &mut self.masks]
-        {
-            array.clear();
-        }
-    }
-}
+use crate::transitions::{Batch, Transitions};
 
 /// Keeps these draws apart from other uses of the run's seed.
 const PURPOSE: u64 = u64::from_be_bytes(*b"batches ");

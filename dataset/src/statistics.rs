@@ -1,6 +1,6 @@
 //! Figures that describe a dataset.
 
-use crate::EnvironmentSpec;
+use crate::environment::EnvironmentSpec;
 
 /// How much a dataset holds and how good its behaviour is, from the recorded rewards.
 #[derive(Clone, Copy, Debug, PartialEq)]

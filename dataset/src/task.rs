@@ -1,10 +1,9 @@
 //! What a run is about: an environment by its name, known here or not.
 
-use crate::EnvironmentSpec;
-use crate::environment;
+use crate::environment::{self, EnvironmentSpec};
 
 /// Where a run's data is from and where its policies act. An environment that is not in the table has the sizes of its
-/// dataset, no time limit that anybody knows, and no reference returns.
+/// dataset, no known time limit, and no reference returns.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Task {
     /// Name of the environment.

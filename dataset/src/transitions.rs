@@ -3,13 +3,42 @@
 use std::path::Path;
 
 use crate::checks;
+use crate::environment::EnvironmentSpec;
+use crate::error::{DatasetError, Problem};
 use crate::formats::Source;
 use crate::recording::Recording;
+use crate::reward::RewardRule;
 use crate::statistics::Statistics;
-use crate::{Batch, DatasetError, EnvironmentSpec, Problem, RewardRule};
 
 /// Actions are kept this far within ±1, where policies that squash can still reach them.
 const ACTION_LIMIT: f32 = 1.0 - 1e-5;
+
+/// B transitions, each array row by row. Reused from step to step; make the first one with `Batch::default()`.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct Batch {
+    /// s, B × o.
+    pub observations: Vec<f32>,
+    /// a, B × a.
+    pub actions: Vec<f32>,
+    /// r, B.
+    pub rewards: Vec<f32>,
+    /// s', B × o.
+    pub next_observations: Vec<f32>,
+    /// 0 where the episode terminated, else 1; B.
+    pub masks: Vec<f32>,
+    /// B.
+    pub size: usize,
+}
+
+impl Batch {
+    fn clear(&mut self) {
+        for array in
+            [&mut self.observations, &mut self.actions, &mut self.rewards, &mut self.next_observations, &mut self.masks]
+        {
+            array.clear();
+        }
+    }
+}
 
 /// How a source is to be read.
 #[derive(Clone, Copy, Debug)]

@@ -8,7 +8,9 @@ use hdf5::types::VarLenUnicode;
 use hdf5::{H5Type, Hyperslab, SliceOrIndex};
 use ndarray::ArrayViewD;
 
-use crate::{DatasetError, EnvironmentSpec, Problem, Row};
+use crate::environment::EnvironmentSpec;
+use crate::error::{DatasetError, Problem};
+use crate::recorded::Row;
 
 /// Rows in a chunk, and in the buffer before it is written: a few hundred kilobytes in all.
 const CHUNK_ROWS: usize = 4096;

@@ -16,7 +16,7 @@
 #
 # The result is the folder DIR/NAME with ca.pem, cert.pem and key.pem, for `--certificates` of learner and evaluator: copy
 # it to the machine that it is for. Made again, it is renewed. The authority is DIR/ca, made when it is missing: its key
-# (DIR/ca/key.pem) signs, so it stays on this machine, or offline until this runs again: whoever has it can make any certificate.
+# (DIR/ca/key.pem) signs, so it stays on this machine, or offline until this runs again: its owner can make any certificate.
 #
 #   --in DIR   [default: certificates]
 #   --days N   how long the certificate is valid [default: 365]; the authority is for ten years, and no certificate for longer
@@ -52,7 +52,7 @@ case $ROLE in
   *) wrong "$ROLE is none of the roles" ;;
 esac
 [[ $ROLE != router || $# -gt 0 ]] || wrong "at which HOST do others connect to the router?"
-[[ ${#HOSTS[@]} -gt 0 || $# -eq 0 ]] || wrong "nobody connects to an evaluator or a monitor, so they have no HOST"
+[[ ${#HOSTS[@]} -gt 0 || $# -eq 0 ]] || wrong "evaluators and monitors only connect to others, so they have no HOST"
 # A folder's name and a part of the certificate's subject.
 [[ $WHO =~ ^[A-Za-z0-9][A-Za-z0-9._-]{0,63}$ ]] ||
   wrong "the name $WHO is not made of 1 to 64 letters, digits, dots, dashes or underscores"
@@ -70,10 +70,10 @@ new_key() { # new_key FILE: on the curve that every TLS library has
 }
 
 if [ ! -e "$DIR/ca/key.pem" ] || [ ! -e "$DIR/ca/ca.pem" ]; then
-  # Whoever has a certificate trusts the authority that signed it, and would refuse what another one signs.
+  # The owners of certificates trust the authority that signed them, and would refuse what another one signs.
   for made in "$DIR"/*/ca.pem "$DIR/ca/key.pem"; do
     [ ! -e "$made" ] || die "$made is there, but not the whole authority: $DIR/ca/ca.pem and $DIR/ca/key.pem" \
-      "if they are kept elsewhere, put them back while this runs; for another authority, which nobody trusts yet, move $DIR away"
+      "if they are kept elsewhere, put them back while this runs; for another authority, which no program trusts yet, move $DIR away"
   done
   mkdir -p "$SCRATCH/ca"
   new_key "$SCRATCH/ca/key.pem"

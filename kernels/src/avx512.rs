@@ -36,6 +36,16 @@ pub(crate) struct Strided<T> {
     pub column: usize,
 }
 
+/// Two neighbours of a sum's terms, rounded to bfloat16, in one element.
+type Pair = i32;
+
+/// Whether this CPU has AVX512-BF16.
+fn has_bf16() -> bool {
+    is_x86_feature_detected!("avx512f")
+        && is_x86_feature_detected!("avx512bw")
+        && is_x86_feature_detected!("avx512bf16")
+}
+
 thread_local! {
     /// A block of columns of the right side.
     static BLOCK: RefCell<Vec<Line<f32>>> = RefCell::default();
@@ -68,7 +78,7 @@ macro_rules! panel {
                 for p in 0..k {
                     let b = b.add(p * COLUMNS);
                     let (left, right) = ($load(b), $load(b.add(LANES)));
-                    // Behind the last block it is an address that nobody reads.
+                    // Prefetching past the end of the last block is harmless.
                     let soon = ahead.first.wrapping_add(p * ahead.row);
                     _mm_prefetch::<_MM_HINT_T0>(soon.cast());
                     _mm_prefetch::<_MM_HINT_T0>(soon.wrapping_add(LANES).cast());

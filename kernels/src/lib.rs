@@ -4,9 +4,10 @@
 //!
 //! - [`product`]: dense products on one thread, in f32 and with operands rounded to bfloat16.
 //! - `avx512`: the products that the libraries at hand do more slowly (docs/performance.md says by how much).
-//! - [`activation`]: Mish, its derivative, and the narrow first and last layer of a network fused with it.
+//! - [`activation`]: Mish and its derivative; [`narrow`]: the first and last layer of a network, fused with it.
 //! - [`optimiser`]: Adam, EMA and sums over whole parameter vectors.
 //! - [`Buffer`] (`buffer`): memory that is used again and again, aligned to cache lines.
+//! - `vectorised`: the macro that the loops of the two above are written with.
 //!
 //! Matrices are row-major `f32` slices; a name's shape is given as `rows × columns`. What a CPU can do is found out at
 //! run time.
@@ -15,7 +16,9 @@ pub mod activation;
 #[cfg(target_arch = "x86_64")]
 mod avx512;
 mod buffer;
+pub mod narrow;
 pub mod optimiser;
 pub mod product;
+mod vectorised;
 
 pub use buffer::Buffer;

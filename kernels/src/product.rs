@@ -99,7 +99,7 @@ impl Rounded {
     }
 }
 
-/// `out[m × k] = g[m × n] · w[k × n]ᵀ`: a gradient's way back through `product`.
+/// `out[m × k] = g[m × n] · w[k × n]ᵀ`: a gradient's backward pass through `product`.
 pub fn product_transposed(g: &[f32], w: &[f32], out: &mut [f32], k: usize, n: usize) {
     let m = g.len() / n;
     assert!(g.len() == m * n && w.len() == k * n, "operands of a product");

@@ -1,60 +1,26 @@
 //! The learner: trains on a dataset, publishes snapshots, collects their scores, and keeps all of it in the run's folder.
 //!
 //! # Layout
-//! In reading order:
+//! In reading order, each room over those below it:
 //!
-//! - [`cli`] is the command line; [`config`] the experiment that it describes, one of the [`presets`] with flags on top,
-//!   validated once; [`schedule`] says which of its steps are evaluated.
-//! - [`datasets`] finds or fetches the data that a run learns from.
-//! - [`run`] goes from the command line to the exit, [`resume`] takes up a run that was there, by its [`settings`];
-//!   [`conduct`] is the main loop in between.
-//! - [`threads`] starts the threads that do the work: [`trainer`] and [`train`] (nothing but gradient steps, by an [`agent`] on a
-//!   [`device`]), [`keeper`] (snapshots and checkpoints to the disk), [`publisher`] (publishes snapshots), [`hub`]
-//!   (hands out jobs, takes scores in) and [`scribe`] (scores to the disk).
-//! - [`agent`] runs one of the [`algorithms`], each a file to be read beside its paper, with an [`optimiser`] and the
-//!   [`random`] numbers of its seed, on a thread pool that is kept awake (`pool`).
-//! - [`scoreboard`] is the hub's state without any I/O.
-//! - [`wire`] declares everything on Zenoh; its callbacks fill an [`inbox`], [`replies`] answers and a [`herald`] publishes, so
-//!   that nobody else waits for a peer that does not read; [`notice`] is what threads tell the main loop.
-//! - [`run_dir`] is the folder of a run, [`trouble`] what is told of a disk that takes nothing, [`metrics`] are for Prometheus, [`display`] shows progress on the terminal.
-//! - [`doctor`] checks a machine before a run is trusted to it.
-//! - [`report`] and [`plot`] summarise the scores as tables and as a picture; [`verify`] checks them against the folder.
+//! - `cli` is the command line, [`command`] goes from there to the exit.
+//! - `service` is a run at work: threads, main loop, Zenoh.
+//! - `report` summarises scores as tables and as a picture.
+//! - [`train`] makes gradient steps.
+//! - `run` is the folder of a run.
+//! - `evaluation` is what is to be scored and by which evaluator, without input or output.
+//! - `data` finds or fetches the data that a run learns from; [`config`] says what was asked for.
+//! - [`algorithms`]: each a file to be read beside its paper.
 
 #![deny(unsafe_code)]
 
-pub mod agent;
 pub mod algorithms;
 pub mod cli;
-pub mod conduct;
+pub mod command;
 pub mod config;
-pub mod datasets;
-pub mod device;
-pub mod display;
-pub mod doctor;
-pub mod herald;
-pub mod hub;
-pub mod inbox;
-pub mod keeper;
-pub mod metrics;
-pub mod notice;
-pub mod optimiser;
-pub mod plot;
-mod pool;
-pub mod presets;
-pub mod publisher;
-pub mod random;
-pub mod replies;
-pub mod report;
-pub mod resume;
-pub mod run;
-pub mod run_dir;
-pub mod schedule;
-pub mod scoreboard;
-pub mod scribe;
-pub mod settings;
-pub mod threads;
+mod data;
+mod evaluation;
+mod report;
+mod run;
+mod service;
 pub mod train;
-pub mod trainer;
-pub mod trouble;
-pub mod verify;
-pub mod wire;

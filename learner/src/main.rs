@@ -8,5 +8,5 @@ use quad_learner::cli::Cli;
 fn main() -> ExitCode {
     quad_service::choose_zenoh_threads();
     let cli = Cli::parse();
-    quad_service::run_main(quad_service::init_logging(), || quad_learner::run::run(&cli))
+    quad_service::run_main(quad_service::init_logging(), || quad_learner::command::run(&cli))
 }

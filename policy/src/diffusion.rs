@@ -1,40 +1,21 @@
 //! The diffusion policy: the best of N_a candidates (Eq. 25), drawn from the target actor and valued by the target critics.
 
-use crate::ensemble::tile_numbers;
-use crate::kind::{Cost, check_range};
+use crate::ensemble::Ensemble;
+use crate::error::PolicyError;
+use crate::noise_predictor::NoisePredictor;
+use crate::policy::{ActionNoise, Cost, Policy, check_range};
+use crate::precision::Precision;
+use crate::shape::{EnsembleShape, NoiseShape, tile_numbers};
 use crate::slices::read;
-use crate::weights::{Tensors, Weights};
-use crate::{Ensemble, EnsembleShape, NoisePredictor, NoiseShape, Policy, PolicyError, Precision};
+use crate::weights::{Layout, Tensors, Weights};
 use candle_core::{Device, Tensor};
-use rand::SeedableRng;
-use rand_chacha::ChaCha8Rng;
-use rand_distr::{Distribution, StandardNormal};
 use serde::{Deserialize, Serialize};
 
-/// The stream, among those of an episode's seed, that action noise is drawn from.
-const ACTION_STREAM: u64 = 2;
 /// Most denoising steps that are believed; the tensors' shapes do not bound them.
 const MOST_STEPS: usize = 1000;
 /// Before the names of the two networks' tensors.
 const ACTOR: &str = "actor.";
 const CRITIC: &str = "critic.";
-
-/// The noise that one episode's actions are drawn from. A stream for each episode: its result does not depend on which
-/// other episodes shared a batch with it.
-pub struct ActionNoise(ChaCha8Rng);
-
-impl ActionNoise {
-    /// The stream of an episode's seed, apart from any other use of that seed.
-    pub fn new(episode_seed: u64) -> Self {
-        let mut generator = ChaCha8Rng::seed_from_u64(episode_seed);
-        generator.set_stream(ACTION_STREAM);
-        Self(generator)
-    }
-
-    fn fill(&mut self, out: &mut [f32]) {
-        out.fill_with(|| StandardNormal.sample(&mut self.0));
-    }
-}
 
 /// The shapes of a diffusion policy's networks.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
@@ -104,7 +85,7 @@ impl DiffusionPolicy {
         precision: Precision,
     ) -> Result<Self, PolicyError> {
         shape.check()?;
-        let mut weights = |layout: crate::Layout, prefix: &str| -> Result<Weights, PolicyError> {
+        let mut weights = |layout: Layout, prefix: &str| -> Result<Weights, PolicyError> {
             let values = layout.join(tensors, prefix)?;
             Ok(Weights::constant(layout, values))
         };

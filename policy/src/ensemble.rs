@@ -2,63 +2,19 @@
 //!
 //! On the CPU custom operations of candle's do the work (`ensemble_ops`); elsewhere plain ones do.
 
-use crate::Precision;
 use crate::ensemble_ops::{ActionGradients, Networks, Outputs, SquaredError};
-use crate::kind::Cost;
-use crate::layers::Layers;
-use crate::network::TILE;
 use crate::operation::OnCpu;
 use crate::plain;
-use crate::record::{Pool, Record};
+use crate::precision::Precision;
 use crate::rounded::RoundedOnce;
+use crate::saved::{Pool, SavedActivations};
+use crate::shape::EnsembleShape;
 use crate::slices::{has_fast_body, read};
-use crate::weights::{Layout, Weights};
+use crate::weights::Weights;
 use candle_core::{Result, Tensor, Var, bail};
 use quad_kernels::product::Rounded;
 use rayon::prelude::*;
 use std::sync::Arc;
-
-/// The shape of an ensemble.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub struct EnsembleShape {
-    /// Networks, K.
-    pub members: usize,
-    /// Numbers in an observation s.
-    pub observation_dim: usize,
-    /// Numbers in an action a; 0 for networks of s alone.
-    pub action_dim: usize,
-    /// Width of the three hidden layers.
-    pub hidden: usize,
-    /// Numbers that come out.
-    pub outputs: usize,
-}
-
-impl EnsembleShape {
-    fn layers(&self) -> Layers {
-        let Self { observation_dim, action_dim, hidden, .. } = *self;
-        Layers::new(self.members, &[observation_dim + action_dim, hidden, hidden, hidden, self.outputs], 0)
-    }
-
-    /// What it takes to run all networks forward on so many states, `repeat` rows for each.
-    pub(crate) fn cost(&self, states: u64, repeat: u64) -> Cost {
-        let (rows, members) = (states.saturating_mul(repeat), self.members as u64);
-        let outputs = rows.saturating_mul(members).saturating_mul(self.outputs as u64);
-        let bytes = 4 * outputs.saturating_add(tile_numbers(repeat, self.hidden));
-        Cost { bytes, products: rows.saturating_mul(self.layout().count() as u64) }
-    }
-
-    /// Tensors `{0..3}.kernel` `[K, in, out]` and `{0..3}.bias` `[K, out]`.
-    pub fn layout(&self) -> Layout {
-        Layout::new(self.layers().named("", true))
-    }
-}
-
-/// Numbers that the threads keep of the tiles of rows that they are at: rows of one state are not parted, and of each row
-/// there are some hidden layers.
-pub(crate) fn tile_numbers(repeat: u64, hidden: usize) -> u64 {
-    const LAYERS: u64 = 6;
-    (rayon::current_num_threads() as u64 * LAYERS).saturating_mul(repeat.max(TILE as u64)).saturating_mul(hidden as u64)
-}
 
 /// An ensemble and its weights.
 pub struct Ensemble {
@@ -67,7 +23,7 @@ pub struct Ensemble {
     weights: Weights,
     precision: Precision,
     rounded: RoundedOnce<Vec<[Rounded; 2]>>,
-    records: Pool<Record>,
+    saved: Pool<SavedActivations>,
     gradients: Pool<Vec<f32>>,
 }
 
@@ -94,28 +50,28 @@ impl Ensemble {
     }
 
     fn over(networks: Arc<Networks>, weights: Weights, precision: Precision) -> Self {
-        let (rounded, records, gradients) = (RoundedOnce::default(), Pool::default(), Pool::default());
-        Self { shape: networks.shape, networks, weights, precision, rounded, records, gradients }
+        let (rounded, saved, gradients) = (RoundedOnce::default(), Pool::default(), Pool::default());
+        Self { shape: networks.shape, networks, weights, precision, rounded, saved, gradients }
     }
 
     /// What comes out, `[K, rows, outputs]`, a row for each action.
     ///
     /// `observations` is `[n, o]`; `actions` `[rows, a]`, where equally many consecutive rows share an observation.
-    /// Gradients flow to the weights; to actions they flow, too, but by the plain body.
+    /// Differentiable in the weights; in the actions, too, but slowly, by the plain implementation.
     pub fn outputs(&self, observations: &Tensor, actions: &Tensor) -> Result<Tensor> {
         self.check(observations, actions)?;
         let weights = self.weights.values();
         if !has_fast_body(weights.device()) || observations.track_op() || actions.track_op() {
             return self.plain_outputs(observations, actions);
         }
-        let record = match (weights.track_op(), self.weights.kept_gradient()) {
+        let saved = match (weights.track_op(), self.weights.kept_gradient()) {
             (false, _) => None,
-            (true, Some(kept)) if observations.dim(0)? == actions.dim(0)? => Some((kept, self.records.lend())),
+            (true, Some(kept)) if observations.dim(0)? == actions.dim(0)? => Some((kept, self.saved.lend())),
             _ => return self.plain_outputs(observations, actions),
         };
-        let rounds = self.precision == Precision::Bf16 && record.is_none();
+        let rounds = self.precision == Precision::Bf16 && saved.is_none();
         let rounded = if rounds { Some(self.rounded()?) } else { None };
-        let operation = OnCpu(Outputs { networks: self.networks.clone(), rounded, record });
+        let operation = OnCpu(Outputs { networks: self.networks.clone(), rounded, saved });
         weights.apply_op3(&observations.contiguous()?, &actions.contiguous()?, operation)
     }
 
@@ -137,8 +93,8 @@ impl Ensemble {
 
     /// Mean over members and rows of (Q_k(s, a) - y)², `[]`, for `targets` y `[rows]`, which are constants.
     ///
-    /// On the CPU the way back begins on the way forward, as soon as a tile's errors are known and while its activations
-    /// are at hand.
+    /// On the CPU the backward pass begins within the forward pass: as soon as a tile's errors are known, while its
+    /// activations are at hand.
     pub fn squared_error(&self, observations: &Tensor, actions: &Tensor, targets: &Tensor) -> Result<Tensor> {
         self.check(observations, actions)?;
         let weights = self.weights.values();
@@ -203,7 +159,7 @@ impl Ensemble {
         values.broadcast_sub(&targets.detach())?.sqr()?.mean_all()
     }
 
-    /// [`Self::action_gradients`] in plain candle operations. One way back gives the gradients of all members at actions
+    /// [`Self::action_gradients`] in plain candle operations. One backward pass gives the gradients of all members at actions
     /// of their own: none has a part in another's.
     pub(crate) fn plain_action_gradients(&self, observations: &Tensor, actions: &Tensor) -> Result<Tensor> {
         let weights = self.weights.layout().split(&self.weights.values().detach(), "")?;

@@ -3,11 +3,11 @@
 //! It is cut into (member, tile of rows) and runs in parallel; the cut does not depend on the number of threads, so neither
 //! do the results.
 
-use crate::EnsembleShape;
 use crate::layers::{LayerMut, Layers};
 use crate::network::{Input, Network, TILE, rows_of, with_workspace};
 use crate::operation::{Arguments, Operation};
-use crate::record::{Lent, Record, concatenate, layer_gradient};
+use crate::saved::{Lent, SavedActivations, concatenate, layer_gradient};
+use crate::shape::EnsembleShape;
 use crate::weights::KeptGradient;
 use candle_core::{Result, Shape};
 use quad_kernels::optimiser::weighted_sum;
@@ -47,11 +47,11 @@ impl Networks {
         });
     }
 
-    /// Runs all members forward, tile by tile, and keeps what the way back needs.
-    fn record(&self, given: Arguments<'_>, record: &mut Record, out: &mut [f32]) {
+    /// Runs all members forward, tile by tile, and keeps what the backward pass needs.
+    fn forward_saving(&self, given: Arguments<'_>, saved: &mut SavedActivations, out: &mut [f32]) {
         let EnsembleShape { members, observation_dim, action_dim, hidden, .. } = self.shape;
-        record.resize(members, given.rows, hidden);
-        record.tiles(out).into_par_iter().for_each(|mut tile| {
+        saved.resize(members, given.rows, hidden);
+        saved.tiles(out).into_par_iter().for_each(|mut tile| {
             let network = self.member(given.weights, tile.member);
             let observations = rows_of(given.observations, tile.index * TILE, TILE, observation_dim);
             let actions = rows_of(given.actions, tile.index * TILE, TILE, action_dim);
@@ -59,15 +59,15 @@ impl Networks {
                 work.with_base(observations.len() / observation_dim * hidden, 0, |base, _, work| {
                     network.state_part(observations, base);
                     let input = Input { base, repeat: 1, shift: network.bias(0), actions };
-                    network.forward_recorded(input, &mut tile.activations, work.scratch(), tile.out);
+                    network.forward_saving(input, &mut tile.activations, work.scratch(), tile.out);
                 });
             });
         });
     }
 
     /// Goes from the outputs' gradient, `K × rows × outputs`, back to those before each activation.
-    fn back(&self, weights: &[f32], record: &mut Record, output_gradient: &mut [f32]) {
-        record.tiles(output_gradient).into_par_iter().for_each(|mut tile| {
+    fn back(&self, weights: &[f32], saved: &mut SavedActivations, output_gradient: &mut [f32]) {
+        saved.tiles(output_gradient).into_par_iter().for_each(|mut tile| {
             let network = self.member(weights, tile.member);
             with_workspace(|work| network.backward(tile.out, &mut tile.activations.slope, work.scratch()));
         });
@@ -78,8 +78,8 @@ impl Networks {
 pub(crate) struct Outputs {
     pub networks: Arc<Networks>,
     pub rounded: Option<Arc<Vec<[Rounded; 2]>>>,
-    /// For a way back to the weights: where their gradient is left, and what is kept for it.
-    pub record: Option<(Arc<KeptGradient>, Lent<Record>)>,
+    /// For a backward pass to the weights: where their gradient is left, and what is kept for it.
+    pub saved: Option<(Arc<KeptGradient>, Lent<SavedActivations>)>,
 }
 
 impl Operation for Outputs {
@@ -88,8 +88,8 @@ impl Operation for Outputs {
     fn forward(&self, given: Arguments<'_>) -> Result<(Vec<f32>, Shape)> {
         let EnsembleShape { members, observation_dim, hidden, outputs, .. } = self.networks.shape;
         let mut out = vec![0.0; members * given.rows * outputs];
-        if let Some((_, lent)) = &self.record {
-            self.networks.record(given, &mut lent.lock(), &mut out);
+        if let Some((_, lent)) = &self.saved {
+            self.networks.forward_saving(given, &mut lent.lock(), &mut out);
         } else {
             let repeat = given.rows / given.states;
             self.networks.for_each_tile(given, &mut out, |k, network, states, actions, out| {
@@ -107,17 +107,17 @@ impl Operation for Outputs {
     }
 
     fn backward(&self, given: Arguments<'_>, gradient: &[f32]) -> Result<()> {
-        let Some((kept, lent)) = &self.record else { return Ok(()) };
+        let Some((kept, lent)) = &self.saved else { return Ok(()) };
         let EnsembleShape { observation_dim, action_dim, .. } = self.networks.shape;
         let input = concatenate(given.observations, given.actions, (observation_dim, action_dim));
-        let mut record = lent.lock();
+        let mut saved = lent.lock();
         // The copy is cut up; the other is read as a whole.
-        self.networks.back(given.weights, &mut record, &mut gradient.to_vec());
-        kept.write(|out| record.weight_gradients(self.networks.layers.split_mut(out), &input, gradient))
+        self.networks.back(given.weights, &mut saved, &mut gradient.to_vec());
+        kept.write(|out| saved.weight_gradients(self.networks.layers.split_mut(out), &input, gradient))
     }
 }
 
-/// Mean over members and rows of (Q_k(s, a) - y)². As soon as a tile's errors are known, its way back begins, while its
+/// Mean over members and rows of (Q_k(s, a) - y)². As soon as a tile's errors are known, its backward pass begins, while its
 /// activations are at hand; what is left for later is to add up the tiles' gradients.
 pub(crate) struct SquaredError {
     pub networks: Arc<Networks>,
@@ -138,7 +138,7 @@ impl SquaredError {
                 network.state_part(observations, base);
                 let input = Input { base, repeat: 1, shift: network.bias(0), actions };
                 let (mut left, scratch) = work.activations(len);
-                network.forward_recorded(input, &mut left, scratch, values);
+                network.forward_saving(input, &mut left, scratch, values);
                 let mut loss = 0.0;
                 for (q, y) in values.iter_mut().zip(targets) {
                     let error = *q - y;
@@ -192,7 +192,7 @@ impl Operation for SquaredError {
     }
 }
 
-/// ∇_a Q_k(s, a): `K × rows × a`, worked out tile by tile on the way forward, while its activations are at hand.
+/// ∇_a Q_k(s, a): `K × rows × a`, worked out tile by tile on the forward pass, while its activations are at hand.
 pub(crate) struct ActionGradients {
     pub networks: Arc<Networks>,
 }
@@ -210,7 +210,7 @@ impl Operation for ActionGradients {
                     network.state_part(states, base);
                     let input = Input { base, repeat, shift: network.bias(0), actions };
                     let (mut left, scratch) = work.activations(rows * hidden);
-                    network.forward_recorded(input, &mut left, scratch, values);
+                    network.forward_saving(input, &mut left, scratch, values);
                     values.fill(1.0);
                     let (mut left, scratch) = work.activations(rows * hidden);
                     network.backward(values, &mut left.slope, scratch);

@@ -12,7 +12,7 @@ pub enum PolicyError {
     /// What it says is not understood.
     #[error("what the weights say about themselves is not understood: {0}")]
     Description(#[from] serde_json::Error),
-    /// A shape that nobody can mean.
+    /// A shape with a number out of range.
     #[error("the weights' {field} is {value}, which is out of range")]
     Range {
         /// Name in the description.

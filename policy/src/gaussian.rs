@@ -1,9 +1,12 @@
 //! The Gaussian policy: its mean, tanh of a network of the state, is the action. Nothing is sampled.
 
-use crate::kind::{Cost, check_range};
+use crate::ensemble::Ensemble;
+use crate::error::PolicyError;
+use crate::policy::{ActionNoise, Cost, Policy, check_range};
+use crate::precision::Precision;
+use crate::shape::EnsembleShape;
 use crate::slices::read;
 use crate::weights::{Tensors, Weights};
-use crate::{ActionNoise, Ensemble, EnsembleShape, Policy, PolicyError, Precision};
 use candle_core::{Device, Result, Tensor};
 use serde::{Deserialize, Serialize};
 

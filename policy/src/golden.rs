@@ -4,11 +4,14 @@
 #[path = "../../tests/golden/golden.rs"]
 mod reader;
 
-use crate::diffusion::DiffusionPolicy;
-use crate::{
-    ActionNoise, Description, DiffusionShape, Ensemble, Layout, NoisePredictor, Policy, PolicyError, Precision,
-    Tensors, Weights, load_policy,
-};
+use crate::diffusion::{DiffusionPolicy, DiffusionShape};
+use crate::ensemble::Ensemble;
+use crate::error::PolicyError;
+use crate::kind::{Description, load_policy};
+use crate::noise_predictor::NoisePredictor;
+use crate::policy::{ActionNoise, Policy};
+use crate::precision::Precision;
+use crate::weights::{Layout, Tensors, Weights};
 use candle_core::{Device, Tensor};
 use reader::{Golden, goldens};
 
@@ -91,7 +94,7 @@ fn a_candidate_without_a_value_is_an_error() {
 
 /// Shapes come from strangers: none may ask for unbounded memory, whatever it wraps around to.
 #[test]
-fn a_shape_that_nobody_can_mean_is_refused() {
+fn a_shape_out_of_range_is_refused() {
     let good = DiffusionShape { observation_dim: 4, action_dim: 2, hidden: 8, critics: 3, diffusion_steps: 2 };
     let refused = |shape| {
         let bytes = Description::Diffusion(shape).to_safetensors(&Tensors::new()).unwrap();

@@ -1,9 +1,11 @@
-//! Kinds of policy: what any of them can do, and how one is read from a file that says which it is.
+//! Kinds of policy, and how one is read from a file that says which it is.
 
-use crate::diffusion::DiffusionPolicy;
-use crate::gaussian::GaussianPolicy;
-use crate::weights::Tensors;
-use crate::{ActionNoise, DiffusionShape, GaussianShape, PolicyError, Precision, check_finite};
+use crate::diffusion::{DiffusionPolicy, DiffusionShape};
+use crate::error::PolicyError;
+use crate::gaussian::{GaussianPolicy, GaussianShape};
+use crate::policy::Policy;
+use crate::precision::Precision;
+use crate::weights::{Tensors, check_finite};
 use candle_core::Device;
 use candle_core::safetensors::Load;
 use safetensors::{SafeTensorError, SafeTensors};
@@ -12,53 +14,9 @@ use std::collections::{BTreeMap, HashMap};
 
 /// Key of the description in a safetensors file's metadata.
 const DESCRIPTION: &str = "policy";
-/// Widest hidden layer, most critics and most denoising steps that are believed.
-pub(crate) const MOST: usize = u16::MAX as usize;
 /// Longest header of a safetensors file that is read, bytes. The paper's networks have 3 KB; a million empty tensors would
 /// take a gigabyte of memory before anything else is known of them.
 const MAX_HEADER: u64 = 1 << 20;
-
-/// What one call of [`Policy::act`] takes, at most.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub struct Cost {
-    /// Memory beside the weights, bytes.
-    pub bytes: u64,
-    /// Multiplications.
-    pub products: u64,
-}
-
-/// A trained policy, ready to act.
-pub trait Policy: Send + Sync {
-    /// What kind it is, e.g. `diffusion`.
-    fn kind(&self) -> &'static str;
-
-    /// Numbers in an observation.
-    fn observation_dim(&self) -> usize;
-
-    /// Numbers in an action.
-    fn action_dim(&self) -> usize;
-
-    /// Whether it samples candidate actions, of which it takes the best.
-    fn samples_candidates(&self) -> bool;
-
-    /// What it takes to choose an action for each of so many states, which can be asked before it is too much.
-    fn cost(&self, states: usize, candidates: usize) -> Cost;
-
-    /// Chooses an action for each of n states.
-    ///
-    /// `observations` is `n × observation_dim`, `actions` (written) `n × action_dim`; `noise` has the stream of each
-    /// state's episode. A kind that samples draws `candidates` actions per state and takes the best of them.
-    ///
-    /// # Errors
-    /// An action or its value is not a number, or candle fails.
-    fn act(
-        &self,
-        observations: &[f32],
-        candidates: usize,
-        noise: &mut [ActionNoise],
-        actions: &mut [f32],
-    ) -> Result<(), PolicyError>;
-}
 
 /// What a file of weights says about itself: the kind of policy and the shapes of its networks.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
@@ -138,11 +96,6 @@ fn check_header(file: &[u8]) -> Result<(), PolicyError> {
         Some(length) if u64::from_le_bytes(*length) > MAX_HEADER => Err(SafeTensorError::HeaderTooLarge.into()),
         _ => Ok(()),
     }
-}
-
-/// That a shape's number is one that somebody could mean.
-pub(crate) fn check_range(field: &'static str, value: usize) -> Result<(), PolicyError> {
-    if (1..=MOST).contains(&value) { Ok(()) } else { Err(PolicyError::Range { field, value }) }
 }
 
 #[cfg(test)]

@@ -3,6 +3,8 @@
 //! A vector for all weights keeps an optimiser's step at one operation, and each named tensor is one contiguous run of it:
 //! layer after layer the kernels of all members, then their biases.
 
+use crate::weights::Part;
+
 /// Linear layers of given widths for K members: for each layer K kernels `[in, out]`, then K biases `[out]`.
 #[derive(Clone, Debug)]
 pub(crate) struct Layers {
@@ -71,9 +73,9 @@ impl Layers {
 
     /// Names, shapes and offsets of the tensors `{prefix}.{layer}.kernel` and `.bias`; `leading` says whether the number
     /// of members is their first dimension.
-    pub fn named(&self, prefix: &str, leading: bool) -> Vec<super::weights::Part> {
+    pub fn named(&self, prefix: &str, leading: bool) -> Vec<Part> {
         let members = leading.then_some(self.members);
-        let part = |layer: usize, kind: &str, shape: &[usize], offset| super::weights::Part {
+        let part = |layer: usize, kind: &str, shape: &[usize], offset| Part {
             name: format!("{prefix}{layer}.{kind}"),
             shape: members.into_iter().chain(shape.iter().copied()).collect(),
             offset,

@@ -4,24 +4,21 @@
 //!
 //! - [`Ensemble`] (`ensemble`): K networks side by side, as critics, value functions or means; [`NoisePredictor`]
 //!   (`noise_predictor`): ε_θ and the sampler; [`Schedule`] (`schedule`): the noise schedule and one reverse step.
-//!   Each works on candle's tensors, and has two bodies: a custom operation for the CPU, and plain operations (`plain`)
-//!   that run on any device.
+//!   Each works on candle's tensors, and has two implementations: a custom operation for the CPU, and plain operations
+//!   (`plain`) that run on any device.
 //! - [`Weights`] (`weights`): a network's weights as one vector with named tensors in it, and their gradient.
-//! - [`Policy`] (`kind`): any policy, read from a file that says what kind it is: [`DiffusionPolicy`] (`diffusion`, the
-//!   best of N_a samples) or [`GaussianPolicy`] (`gaussian`, a mean).
+//! - [`Policy`] (`policy`): what any policy can do. `kind` reads one from a file that says what kind it is:
+//!   [`DiffusionPolicy`] (`diffusion`, the best of N_a samples) or [`GaussianPolicy`] (`gaussian`, a mean).
 //! - [`Precision`] (`precision`): how exactly networks are evaluated that no gradient is taken of.
-//! - Below: `ensemble_ops` and `noise_ops` (those custom operations, which `operation` gives to candle), `layers` (where
-//!   each layer lies in the vector), `network` (one network on one tile of rows, over the crate `kernels`), `record` (what
-//!   is kept for the way back), `rounded` (what is made once of weights), `slices` (candle's tensors as slices),
-//!   `statistics` (mean and variance over an ensemble).
+//! - Below: `ensemble_ops` and `noise_ops` (those custom operations, which `operation` gives to candle), `shape` and
+//!   `layers` (where each layer lies in the vector), `network` (one network on one tile of rows, over the crate `kernels`),
+//!   `saved` (what a forward pass keeps for the backward pass), `rounded` (kernels rounded once), `slices` (candle's tensors
+//!   as slices), `statistics` (mean and variance over an ensemble).
 //!
 //! Everything that draws random numbers takes them as an argument or from a seeded generator.
 
 #![deny(unsafe_code)]
 
-#[cfg(test)]
-#[allow(clippy::unwrap_used)]
-mod bodies;
 mod diffusion;
 mod ensemble;
 mod ensemble_ops;
@@ -30,6 +27,9 @@ mod gaussian;
 #[cfg(test)]
 #[allow(clippy::unwrap_used)]
 mod golden;
+#[cfg(test)]
+#[allow(clippy::unwrap_used)]
+mod implementations;
 mod kind;
 mod layers;
 mod network;
@@ -37,22 +37,26 @@ mod noise_ops;
 mod noise_predictor;
 mod operation;
 mod plain;
+mod policy;
 mod precision;
-mod record;
 mod rounded;
+mod saved;
 mod schedule;
+mod shape;
 mod slices;
 mod statistics;
 mod weights;
 
-pub use diffusion::{ActionNoise, DiffusionPolicy, DiffusionShape};
-pub use ensemble::{Ensemble, EnsembleShape};
+pub use diffusion::{DiffusionPolicy, DiffusionShape};
+pub use ensemble::Ensemble;
 pub use error::PolicyError;
 pub use gaussian::{GaussianPolicy, GaussianShape, gaussian_mean};
-pub use kind::{Cost, Description, Policy, load_policy, read_tensors};
-pub use noise_predictor::{NoisePredictor, NoiseShape};
+pub use kind::{Description, load_policy, read_tensors};
+pub use noise_predictor::NoisePredictor;
+pub use policy::{ActionNoise, Cost, Policy};
 pub use precision::Precision;
 pub use schedule::Schedule;
+pub use shape::{EnsembleShape, NoiseShape};
 pub use slices::{has_fast_body, modify, read};
 pub use statistics::mean_and_variance;
 pub use weights::{Layout, Part, Tensors, Weights, check_finite};

@@ -6,9 +6,8 @@
 
 use crate::layers::Layers;
 use quad_kernels::Buffer;
-use quad_kernels::activation::{
-    FirstLayer, bias_mish, bias_mish_slope, dots, first_layer, first_layer_slope, multiply, scale_by_combination,
-};
+use quad_kernels::activation::{bias_mish, bias_mish_slope, multiply};
+use quad_kernels::narrow::{FirstLayer, dots, first_layer, first_layer_slope, scale_by_combination};
 use quad_kernels::product::{Rounded, product, product_transposed};
 use std::cell::RefCell;
 
@@ -41,7 +40,7 @@ pub(crate) struct Input<'a> {
     pub actions: &'a [f32],
 }
 
-/// Activations of a tile's hidden layers, and their slopes; on the way back the gradients before the activations.
+/// Activations of a tile's hidden layers, and their slopes; on the backward pass the gradients before the activations.
 pub(crate) struct Activations<'a> {
     pub x: [&'a mut [f32]; 3],
     pub slope: [&'a mut [f32]; 3],
@@ -97,7 +96,7 @@ impl Workspace {
     }
 }
 
-/// Buffers whose contents nobody needs afterwards.
+/// Buffers whose contents are not needed afterwards.
 pub(crate) struct Scratch<'a> {
     temporary: &'a mut Buffer,
     output: &'a mut Buffer,
@@ -205,13 +204,7 @@ impl<'a> Network<'a> {
     }
 
     /// `forward` that leaves activations and slopes behind for `backward`.
-    pub fn forward_recorded(
-        &self,
-        input: Input<'_>,
-        left: &mut Activations<'_>,
-        scratch: Scratch<'_>,
-        out: &mut [f32],
-    ) {
+    pub fn forward_saving(&self, input: Input<'_>, left: &mut Activations<'_>, scratch: Scratch<'_>, out: &mut [f32]) {
         let h = self.hidden();
         let ([x1, x2, x3], [s1, s2, s3]) = (&mut left.x, &mut left.slope);
         let network: Network<'_> = *self;

@@ -3,11 +3,11 @@
 
 use crate::layers::{LayerMut, Layers};
 use crate::network::{Input, Network, TILE, Workspace, rows_of, with_workspace};
-use crate::noise_predictor::TIME_EMBEDDING;
 use crate::operation::{Arguments, Operation};
-use crate::record::{Lent, Record, concatenate};
+use crate::saved::{Lent, SavedActivations, concatenate};
+use crate::schedule::Schedule;
+use crate::shape::{NoiseShape, TIME_EMBEDDING};
 use crate::weights::KeptGradient;
-use crate::{NoiseShape, Schedule};
 use candle_core::{Result, Shape, bail};
 use quad_kernels::activation::{column_sums, mish_slope, multiply};
 use quad_kernels::product::{Rounded, outer, product, product_transposed};
@@ -113,7 +113,7 @@ impl Parts {
         });
     }
 
-    /// The way back into the time embedding, once per t rather than once per row: `by_step` is the gradient before the
+    /// The backward pass into the time embedding, once per t rather than once per row: `by_step` is the gradient before the
     /// trunk's first activation, summed by t, `T × hidden`.
     fn time_gradient(
         &self,
@@ -157,8 +157,8 @@ fn check_shapes(shape: &NoiseShape, given: &Arguments<'_>) -> Result<()> {
 pub(crate) struct Predict {
     pub parts: Arc<Parts>,
     pub t: Vec<u32>,
-    pub gradient: Option<(Arc<KeptGradient>, Lent<Record>)>,
-    /// Left by the way forward.
+    pub gradient: Option<(Arc<KeptGradient>, Lent<SavedActivations>)>,
+    /// Left by the forward pass.
     pub embedding: OnceLock<TimeEmbedding>,
 }
 
@@ -169,7 +169,7 @@ impl Predict {
         (rows_of(observations, i * TILE, TILE, observation_dim), rows_of(actions, i * TILE, TILE, action_dim), t)
     }
 
-    /// The network and its time embedding, which the way forward leaves for the way back.
+    /// The network and its time embedding, which the forward pass leaves for the backward pass.
     fn network<'a>(&'a self, weights: &'a [f32]) -> (Network<'a>, &'a TimeEmbedding) {
         (self.parts.network(weights), self.embedding.get_or_init(|| self.parts.embed(weights)))
     }
@@ -182,14 +182,14 @@ impl Predict {
         });
     }
 
-    fn predict_recorded(&self, given: Arguments<'_>, record: &mut Record, out: &mut [f32]) {
+    fn predict_saving(&self, given: Arguments<'_>, saved: &mut SavedActivations, out: &mut [f32]) {
         let of = self.network(given.weights);
-        record.resize(1, given.rows, self.parts.shape.hidden);
-        record.tiles(out).into_par_iter().for_each(|mut tile| {
+        saved.resize(1, given.rows, self.parts.shape.hidden);
+        saved.tiles(out).into_par_iter().for_each(|mut tile| {
             let rows = self.tile(given.observations, given.actions, tile.index);
             with_workspace(|work| {
                 self.parts.with_tile(of, rows, work, |input, work| {
-                    of.0.forward_recorded(input, &mut tile.activations, work.scratch(), tile.out);
+                    of.0.forward_saving(input, &mut tile.activations, work.scratch(), tile.out);
                 });
             });
         });
@@ -199,21 +199,21 @@ impl Predict {
         &self,
         given: Arguments<'_>,
         output_gradient: &[f32],
-        record: &mut Record,
+        saved: &mut SavedActivations,
         gradient: &mut [f32],
     ) {
         let Parts { shape, time, trunk, .. } = &*self.parts;
         let (network, embedding) = self.network(given.weights);
         // The copy is cut up; the other is read as a whole.
-        record.tiles(&mut output_gradient.to_vec()).into_par_iter().for_each(|mut tile| {
+        saved.tiles(&mut output_gradient.to_vec()).into_par_iter().for_each(|mut tile| {
             with_workspace(|work| network.backward(tile.out, &mut tile.activations.slope, work.scratch()));
         });
         let (of_time, of_trunk) = gradient.split_at_mut(time.end());
         let input = concatenate(given.observations, given.actions, (shape.observation_dim, shape.action_dim));
-        record.weight_gradients(trunk.split_mut(of_trunk), &input, output_gradient);
+        saved.weight_gradients(trunk.split_mut(of_trunk), &input, output_gradient);
         let h = shape.hidden;
         let mut by_step = vec![0.0; shape.diffusion_steps * h];
-        for (t, delta) in self.t.iter().zip(record.first_delta(0).chunks_exact(h)) {
+        for (t, delta) in self.t.iter().zip(saved.first_delta(0).chunks_exact(h)) {
             by_step[(*t as usize - 1) * h..][..h].iter_mut().zip(delta).for_each(|(sum, d)| *sum += d);
         }
         let tail = &mut of_trunk[(shape.observation_dim + shape.action_dim) * h..][..TIME_EMBEDDING * h];
@@ -234,7 +234,7 @@ impl Operation for Predict {
         let mut out = vec![0.0; given.actions.len()];
         match &self.gradient {
             None => self.predict(given, &mut out),
-            Some((_, lent)) => self.predict_recorded(given, &mut lent.lock(), &mut out),
+            Some((_, lent)) => self.predict_saving(given, &mut lent.lock(), &mut out),
         }
         Ok((out, (given.rows, shape.action_dim).into()))
     }

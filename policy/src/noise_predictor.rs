@@ -2,55 +2,19 @@
 //!
 //! On the CPU custom operations of candle's do the work (`noise_ops`); elsewhere plain ones do.
 
-use crate::layers::Layers;
 use crate::noise_ops::{Parts, Predict, Sample};
 use crate::operation::OnCpu;
 use crate::plain;
-use crate::record::{Pool, Record};
+use crate::precision::Precision;
 use crate::rounded::RoundedOnce;
+use crate::saved::{Pool, SavedActivations};
+use crate::schedule::Schedule;
+use crate::shape::{NoiseShape, TIME_FEATURES};
 use crate::slices::{has_fast_body, read};
-use crate::weights::{Layout, Tensors, Weights};
-use crate::{Precision, Schedule};
+use crate::weights::{Tensors, Weights};
 use candle_core::{D, DType, Result, Tensor};
 use quad_kernels::product::Rounded;
 use std::sync::{Arc, OnceLock};
-
-/// Size of the sinusoidal features of a denoising step.
-const TIME_FEATURES: usize = 16;
-/// Width of the network that embeds them, and of its output.
-pub(crate) const TIME_EMBEDDING: usize = 32;
-
-/// The shape of a noise predictor.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub struct NoiseShape {
-    /// Numbers in an observation s.
-    pub observation_dim: usize,
-    /// Numbers in an action a.
-    pub action_dim: usize,
-    /// Width of the three hidden layers.
-    pub hidden: usize,
-    /// Denoising steps T.
-    pub diffusion_steps: usize,
-}
-
-impl NoiseShape {
-    fn time_layers(&self) -> Layers {
-        Layers::new(1, &[TIME_FEATURES, TIME_EMBEDDING, TIME_EMBEDDING], 0)
-    }
-
-    fn trunk_layers(&self) -> Layers {
-        let Self { observation_dim, action_dim, hidden, .. } = *self;
-        let input = observation_dim + action_dim + TIME_EMBEDDING;
-        Layers::new(1, &[input, hidden, hidden, hidden, action_dim], self.time_layers().end())
-    }
-
-    /// Tensors `time.{0,1}` and `trunk.{0..3}`, each with `.kernel` `[in, out]` and `.bias` `[out]`.
-    pub fn layout(&self) -> Layout {
-        let mut parts = self.time_layers().named("time.", false);
-        parts.extend(self.trunk_layers().named("trunk.", false));
-        Layout::new(parts)
-    }
-}
 
 /// A noise predictor and its weights.
 pub struct NoisePredictor {
@@ -58,7 +22,7 @@ pub struct NoisePredictor {
     weights: Weights,
     precision: Precision,
     rounded: RoundedOnce<Option<[Rounded; 2]>>,
-    records: Pool<Record>,
+    saved: Pool<SavedActivations>,
 }
 
 /// cos(t·f_k), then sin(t·f_k), with f_k = exp(-k·ln(10000)/7) for k = 0..7, of t = 1..T.
@@ -79,8 +43,8 @@ impl NoisePredictor {
             schedule: Schedule::variance_preserving(shape.diffusion_steps),
             features: time_features(shape.diffusion_steps),
         };
-        let (rounded, records) = (RoundedOnce::default(), Pool::default());
-        Self { parts: Arc::new(parts), weights, precision, rounded, records }
+        let (rounded, saved) = (RoundedOnce::default(), Pool::default());
+        Self { parts: Arc::new(parts), weights, precision, rounded, saved }
     }
 
     /// Its weights.
@@ -111,7 +75,7 @@ impl NoisePredictor {
             return self.plain_predict(observations, actions, t);
         }
         let gradient = match (weights.track_op(), self.weights.kept_gradient()) {
-            (true, Some(kept)) => Some((kept, self.records.lend())),
+            (true, Some(kept)) => Some((kept, self.saved.lend())),
             _ => None,
         };
         let operation = OnCpu(Predict {
@@ -126,7 +90,7 @@ impl NoisePredictor {
     /// The same network with its weights as constants, which share their memory with these.
     pub fn frozen(&self) -> Self {
         let (parts, weights) = (self.parts.clone(), self.weights.frozen());
-        Self { parts, weights, precision: Precision::F32, rounded: RoundedOnce::default(), records: Pool::default() }
+        Self { parts, weights, precision: Precision::F32, rounded: RoundedOnce::default(), saved: Pool::default() }
     }
 
     /// Draws actions by the whole reverse process (DDPM), x_0 clipped to [-1, 1] at each step.

@@ -24,7 +24,7 @@ pub(crate) trait Operation: Send + Sync {
     /// The outcome and its shape.
     fn forward(&self, arguments: Arguments<'_>) -> Result<(Vec<f32>, Shape)>;
 
-    /// The way back, from the gradient of the outcome.
+    /// The backward pass, from the gradient of the outcome.
     fn backward(&self, _arguments: Arguments<'_>, _gradient: &[f32]) -> Result<()> {
         Err(Error::BackwardNotSupported { op: Self::NAME })
     }

@@ -1,4 +1,4 @@
-//! The networks in plain candle operations, which candle differentiates: what runs on a GPU, and what the fast bodies
+//! The networks in plain candle operations, which candle differentiates: what runs on a GPU, and what the fast ones
 //! on the CPU are tested against.
 
 use crate::weights::Tensors;

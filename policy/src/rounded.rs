@@ -1,5 +1,6 @@
 //! What is prepared once from weights and used until they change.
 
+use crate::slices::read;
 use crate::weights::Weights;
 use candle_core::Result;
 use std::sync::{Arc, Mutex, PoisonError};
@@ -25,7 +26,7 @@ impl<T> RoundedOnce<T> {
         {
             return Ok(rounded.clone());
         }
-        let rounded = Arc::new(crate::slices::read(weights.values(), make)?);
+        let rounded = Arc::new(read(weights.values(), make)?);
         *made = Some((weights.changes(), rounded.clone()));
         Ok(rounded)
     }

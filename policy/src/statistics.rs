@@ -53,7 +53,7 @@ mod tests {
     use candle_core::Device;
 
     #[test]
-    fn both_bodies_do_the_same() {
+    fn both_implementations_do_the_same() {
         for dims in [vec![1, 4], vec![3, 7], vec![10, 5, 3]] {
             let numbers: Vec<f32> = (0..dims.iter().product()).map(|i: usize| (i as f32 * 1.7).sin()).collect();
             let x = Tensor::from_vec(numbers, dims, &Device::Cpu).unwrap();

@@ -1,6 +1,6 @@
 //! The weights of a network: one flat vector, with named tensors in it.
 
-use crate::PolicyError;
+use crate::error::PolicyError;
 use crate::slices::{has_fast_body, modify};
 use candle_core::backprop::GradStore;
 use candle_core::{DType, Device, Result, Tensor, Var};
@@ -148,7 +148,7 @@ impl Weights {
         Ok(self.change(|mine| mine.slice_set(&values, 0, 0))?)
     }
 
-    /// Changes the vector in place. Whoever prepares something from the weights does it anew afterwards.
+    /// Changes the vector in place, after which kernels that were rounded from it are rounded again.
     pub fn change(&mut self, work: impl FnOnce(&Tensor) -> Result<()>) -> Result<()> {
         self.changes += 1;
         work(&self.values.detach())
@@ -164,7 +164,8 @@ impl Weights {
         self.kept.clone()
     }
 
-    /// The gradient of the loss that `gradients` are of. To be asked for once after each backward pass.
+    /// The gradient of the loss that `gradients` are of. Take it exactly once after each backward pass: one that is not taken is
+    /// added to the next.
     ///
     /// # Errors
     /// If the loss does not depend on these weights.

@@ -1,15 +1,15 @@
-//! What those who connect to a learner may do and send: the rules of the router's configuration.
+//! What the clients of a learner that listens may do and send: the rules of the router's configuration.
 
 use serde_json::{Value, json};
 use zenoh::Config;
 
-/// The rules stand there once, for routers and for learners that listen themselves.
+/// The rules stand in this file once, for routers and for learners that listen.
 const ROUTER: &str = include_str!("../../deploy/zenoh/router-tls.json5");
 
 /// Zenoh's `access_control` for a learner's own session.
 ///
-/// A router lets learners publish and answer. At a learner nobody else may: it does so itself, and access control is
-/// about those who connect.
+/// A router lets learners publish and answer. A learner that listens does so itself, and access control is about its clients,
+/// so no client may, whatever its certificate.
 pub(crate) fn rules() -> zenoh::Result<Value> {
     let mut rules = of_router("access_control")?;
     if let Some(policies) = rules["policies"].as_array_mut() {
@@ -32,7 +32,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn at_a_learner_nobody_is_a_learner() {
+    fn no_client_of_a_learner_may_be_a_learner() {
         let rules = rules().unwrap();
         assert_eq!((&rules["enabled"], &rules["default_permission"]), (&json!(true), &json!("deny")));
         let subjects: Vec<_> = rules["policies"].as_array().unwrap().iter().map(|policy| &policy["subjects"]).collect();

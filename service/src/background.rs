@@ -1,13 +1,12 @@
-//! Threads that talk to others step back behind those that compute.
+//! Threads that serve the network step back behind those that train.
 
-/// On a processor that is busy, a thread of this niceness gets about a tenth of what one that computes gets.
+/// On a busy processor, a thread of this niceness gets about a tenth of the time of one that trains.
 const NICENESS: i32 = 10;
 
-/// Lets the calling thread, and those that it starts from now on, go second where processors are busy. Whoever floods a
-/// learner with messages then waits himself, and training hardly does.
+/// Gives the calling thread, and those that it starts from now on, less time where processors are busy, so that messages
+/// hardly slow down training.
 ///
-/// It is a compromise: where training takes every processor, claims wait some milliseconds longer. With less than a tenth, five
-/// hundred honest evaluators are too many for one processor, and a router that cannot get rid of its messages holds up everybody.
+/// It is a compromise: where training takes every processor, an evaluator waits some milliseconds longer for a job.
 pub fn stay_in_background() {
     // On Linux this is about the thread; elsewhere it would be about the process.
     #[cfg(target_os = "linux")]

@@ -1,29 +1,35 @@
-//! Who a program is to the others, by the three files that `deploy/zenoh/certificates.sh` makes.
+//! The certificate by which a program shows what it is: three files that `deploy/zenoh/certificates.sh` makes.
 
+use std::fmt;
 use std::net::IpAddr;
 use std::path::{Path, PathBuf};
-use std::{fs, io};
+use std::sync::Arc;
 
 use rustls::crypto::ring;
-use rustls::pki_types::pem::{self, PemObject};
-use rustls::pki_types::{CertificateDer, PrivateKeyDer};
+use rustls::pki_types::pem::{Error as PemError, PemObject};
+use rustls::pki_types::{CertificateDer, PrivateKeyDer, UnixTime};
+use rustls::server::WebPkiClientVerifier;
 use rustls::sign::CertifiedKey;
+use rustls::{CertificateError, Error as TlsError, RootCertStore};
 use serde_json::{Value, json};
 use tracing::{info, warn};
-use x509_parser::certificate::X509Certificate;
 use x509_parser::extensions::GeneralName;
-use x509_parser::pem::Pem;
+use x509_parser::prelude::{FromDer, X509Certificate};
 use x509_parser::time::ASN1Time;
 
-/// Names of the three files.
-pub(crate) const AUTHORITY: &str = "ca.pem";
-pub(crate) const CERTIFICATE: &str = "cert.pem";
-pub(crate) const KEY: &str = "key.pem";
+/// The authority that is trusted, the program's own certificate, and its private key.
+const FILES: [&str; 3] = ["ca.pem", "cert.pem", "key.pem"];
 
-/// A certificate that is valid for less than this is worth a warning, seconds: renewing takes people time.
-pub(crate) const EXPIRES_SOON: i64 = 14 * 24 * 60 * 60;
+/// A certificate that is valid for fewer days than this is worth a warning: people need time to renew it.
+const EXPIRES_SOON: i64 = 14;
 
-/// What a certificate entitles to. Access control tells roles apart by the certificate's common name.
+const HINT: &str = "--certificates takes a folder with ca.pem, cert.pem and key.pem that this user may read; \
+                    deploy/zenoh/certificates.sh makes one";
+const HINT_TIME: &str =
+    "if the clock of this machine is right, make a new certificate with deploy/zenoh/certificates.sh";
+const HINT_ROLE: &str = "give the folder that was made for this program's role";
+
+/// What the owner of a certificate may do. Access control tells roles apart by the certificate's common name.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Role {
     /// Publishes weights, answers jobs and scores.
@@ -42,141 +48,101 @@ impl Role {
     }
 }
 
-/// A folder with the authority that is trusted (ca.pem), this program's certificate (cert.pem) and its key (key.pem).
+/// A folder with an authority (ca.pem), a certificate that it has signed (cert.pem), and the certificate's key (key.pem).
 ///
-/// Zenoh reads the files again for each connection that it makes, and once for each endpoint that it listens at.
+/// Zenoh reads the files again for each connection that it opens, and once for each endpoint that it listens at.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Certificates {
     folder: PathBuf,
-    /// The hosts at which its owner may be connected to.
+    expires: ASN1Time,
+    /// The hosts at which clients may connect to its owner.
     hosts: Vec<String>,
 }
 
-/// The files cannot be used.
+/// A file cannot be used.
 #[derive(Debug, thiserror::Error)]
-pub enum CertificatesError {
-    /// A file is missing, or may not be read.
-    #[error("cannot read {}", path.display())]
-    Unreadable {
-        /// The file.
-        path: PathBuf,
-        /// Why not.
-        source: io::Error,
-    },
-    /// A file holds something else.
-    #[error("{} holds no {wanted} in PEM's notation", path.display())]
-    Malformed {
-        /// The file.
-        path: PathBuf,
-        /// What belongs there.
-        wanted: &'static str,
-    },
-    /// The certificate is not valid any more, or not yet.
-    #[error("{} is valid from {from} to {to}, which is not now", path.display())]
-    NotValidNow {
-        /// The certificate's file.
-        path: PathBuf,
-        /// First moment of its validity.
-        from: String,
-        /// Last moment of its validity.
-        to: String,
-    },
-    /// It is a certificate for another program.
-    #[error("{} is a certificate for {found}, not for {wanted}", path.display())]
-    OtherRole {
-        /// The certificate's file.
-        path: PathBuf,
-        /// Its common name.
-        found: String,
-        /// The one that is needed.
-        wanted: &'static str,
-    },
-    /// Whoever trusts the same authority would refuse it.
-    #[error("{} is of another authority than {}", path.display(), authority.display())]
-    OtherAuthority {
-        /// The certificate's file.
-        path: PathBuf,
-        /// The authority's file.
-        authority: PathBuf,
-    },
-    /// Its owner could not prove that it is its.
-    #[error("{} is not the key of {}", key.display(), path.display())]
-    OtherKey {
-        /// The certificate's file.
-        path: PathBuf,
-        /// The key's file.
-        key: PathBuf,
-    },
+#[error("{} {problem}", path.display())]
+pub struct CertificatesError {
+    path: PathBuf,
+    problem: String,
+    hint: &'static str,
 }
 
 impl CertificatesError {
     /// What to do about it.
     pub fn hint(&self) -> &'static str {
-        match self {
-            CertificatesError::NotValidNow { .. } => {
-                "if the clock of this machine is right, make a new certificate with deploy/zenoh/certificates.sh"
-            }
-            CertificatesError::OtherRole { .. } => "give the folder that was made for this program's role",
-            _ => {
-                "--certificates takes a folder with ca.pem, cert.pem and key.pem that this user may read; \
-                 deploy/zenoh/certificates.sh makes one"
-            }
-        }
+        self.hint
+    }
+
+    fn new(path: &Path, problem: impl Into<String>, hint: &'static str) -> Self {
+        Self { path: path.to_owned(), problem: problem.into(), hint }
     }
 }
 
 impl Certificates {
-    /// Checks the files in `folder`, whose certificate must be one of `role`, and logs until when it is valid.
+    /// Checks the files in `folder` as the other side of a connection would, and that the certificate is one of `role`;
+    /// logs until when it is valid.
     ///
     /// # Errors
-    ///
-    /// Whatever would have all others refuse the certificate; that of another authority is only told by its name.
+    /// A file is missing or malformed; the certificate is of another role, not valid now, or of another authority; the key is
+    /// another certificate's.
     pub fn read(folder: &Path, role: Role) -> Result<Self, CertificatesError> {
-        let (authority, path) = (folder.join(AUTHORITY), folder.join(CERTIFICATE));
-        let authorities = certificates(&authority)?;
-        let own = certificates(&path)?;
-        let key_path = folder.join(KEY);
-        let key = key(&key_path)?;
+        let certificates = Self::check(folder, role)?;
+        match certificates.expire_soon() {
+            true => warn!("{certificates}; make a new one soon"),
+            false => info!("{certificates}"),
+        }
+        Ok(certificates)
+    }
 
-        let certificate = parse(&own[0], &path)?;
-        let found = certificate.subject().iter_common_name().next().and_then(|name| name.as_str().ok());
-        if found != Some(role.common_name()) {
-            let (found, wanted) = (found.unwrap_or("nobody").to_owned(), role.common_name());
-            return Err(CertificatesError::OtherRole { path, found, wanted });
+    /// [`read`](Self::read) without the log.
+    pub(crate) fn check(folder: &Path, role: Role) -> Result<Self, CertificatesError> {
+        let [ca, own, key] = FILES.map(|name| folder.join(name));
+        let (authorities, chain) = (certificates(&ca)?, certificates(&own)?);
+        let private = PrivateKeyDer::from_pem_file(&key).map_err(|error| unreadable(&key, "private key", &error))?;
+        let certificate = X509Certificate::from_der(&chain[0])
+            .map_err(|_| CertificatesError::new(&own, "holds no certificate that can be read", HINT))?
+            .1;
+
+        let names = certificate.subject().iter_common_name().filter_map(|name| name.as_str().ok());
+        let (found, wanted) = (names.collect::<Vec<_>>().join(", "), role.common_name());
+        if found != wanted {
+            let problem = format!("is a certificate for {found}, not for {wanted}");
+            return Err(CertificatesError::new(&own, problem, HINT_ROLE));
         }
         let validity = certificate.validity();
         if !validity.is_valid() {
-            let (from, to) = (validity.not_before.to_string(), validity.not_after.to_string());
-            return Err(CertificatesError::NotValidNow { path, from, to });
+            let (from, until) = (validity.not_before, validity.not_after);
+            let problem = format!("is valid from {from} to {until}, which is not now");
+            return Err(CertificatesError::new(&own, problem, HINT_TIME));
         }
-        let mut known = false;
-        for pem in &authorities {
-            known |= parse(pem, &authority)?.subject() == certificate.issuer();
+        let (expires, hosts) = (validity.not_after, hosts(&certificate));
+        verify(&chain, authorities).map_err(|error| match error {
+            // The second is of an authority that has the same name.
+            TlsError::InvalidCertificate(CertificateError::UnknownIssuer | CertificateError::BadSignature) => {
+                CertificatesError::new(&own, format!("is of another authority than {}", ca.display()), HINT)
+            }
+            other => CertificatesError::new(&own, format!("does not pass with {}: {other}", ca.display()), HINT),
+        })?;
+        if CertifiedKey::from_der(chain, private, &ring::default_provider()).is_err() {
+            return Err(CertificatesError::new(&key, format!("is not the key of {}", own.display()), HINT));
         }
-        if !known {
-            return Err(CertificatesError::OtherAuthority { path, authority });
-        }
-        let chain = own.iter().map(|pem| CertificateDer::from(pem.contents.clone())).collect();
-        if CertifiedKey::from_der(chain, key, &ring::default_provider()).is_err() {
-            return Err(CertificatesError::OtherKey { path, key: key_path });
-        }
-
-        let left = validity.not_after.timestamp() - ASN1Time::now().timestamp();
-        match left < EXPIRES_SOON {
-            true => warn!("{} is valid until {} only; make a new one soon", path.display(), validity.not_after),
-            false => info!("{} is valid until {}", path.display(), validity.not_after),
-        }
-        Ok(Self { folder: folder.to_owned(), hosts: hosts(&certificate) })
+        Ok(Self { folder: folder.to_owned(), expires, hosts })
     }
 
-    /// Whether nobody but this machine itself could connect to whoever listens with it.
+    /// Whether a new one should be made now.
+    pub(crate) fn expire_soon(&self) -> bool {
+        self.expires.timestamp() - ASN1Time::now().timestamp() < EXPIRES_SOON * 24 * 60 * 60
+    }
+
+    /// Whether only programs on this machine could connect to its owner.
     pub(crate) fn is_for_this_machine_alone(&self) -> bool {
         self.hosts.iter().all(|host| is_this_machine(host))
     }
 
     /// Zenoh's `transport/link/tls`: both sides show a certificate, and stay connected only while it is valid.
     pub(crate) fn settings(&self) -> Value {
-        let [authority, certificate, key] = [AUTHORITY, CERTIFICATE, KEY].map(|name| self.folder.join(name));
+        let [authority, certificate, key] = FILES.map(|name| self.folder.join(name));
         json!({
             "root_ca_certificate": authority,
             "listen_certificate": certificate,
@@ -190,20 +156,45 @@ impl Certificates {
     }
 }
 
-fn certificates(path: &Path) -> Result<Vec<Pem>, CertificatesError> {
-    let found = blocks(path, "CERTIFICATE")?;
-    if found.is_empty() { Err(malformed(path, "certificate")) } else { Ok(found) }
+impl fmt::Display for Certificates {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let (path, hosts) = (self.folder.join(FILES[1]), self.hosts.join(", "));
+        write!(f, "{} is valid until {}", path.display(), self.expires)?;
+        // An evaluator's names none: it never listens.
+        if hosts.is_empty() { Ok(()) } else { write!(f, ", to listen at {hosts}") }
+    }
 }
 
-fn key(path: &Path) -> Result<PrivateKeyDer<'static>, CertificatesError> {
-    PrivateKeyDer::from_pem_file(path).map_err(|error| match error {
-        pem::Error::Io(source) => CertificatesError::Unreadable { path: path.to_owned(), source },
-        _ => malformed(path, "private key"),
-    })
+/// All certificates of a file. While an authority is replaced, ca.pem has the old and the new one.
+fn certificates(path: &Path) -> Result<Vec<CertificateDer<'static>>, CertificatesError> {
+    let read = || match CertificateDer::pem_file_iter(path)?.collect::<Result<Vec<_>, _>>()? {
+        none if none.is_empty() => Err(PemError::NoItemsFound),
+        found => Ok(found),
+    };
+    read().map_err(|error| unreadable(path, "certificate", &error))
 }
 
-/// The names and addresses in a certificate at which its owner may be connected to.
-pub(crate) fn hosts(certificate: &X509Certificate<'_>) -> Vec<String> {
+fn unreadable(path: &Path, wanted: &str, error: &PemError) -> CertificatesError {
+    let problem = match error {
+        PemError::Io(error) => format!("cannot be read: {error}"),
+        _ => format!("holds no {wanted} in PEM's notation"),
+    };
+    CertificatesError::new(path, problem, HINT)
+}
+
+/// Whether one of the authorities has signed the certificate, now and for a client.
+fn verify(chain: &[CertificateDer<'_>], authorities: Vec<CertificateDer<'static>>) -> Result<(), TlsError> {
+    let mut roots = RootCertStore::empty();
+    for authority in authorities {
+        roots.add(authority)?;
+    }
+    let verifier = WebPkiClientVerifier::builder_with_provider(Arc::new(roots), Arc::new(ring::default_provider()));
+    let verifier = verifier.build().map_err(|error| TlsError::General(error.to_string()))?;
+    verifier.verify_client_cert(&chain[0], &chain[1..], UnixTime::now()).map(|_| ())
+}
+
+/// The names and addresses in a certificate at which clients may connect to its owner.
+fn hosts(certificate: &X509Certificate<'_>) -> Vec<String> {
     let names = certificate.subject_alternative_name().ok().flatten().map(|names| &names.value.general_names);
     let host = |name: &GeneralName<'_>| match *name {
         GeneralName::DNSName(name) => Some(name.to_owned()),
@@ -219,17 +210,4 @@ pub(crate) fn hosts(certificate: &X509Certificate<'_>) -> Vec<String> {
 /// Whether a host is only this machine's name for itself.
 pub(crate) fn is_this_machine(host: &str) -> bool {
     host == "localhost" || host.parse().is_ok_and(|host: IpAddr| host.is_loopback())
-}
-
-fn blocks(path: &Path, label: &str) -> Result<Vec<Pem>, CertificatesError> {
-    let bytes = fs::read(path).map_err(|source| CertificatesError::Unreadable { path: path.to_owned(), source })?;
-    Ok(Pem::iter_from_buffer(&bytes).filter_map(Result::ok).filter(|pem| pem.label == label).collect())
-}
-
-fn parse<'a>(pem: &'a Pem, path: &Path) -> Result<X509Certificate<'a>, CertificatesError> {
-    pem.parse_x509().map_err(|_| malformed(path, "certificate"))
-}
-
-fn malformed(path: &Path, wanted: &'static str) -> CertificatesError {
-    CertificatesError::Malformed { path: path.to_owned(), wanted }
 }

@@ -4,23 +4,23 @@ use zenoh::config::EndPoint;
 
 use crate::certificates::{Certificates, is_this_machine};
 
-/// The protocols that Zenoh is built with here: readable by anybody in between, and encrypted and authenticated.
+/// The protocols that Zenoh is built with here: neither encrypted nor authenticated, and both.
 const OPEN: &str = "tcp/";
 const PROTECTED: &str = "tls/";
 
 /// Where a session meets the others, as Zenoh's endpoints: `tcp/127.0.0.1:7447`, or with certificates
 /// `tls/127.0.0.1:7447`.
 ///
-/// There is no scouting: nobody is found that was not named. A session that listens is a peer, to which others connect
+/// There is no scouting: only the endpoints named here are used. A session that listens is a peer, to which clients connect
 /// directly; one that does not is a client of the peer or router that it connects to.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
 pub struct Endpoints {
-    /// Listen here. Port 0 takes a free one; [`reachable_at`] tells which.
+    /// Listen here. Port 0 takes a free one; [`reachable_at`](crate::reachable_at) tells which.
     pub listen: Vec<String>,
-    /// Connect to these. A client keeps one connection: to talk to several meeting points, open a session for each.
+    /// Connect to these. A client keeps one connection: to reach several learners or routers, open a session for each.
     pub connect: Vec<String>,
-    /// With them, every connection is by TLS, and both sides show who they are. Whoever connects to a session that
-    /// listens may do what deploy/zenoh/router-tls.json5 allows.
+    /// With them, every connection is by TLS, and both sides show a certificate. A client of a session that listens may
+    /// do what deploy/zenoh/router-tls.json5 allows its role.
     pub certificates: Option<Certificates>,
 }
 
@@ -37,7 +37,7 @@ pub enum SessionError {
         endpoint: String,
     },
     /// Certificates are there, but would not be used.
-    #[error("certificates are given, but the connection at {endpoint} would be open to anybody")]
+    #[error("certificates are given, but the connection at {endpoint} would not be encrypted")]
     Open {
         /// The endpoint.
         endpoint: String,
@@ -78,11 +78,11 @@ impl SessionError {
 }
 
 impl Endpoints {
-    /// Tells early what [`open_session`] would refuse.
+    /// Tells early what [`open_session`](crate::open_session) would refuse.
     ///
     /// # Errors
     ///
-    /// None or malformed ones; tcp/ with certificates, and tls/ without.
+    /// No endpoint, or a malformed one; tcp/ with certificates, and tls/ without.
     pub fn check(&self) -> Result<(), SessionError> {
         if self.listen.is_empty() && self.connect.is_empty() {
             return Err(SessionError::NoEndpoint);
@@ -98,21 +98,21 @@ impl Endpoints {
         Ok(())
     }
 
-    /// What it listens at without certificates, and not on loopback only: whoever reaches it may come in.
-    pub fn open_to_anybody(&self) -> Option<&str> {
+    /// The endpoint at which other machines may connect without a certificate, if there is one.
+    pub fn open_to_all(&self) -> Option<&str> {
         self.for_others().filter(|_| self.certificates.is_none())
     }
 
-    /// What it listens at for others who would all refuse its certificate, because that names no host which they could mean.
-    pub(crate) fn closed_to_anybody(&self) -> Option<&str> {
+    /// The endpoint for other machines at which all of them would refuse its certificate, if there is one: the certificate
+    /// names only this machine's names for itself.
+    pub(crate) fn closed_to_all(&self) -> Option<&str> {
         self.for_others().filter(|_| self.certificates.as_ref().is_some_and(Certificates::is_for_this_machine_alone))
     }
 
-    /// What it listens at, and not on loopback only.
+    /// The first endpoint that it listens at for other machines, so not on loopback.
     fn for_others(&self) -> Option<&str> {
         let is_local = |endpoint: &&String| {
-            let address = endpoint.trim_start_matches(OPEN).trim_start_matches(PROTECTED);
-            let address = address.split(['?', '#']).next().unwrap_or_default();
+            let address = address_of(endpoint);
             let host = address.rsplit_once(':').map_or(address, |(host, _)| host).trim_matches(['[', ']']);
             is_this_machine(host)
         };
@@ -120,7 +120,7 @@ impl Endpoints {
     }
 }
 
-/// Where learner and evaluator of one machine meet, at `port`, if nothing else is said.
+/// Where learner and evaluator of one machine meet by default.
 pub fn default_endpoint(certificates: Option<&Certificates>, port: u16) -> String {
     format!("{}127.0.0.1:{port}", if certificates.is_some() { PROTECTED } else { OPEN })
 }
@@ -137,9 +137,15 @@ pub fn parse_endpoint(text: &str) -> Result<String, SessionError> {
     Err(SessionError::NotAnEndpoint { endpoint: text.to_owned() })
 }
 
-/// Whether the system is to choose the endpoint's port. Options may follow the address: `tcp/127.0.0.1:0#iface=lo`.
+/// HOST:PORT of an endpoint, between its protocol and its options: `tcp/127.0.0.1:0#iface=lo`.
+pub(crate) fn address_of(endpoint: &str) -> &str {
+    let address = endpoint.split_once('/').map_or(endpoint, |(_, rest)| rest);
+    address.split(['?', '#']).next().unwrap_or(address)
+}
+
+/// Whether the system is to choose the endpoint's port.
 pub(crate) fn leaves_port_open(endpoint: &str) -> bool {
-    endpoint.split(['?', '#']).next().is_some_and(|address| address.ends_with(":0"))
+    address_of(endpoint).ends_with(":0")
 }
 
 #[cfg(test)]
@@ -147,10 +153,10 @@ mod tests {
     use super::*;
 
     #[test]
-    fn who_can_reach_a_session_that_listens() {
+    fn endpoints_that_other_machines_reach() {
         let open = |endpoint: &str| {
             let listen = vec!["tcp/127.0.0.1:1".to_owned(), endpoint.to_owned()];
-            Endpoints { listen, ..Endpoints::default() }.open_to_anybody().map(str::to_owned)
+            Endpoints { listen, ..Endpoints::default() }.open_to_all().map(str::to_owned)
         };
         for endpoint in ["tcp/127.0.0.1:7447", "tcp/[::1]:7447", "tcp/localhost:0", "tcp/127.1.2.3:1#iface=lo"] {
             assert_eq!(open(endpoint), None, "{endpoint}");

@@ -14,8 +14,8 @@ pub trait Hint<T> {
     /// What may have gone wrong.
     type Error;
 
-    /// If this is an error, `hint` is shown below it. An error that has a hint already keeps that one, which is from
-    /// closer to the cause.
+    /// If this is an error, `hint` is shown below it. An error that has a hint already keeps that one, which was given closer
+    /// to the cause.
     fn hint(self, hint: impl fmt::Display) -> anyhow::Result<T>;
 
     /// The same, with advice that depends on the error.
@@ -63,7 +63,7 @@ impl std::error::Error for Hinted {
     }
 }
 
-/// An error that nobody reads is given up after this time.
+/// How long the last words wait for stderr to be read.
 const LAST_WORDS: Duration = Duration::from_secs(1);
 
 /// Runs `main`, and ends the logging. An error is printed to stderr with its causes and hints; the exit code is then 1,

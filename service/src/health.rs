@@ -1,4 +1,4 @@
-//! Whether a process still does its work: its parts say that they are alive, `/healthz` tells who has stopped.
+//! Whether a process still does its work: its parts say that they are alive, `/healthz` names those that have stopped.
 
 use std::sync::atomic::{AtomicU64, Ordering::Relaxed};
 use std::sync::{Arc, Mutex, PoisonError};
@@ -132,12 +132,12 @@ mod tests {
     fn a_part_that_falls_silent_is_named_until_it_is_back() {
         let health = Health::default();
         assert!(health.problems().is_empty(), "no parts, no problems");
-        let (hub, _other) = (health.part("hub", SHORT), health.part("other", LONG));
+        let (scores, _other) = (health.part("scores", SHORT), health.part("other", LONG));
         assert!(health.problems().is_empty());
         let later = Instant::now() + 2 * SHORT;
         let problems = health.clone().problems_at(later);
-        assert!(problems.len() == 1 && problems[0].starts_with("hub: no sign of life for "), "{problems:?}");
-        hub.alive_at(later);
+        assert!(problems.len() == 1 && problems[0].starts_with("scores: no sign of life for "), "{problems:?}");
+        scores.alive_at(later);
         assert!(health.problems_at(later).is_empty());
     }
 

@@ -4,14 +4,15 @@
 //!
 //! In reading order, which is the order of a process's life:
 //!
-//! - `logging`: where log lines go; `throttle`: how many of a kind.
-//! - `endpoints`: where learner and evaluators meet; `session`: the connection between them, over Zenoh;
-//!   `zenoh_threads`: who does its work; `certificates`: who a program is there; `access`: what others may do.
+//! - `logging`: which log lines are written, and where to.
+//! - `endpoints`: where learner and evaluators meet; `certificates`: how they show what they are; `access`: what each role may
+//!   do; `session`: the connection between them, over Zenoh.
+//! - `zenoh_threads`, `background`: how little of the processor the network takes.
 //! - `health`: whether the parts of a process still do their work.
 //! - `metrics_server`: `/metrics` and `/healthz`.
 //! - `shutdown`: the signals that end a process.
 //! - `exit`: how an error is shown to the user, and the exit code.
-//! - [`doctor`]: checks a machine before a run is trusted to it.
+//! - [`doctor`]: checks of a machine, before a run is started on it.
 
 mod access;
 mod background;
@@ -24,7 +25,6 @@ mod logging;
 mod metrics_server;
 mod session;
 mod shutdown;
-mod throttle;
 mod zenoh_threads;
 
 pub use background::stay_in_background;

@@ -19,15 +19,15 @@ use tokio::task::{AbortHandle, JoinHandle, JoinSet};
 use tokio::time::timeout;
 use tracing::{debug, warn};
 
-use crate::Health;
+use crate::health::Health;
 
-/// A question is a few lines in one packet. Whoever has not sent it whole by then is sent away.
-const QUESTION: Duration = Duration::from_secs(3);
-/// A connection is for one question, and lasts at most this long however slowly its client reads.
+/// A request is a few lines in one packet. A connection on which it is not there whole by then is closed.
+const REQUEST: Duration = Duration::from_secs(3);
+/// A connection is for one request, and lasts at most this long however slowly its client reads.
 const CONNECTION: Duration = Duration::from_secs(15);
-/// Connections at a time. One more ends the oldest of them, so that those who only hold one do not keep others out.
+/// Connections at a time. One more ends the oldest of them, so that idle clients do not keep others out.
 const MOST_CONNECTIONS: usize = 64;
-/// Bytes that are kept of a connection's question; hyper takes no fewer.
+/// Bytes that are kept of a connection's request; hyper takes no fewer.
 const MOST_BUFFERED: usize = 8 << 10;
 /// When a connection cannot be accepted, most likely because too many files are open, the next try is after this time.
 const RETRY: Duration = Duration::from_secs(1);
@@ -51,7 +51,7 @@ pub struct BindError {
 }
 
 /// Serves over HTTP at `address`: at `/metrics` what `registry` gathers, in Prometheus's text format; at `/healthz` `ok`,
-/// or status 503 and a line for each thing that is wrong.
+/// or status 503 and a line for each problem.
 ///
 /// Clients that send or read slowly, or only hold connections, are cut off; they cost a bounded amount of memory.
 ///
@@ -95,10 +95,10 @@ async fn accept(listener: TcpListener, router: Router) {
     }
 }
 
-/// One question and its answer.
+/// One request and its response.
 async fn answer(stream: TcpStream, router: Router) {
     let mut server = http1::Builder::new();
-    server.timer(TokioTimer::new()).header_read_timeout(QUESTION).max_buf_size(MOST_BUFFERED).keep_alive(false);
+    server.timer(TokioTimer::new()).header_read_timeout(REQUEST).max_buf_size(MOST_BUFFERED).keep_alive(false);
     let exchange = server.serve_connection(TokioIo::new(stream), TowerToHyperService::new(router));
     match timeout(CONNECTION, exchange).await {
         Ok(Ok(())) => {}

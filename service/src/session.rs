@@ -13,28 +13,26 @@ use crate::access;
 use crate::background::stay_in_background;
 use crate::endpoints::{Endpoints, SessionError, leaves_port_open};
 
-/// A process that is frozen or disconnected counts as gone after this time. (One that ends or is killed is noticed at
-/// once.) Half of Zenoh's default; a machine that is busy training may still miss several keep-alive messages in it.
+/// A process that is frozen or disconnected counts as gone after this time. (The end of a process is noticed at once.) Half of
+/// Zenoh's default; a machine that is busy training may still miss several keep-alive messages in it.
 const LEASE: Duration = Duration::from_secs(5);
 /// Largest message that a client takes in, bytes: the largest snapshot that may be sent (64 MiB) and what Zenoh adds.
 const MAX_SNAPSHOT_SIZE: u64 = 65 << 20;
-/// Largest message in several pieces that a session takes in that listens, bytes: none. Zenoh keeps each piece until the last
-/// one has come, and with it the whole buffer of 64 KiB that it was received in, so that a stranger who sends pieces of one
-/// byte fills any memory. What evaluators send (at most 30 KiB) comes in one piece: one takes 32,700 bytes at least,
-/// whatever the network.
+/// Largest message in several pieces that a session that listens takes in, bytes: none. Zenoh keeps each piece until the last
+/// one has come, and with it the whole buffer of 64 KiB that it was received in, so that pieces of one byte could fill any
+/// memory. What evaluators send (at most 30 KiB) comes in one piece: one has room for 32,700 bytes on every network.
 const MAX_PIECED_REQUEST: u64 = 0;
 /// Most connections of a session that listens. Each is an open file, of which many systems allow a process 1024; the rest
 /// is for datasets, logs and metrics. Beyond it, connections are refused; without it, files could not be opened any more.
 const MAX_SESSIONS: u64 = 768;
-/// First and longest pause between two tries to connect. A learner or router that comes back should not be waited for
-/// longer than it takes to notice.
+/// First and longest pause between two tries to connect.
 const RETRY: [Duration; 2] = [Duration::from_millis(250), Duration::from_secs(2)];
 /// How long a large message that may be dropped waits for a receiver that does not keep up. Zenoh's 50 ms are not
 /// enough for a snapshot when training has taken all cores; a receiver that hangs must not hold up the others for long.
 const DROP_AFTER: Duration = Duration::from_millis(500);
 /// How long a message that may not be dropped waits for a receiver that does not read, before its connection is closed.
-/// While Zenoh closes it, others may have to wait as long; of Zenoh's five seconds they would notice. (A network of 256 kbit/s
-/// still takes one packet of 64 KiB in this time.)
+/// Meanwhile other receivers may have to wait, so this is less than Zenoh's five seconds; a network of 256 kbit/s still takes
+/// one packet of 64 KiB in it.
 const CLOSE_AFTER: Duration = Duration::from_secs(2);
 /// A client that has no connection after this time says so.
 const PATIENCE: Duration = Duration::from_secs(10);
@@ -43,15 +41,14 @@ const SELF_QUERY_TIMEOUT: Duration = Duration::from_secs(5);
 
 /// Opens a session. Needs a multi-thread tokio runtime.
 ///
-/// A session that listens is there at once. A client is there as soon as it has a connection: it waits for a meeting
-/// point that has not started yet, until this future is dropped, and later connects again whenever the connection is
-/// lost.
+/// A session that listens is open at once, a client as soon as it has a connection: it waits for a learner or router that has
+/// not started yet, until this future is dropped. Later it connects again whenever the connection is lost.
 pub async fn open_session(endpoints: &Endpoints) -> Result<Session, SessionError> {
     endpoints.check()?;
-    if let Some(endpoint) = endpoints.closed_to_anybody() {
+    if let Some(endpoint) = endpoints.closed_to_all() {
         warn!(
-            "{endpoint} is for other machines, but the certificate names none that they could connect to, so they will refuse it; \
-             make one with deploy/zenoh/certificates.sh that names this machine as they do"
+            "{endpoint} is for other machines, but they will refuse the certificate, which does not name this machine as they do; \
+             make one with deploy/zenoh/certificates.sh learner NAME HOST"
         );
     }
     let wrong = |error| {
@@ -59,11 +56,11 @@ pub async fn open_session(endpoints: &Endpoints) -> Result<Session, SessionError
         SessionError::Endpoint { endpoints, reason: for_people(error) }
     };
     let config = config(endpoints).map_err(wrong)?;
-    // Zenoh's future blocks its thread until there is a connection, so it gets one of its own, which is never
-    // joined: dropping this future gives up waiting, and does not keep the process from ending.
+    // Zenoh's future blocks its thread until there is a connection, so it gets a thread of its own. That is never joined:
+    // dropping this future gives up waiting, and the process can end.
     let (sender, mut opened) = oneshot::channel();
     let open = move || {
-        // Zenoh's own threads are started by this one, and are like it.
+        // Zenoh's own threads are started by this one, and inherit its priority.
         stay_in_background();
         drop(sender.send(zenoh::open(config).wait()));
     };
@@ -71,10 +68,9 @@ pub async fn open_session(endpoints: &Endpoints) -> Result<Session, SessionError
     let opened = match timeout(PATIENCE, &mut opened).await {
         Ok(opened) => opened,
         Err(_) => {
-            // Zenoh keeps its reasons to itself, and goes on.
             warn!(
-                "no connection to {} yet: nobody is there, or one of the two refuses the other's certificate; \
-                 with RUST_LOG=zenoh::net::runtime=debug you see each try",
+                "no connection to {} yet: no learner or router is there, or one of the two refuses the other's certificate; \
+                 RUST_LOG=zenoh::net::runtime=debug logs each try",
                 endpoints.connect.join(", ")
             );
             opened.await
@@ -91,7 +87,7 @@ fn config(endpoints: &Endpoints) -> zenoh::Result<Config> {
         ("mode", json!(mode)),
         ("listen/endpoints", json!(endpoints.listen)),
         ("connect/endpoints", json!(endpoints.connect)),
-        // Wait for whoever is not there yet. A client would give up at once otherwise.
+        // Wait for a learner or router that is not there yet. A client would give up at once otherwise.
         ("connect/timeout_ms", json!(-1)),
         ("connect/exit_on_failure", json!(false)),
         ("connect/retry", json!({ "period_init_ms": retry[0], "period_max_ms": retry[1] })),
@@ -105,8 +101,8 @@ fn config(endpoints: &Endpoints) -> zenoh::Result<Config> {
         ("transport/link/tx/queue/congestion_control/block/wait_before_close", json!(CLOSE_AFTER.as_micros() as u64)),
         ("transport/link/rx/max_message_size", json!(if listens { MAX_PIECED_REQUEST } else { MAX_SNAPSHOT_SIZE })),
         ("transport/unicast/max_sessions", json!(MAX_SESSIONS)),
-        // The only stable way to learn a port that the system chose. Others could read the configuration there, so it
-        // is closed where it is not needed.
+        // The only stable way to learn a port that the system chose. Clients could read the configuration there, so it is
+        // off where it is not needed.
         ("adminspace/enabled", json!(endpoints.listen.iter().any(|endpoint| leaves_port_open(endpoint)))),
     ];
     if let Some(certificates) = &endpoints.certificates {
@@ -138,7 +134,7 @@ fn for_people(error: zenoh::Error) -> String {
     plain
 }
 
-/// Where others meet `session`, which was opened with `endpoints`: what it listens at, with the ports that the system
+/// Where evaluators can meet `session`, which was opened with `endpoints`: what it listens at, with the ports that the system
 /// chose, or, if it does not listen, what it connects to.
 pub async fn reachable_at(session: &Session, endpoints: &Endpoints) -> Result<Vec<String>, SessionError> {
     if endpoints.listen.is_empty() {
@@ -165,6 +161,6 @@ mod tests {
     fn errors_without_places() {
         let text = "Can not listen: [In use (os error 98) at /a/src/tcp.rs:61.] at /a/src/unicast.rs:338.";
         assert_eq!(for_people(text.into()), "Can not listen: [In use (os error 98)]");
-        assert_eq!(for_people("Nobody at home".into()), "Nobody at home");
+        assert_eq!(for_people("No route to host".into()), "No route to host");
     }
 }

@@ -9,10 +9,10 @@ use tracing::{info, warn};
 
 /// A process that was told to end has so long for it: less than the 10 s after which Docker kills.
 const LEAVE_WITHIN: Duration = Duration::from_secs(9);
-/// Whoever sends one signal may send another at once and mean the same: a terminal's Ctrl-C reaches a script and what it has
-/// started, and then the script tells these to end, as well.
+/// A second signal within this time means the same as the first: a terminal's Ctrl-C reaches a script and what it has started,
+/// and then the script sends these a signal, too.
 const SAME: Duration = Duration::from_millis(500);
-/// What is said last gets so long to be read.
+/// The thread that writes the log gets so long for the last line.
 const LAST_WORDS: Duration = Duration::from_millis(100);
 /// What a shell reports of a process that SIGINT has ended.
 const ENDED_AT_ONCE: i32 = 130;
@@ -47,7 +47,7 @@ pub fn shutdown_signal() -> impl Future<Output = ()> + Send {
     });
     async move {
         if told.await.is_err() {
-            // Nobody listens to signals any more, so none will come.
+            // The task above ended with its runtime, so that no signal will come.
             std::future::pending::<()>().await;
         }
     }

@@ -62,12 +62,12 @@ async fn health_and_nothing_else() {
 async fn ill_health_is_told_line_by_line() {
     let health = Health::default();
     let (server, _) = server_with(health.clone()).await;
-    let hub = health.part("hub", Duration::from_secs(3600));
-    hub.set_trouble(Some("the disk is full".to_owned()));
+    let scores = health.part("scores", Duration::from_secs(3600));
+    scores.set_trouble(Some("the disk is full".to_owned()));
     drop(health.part("training", Duration::from_secs(3600)));
     let (head, body) = get(server.address, "/healthz").await;
     assert!(head.starts_with("http/1.1 503"), "{head}");
-    assert_eq!(body, "hub: the disk is full\ntraining: it ended before its work was done\n");
+    assert_eq!(body, "scores: the disk is full\ntraining: it ended before its work was done\n");
     let (head, _) = get(server.address, "/metrics").await;
     assert!(head.starts_with("http/1.1 200"), "a sick process is still measured: {head}");
 }
@@ -87,7 +87,7 @@ fn kept(address: SocketAddr, sent: &str) -> Duration {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn half_a_question_and_silence_are_cut_off_within_seconds() {
+async fn half_a_request_and_silence_are_cut_off_within_seconds() {
     let (server, _) = server().await;
     for sent in ["GET /metrics HTTP/1.1\r\nHost: x", "GET /met", ""] {
         let address = server.address;
@@ -97,16 +97,16 @@ async fn half_a_question_and_silence_are_cut_off_within_seconds() {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn connections_are_not_kept_for_a_second_question() {
+async fn connections_are_not_kept_for_a_second_request() {
     let (server, _) = server().await;
     let address = server.address;
-    let question = "GET /healthz HTTP/1.1\r\nHost: x\r\n\r\n";
-    let time = tokio::task::spawn_blocking(move || kept(address, question)).await.unwrap();
+    let request = "GET /healthz HTTP/1.1\r\nHost: x\r\n\r\n";
+    let time = tokio::task::spawn_blocking(move || kept(address, request)).await.unwrap();
     assert!(time < Duration::from_secs(2), "it was kept for {time:?}");
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn a_hundred_idle_connections_keep_nobody_out() {
+async fn a_hundred_idle_connections_keep_no_client_out() {
     let (server, _) = server().await;
     let connect = |_| TcpStream::connect(server.address).unwrap();
     let mut idle: Vec<TcpStream> = (0..100).map(connect).collect();

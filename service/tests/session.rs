@@ -1,4 +1,4 @@
-//! Sessions over real TCP: what learner and evaluators need of each other, whoever comes first, goes, or comes back.
+//! Sessions over real TCP: what learner and evaluators need of each other, whichever comes first, goes, or comes back.
 #![allow(clippy::unwrap_used, clippy::expect_used)]
 
 use std::net::{Ipv4Addr, TcpListener};
@@ -40,8 +40,8 @@ async fn meeting_point() -> (Session, String) {
     (session, reachable[0].clone())
 }
 
-/// An endpoint that nobody listens at for now; its loopback address is not used by anything else, so that nobody takes
-/// the port before the test does.
+/// An endpoint at which no process listens for now; its loopback address is not used by anything else, so that no other
+/// process takes the port before the test does.
 fn free_endpoint() -> String {
     static LAST: AtomicU8 = AtomicU8::new(1);
     let address = Ipv4Addr::new(127, 0, 0, 1 + LAST.fetch_add(1, Ordering::Relaxed));
@@ -73,8 +73,8 @@ async fn declare_learner(session: &Session, run: &str) -> impl Sized + use<> {
     (answers, token)
 }
 
-async fn ask(session: &Session, run: &str, question: Vec<u8>) -> Option<Vec<u8>> {
-    let replies = session.get(format!("quad/{run}/jobs")).payload(question).timeout(PATIENCE).await.unwrap();
+async fn ask(session: &Session, run: &str, request: Vec<u8>) -> Option<Vec<u8>> {
+    let replies = session.get(format!("quad/{run}/jobs")).payload(request).timeout(PATIENCE).await.unwrap();
     let reply = replies.recv_async().await.ok()?;
     Some(reply.result().unwrap().payload().to_bytes().into_owned())
 }
@@ -151,7 +151,7 @@ async fn a_client_waits_for_a_peer_that_has_not_started() {
         let endpoints = connecting_to(&endpoint);
         async move { open_session(&endpoints).await }
     });
-    assert!(timeout(LULL, &mut opening).await.is_err(), "there is nobody to connect to");
+    assert!(timeout(LULL, &mut opening).await.is_err(), "there is no peer to connect to");
     let endpoints = listening_at(&endpoint);
     let learner = open_session(&endpoints).await.unwrap();
     assert_eq!(reachable_at(&learner, &endpoints).await.unwrap(), [endpoint]);
@@ -162,7 +162,7 @@ async fn a_client_waits_for_a_peer_that_has_not_started() {
 #[tokio::test(flavor = "multi_thread")]
 async fn waiting_can_be_given_up() {
     let (endpoints, begin) = (connecting_to(&free_endpoint()), Instant::now());
-    assert!(timeout(LULL, open_session(&endpoints)).await.is_err(), "there is nobody to connect to");
+    assert!(timeout(LULL, open_session(&endpoints)).await.is_err(), "there is no peer to connect to");
     assert!(begin.elapsed() < PATIENCE, "it took {:?}", begin.elapsed());
 }
 
@@ -179,7 +179,7 @@ async fn a_client_connects_again_when_the_peer_comes_back() {
     drop(declared);
     learner.close().await.unwrap();
     assert_eq!(next(&learners).await, (SampleKind::Delete, key.clone()));
-    assert_eq!(ask(&evaluator, "run", vec![1]).await, None, "nobody is there to answer");
+    assert_eq!(ask(&evaluator, "run", vec![1]).await, None, "no peer is there to answer");
 
     let learner = open_session(&listening_at(&endpoint)).await.unwrap();
     let _declared = declare_learner(&learner, "run").await;
@@ -220,7 +220,7 @@ fn endpoints_on_a_command_line() {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn beyond_the_most_connections_nobody_comes_in_until_one_leaves() {
+async fn beyond_the_most_connections_no_client_comes_in_until_one_leaves() {
     const MOST: usize = 768;
     // Both ends of each connection are open files of this process.
     let limit = rustix::process::getrlimit(Resource::Nofile);

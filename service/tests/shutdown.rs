@@ -9,7 +9,7 @@ use tokio::runtime::{Builder, Runtime};
 use tokio::time::timeout;
 
 #[test]
-fn either_signal_is_noticed_even_before_anybody_waits() {
+fn either_signal_is_noticed_even_before_it_is_awaited() {
     let send = |signal: &str| {
         let status = Command::new("sh").args(["-c", &format!("kill -{signal} {}", std::process::id())]).status();
         assert!(status.unwrap().success());

@@ -11,6 +11,10 @@ const TOLERANCE: f32 = 1e-4;
 #[allow(dead_code)] // not every crate makes some
 const FRESH_TOLERANCE: f32 = 1e-2;
 
+/// The seed of folders that are made for a test. One that never changes, so that a change is what makes the test fail.
+#[allow(dead_code)] // not every crate makes some
+const FRESH_SEED: &str = "1000";
+
 /// A golden folder.
 pub struct Golden {
     pub folder: PathBuf,
@@ -23,7 +27,8 @@ pub struct Golden {
 }
 
 /// Runs tests/golden/make.py. Without the Python that deploy/setup.sh --tests sets up it is skipped, unless
-/// QUAD_REQUIRE_PEERS asks for it; says whether it ran.
+/// QUAD_REQUIRE_PEERS=1 asks for it; says whether it ran.
+#[allow(dead_code)] // not every crate makes some
 #[allow(clippy::print_stderr)] // what is skipped is said
 pub fn make(arguments: &[&str]) -> bool {
     let home = Path::new(env!("CARGO_MANIFEST_DIR")).join("..");
@@ -31,7 +36,8 @@ pub fn make(arguments: &[&str]) -> bool {
     let has_jax = Command::new(&python).args(["-c", "import jax, safetensors"]).output();
     if !has_jax.is_ok_and(|output| output.status.success()) {
         let remedy = "deploy/setup.sh --tests installs it";
-        assert!(std::env::var_os("QUAD_REQUIRE_PEERS").is_none(), "{} has no jax; {remedy}", python.display());
+        let required = std::env::var_os("QUAD_REQUIRE_PEERS").is_some_and(|value| value == "1");
+        assert!(!required, "{} has no jax; {remedy}", python.display());
         eprintln!("skipped, because {} has no jax; {remedy}", python.display());
         return false;
     }
@@ -41,12 +47,10 @@ pub fn make(arguments: &[&str]) -> bool {
     true
 }
 
-/// A folder of a variant that nobody has seen before; `None` where make.py cannot run.
+/// A folder of a variant that is not a committed one, of the seed that GOLDEN_SEED names; `None` where make.py cannot run.
 #[allow(dead_code)] // not every crate makes some
-#[allow(clippy::print_stderr)] // the seed is said, so that a failure can be repeated
 pub fn fresh(variant: &str) -> Option<Golden> {
-    let seed = std::time::UNIX_EPOCH.elapsed().unwrap().subsec_nanos().to_string();
-    eprintln!("make.py --seed {seed} --variant {variant}");
+    let seed = std::env::var("GOLDEN_SEED").unwrap_or_else(|_| FRESH_SEED.to_owned());
     let folder = std::env::temp_dir().join(format!("golden-{variant}-{seed}-{}", std::process::id()));
     if !make(&["--seed", &seed, "--variant", variant, "--out", folder.to_str().unwrap()]) {
         return None;
@@ -56,12 +60,15 @@ pub fn fresh(variant: &str) -> Option<Golden> {
     Some(Golden { tolerance: FRESH_TOLERANCE, ..golden })
 }
 
-/// The folders of one algorithm: the committed ones, or the one that GOLDEN_DIR names.
+/// The folders of one algorithm: the committed ones, or the one that GOLDEN_DIR names, which must be of that algorithm.
 pub fn goldens(algorithm: &str) -> Vec<Golden> {
-    let of_algorithm = |golden: &Golden| golden.config["algorithm"] == algorithm;
     if let Some(folder) = std::env::var_os("GOLDEN_DIR") {
-        return Vec::from_iter(Some(Golden::open(folder.into())).filter(of_algorithm));
+        let golden = Golden::open(folder.into());
+        let (found, place) = (&golden.config["algorithm"], golden.folder.display());
+        assert_eq!(found, algorithm, "{place} is of another algorithm; name this one's tests, as docs/golden.md shows");
+        return vec![golden];
     }
+    let of_algorithm = |golden: &Golden| golden.config["algorithm"] == algorithm;
     let home = Path::new(env!("CARGO_MANIFEST_DIR")).join("../tests/golden");
     let mut folders: Vec<_> = std::fs::read_dir(&home).unwrap().map(|entry| entry.unwrap().path()).collect();
     folders.retain(|folder| folder.join("config.json").exists());

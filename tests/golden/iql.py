@@ -101,7 +101,7 @@ actor_gradient = compiled(jax.value_and_grad(actor_loss))
 
 
 def update(config, state, inputs):
-    """All that must come out; and, for whoever draws the inputs, q and the exponents of the weights."""
+    """All that must come out; and, for `draw`, q and the exponents of the weights."""
     agent, step = config["agent"], config["step"]
     s, a, next_states = (inputs[name] for name in ("observations", "actions", "next_observations"))
     out = {}

@@ -60,7 +60,7 @@ impl Certificates {
     }
 }
 
-/// Connects as whoever has the certificate in `folder`, or as nobody, and trusts the authority of `trusted`.
+/// Connects with the certificate in `folder`, or with none, and trusts the authority of `trusted`.
 pub async fn connect(endpoint: &str, trusted: &Path, folder: Option<&Path>) -> zenoh::Result<Session> {
     let mut config = Config::default();
     let mut settings = vec![

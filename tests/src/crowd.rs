@@ -1,9 +1,8 @@
 //! Evaluators that do everything on the wire and nothing else: they claim, report progress and deliver scores that they made
 //! up. Hundreds of them fit into one test.
 
-use std::collections::BTreeMap;
 use std::mem;
-use std::sync::atomic::{AtomicU8, AtomicUsize, Ordering::Relaxed};
+use std::sync::atomic::{AtomicUsize, Ordering::Relaxed};
 use std::sync::{Arc, Mutex};
 use std::time::{Duration, Instant};
 
@@ -14,43 +13,35 @@ use quad_protocol::{
 use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 use tokio::task::JoinSet;
-use tokio::time::{sleep, sleep_until, timeout};
+use tokio::time::{sleep, timeout};
 use zenoh::query::{ConsolidationMode, QueryTarget};
 use zenoh::{Config, Session};
 
 use crate::made_up::{self, name};
-use crate::number;
 
 /// An evaluator's patience with its learner.
 const ANSWER: Duration = Duration::from_secs(5);
-/// And its pause before the next question of the kind.
-const APART: Duration = Duration::from_millis(50);
+
+/// And its pause after a question without an answer.
+const PAUSE: Duration = Duration::from_millis(250);
 
 /// Most episodes of a job.
 const MOST_EPISODES: u32 = 40;
 
-/// An episode at a real pace takes this long, or half of it.
-fn longest_episode() -> Duration {
-    Duration::from_millis(number("QUAD_EPISODE_MILLISECONDS", 400))
-}
-
-/// A job at a real pace takes no longer.
-pub fn longest_job() -> Duration {
-    MOST_EPISODES * longest_episode()
+/// A job at a real pace takes no longer than this, of episodes that take no longer than `episode`.
+pub fn longest_job(episode: Duration) -> Duration {
+    MOST_EPISODES * episode
 }
 
 /// What a crowd does.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-#[repr(u8)]
 pub enum Pace {
     /// Nothing but staying connected.
     Still,
     /// A job takes some seconds, with progress meanwhile, as with real episodes.
     Real,
-    /// The same in a twentieth of the time, so that somebody claims every moment.
+    /// The same in a twentieth of the time, so that there is a claim at every moment.
     Quick,
-    /// A job takes no time.
-    Instant,
 }
 
 /// What a crowd has measured since it was last asked.
@@ -62,6 +53,10 @@ pub struct Measured {
     pub reports: Vec<Duration>,
     /// Questions without an answer.
     pub unanswered: usize,
+    /// Scores that the learner acknowledged: step, seed, weights.
+    pub acknowledged: Vec<(u64, u64, String)>,
+    /// Reports that it refused.
+    pub refused: usize,
 }
 
 impl Measured {
@@ -70,6 +65,8 @@ impl Measured {
         self.claims.extend(later.claims);
         self.reports.extend(later.reports);
         self.unanswered += later.unanswered;
+        self.acknowledged.extend(later.acknowledged);
+        self.refused += later.refused;
     }
 }
 
@@ -81,18 +78,22 @@ pub struct Crowd {
 
 struct Shared {
     run: Name,
-    pace: AtomicU8,
+    /// The longest episode at a real pace; the shortest takes half as long.
+    episode: Duration,
+    pace: Mutex<Pace>,
     /// Evaluators that have a job.
     busy: AtomicUsize,
     measured: Mutex<Measured>,
 }
 
 impl Crowd {
-    /// Connects `count` evaluators of `run`, each with a session of its own, to `endpoint`.
-    pub async fn connect(count: usize, run: &Name, endpoint: &str) -> Crowd {
+    /// Connects `count` evaluators of `run`, each with a session of its own, to `endpoint`. At a real pace, an episode takes
+    /// up to `episode`.
+    pub async fn connect(count: usize, episode: Duration, run: &Name, endpoint: &str) -> Crowd {
         let shared = Arc::new(Shared {
             run: run.clone(),
-            pace: AtomicU8::new(0),
+            episode,
+            pace: Mutex::new(Pace::Still),
             busy: AtomicUsize::new(0),
             measured: Mutex::default(),
         });
@@ -104,9 +105,9 @@ impl Crowd {
         Crowd { shared, _tasks: tasks }
     }
 
-    /// From now on, everybody does this. A job that was begun is still done.
+    /// From now on, all of them do this. A job that was begun is still done.
     pub fn set(&self, pace: Pace) {
-        self.shared.pace.store(pace as u8, Relaxed);
+        *self.shared.pace.lock().unwrap() = pace;
     }
 
     /// How many have a job.
@@ -116,17 +117,17 @@ impl Crowd {
 
     /// What was measured since this was last called.
     pub fn measured(&self) -> Measured {
-        std::mem::take(&mut *self.shared.measured.lock().expect("nobody panics with it"))
+        mem::take(&mut *self.shared.measured.lock().unwrap())
     }
 }
 
 impl Shared {
     fn pace(&self) -> Pace {
-        [Pace::Still, Pace::Real, Pace::Quick, Pace::Instant][self.pace.load(Relaxed) as usize]
+        *self.pace.lock().unwrap()
     }
 
     fn note(&self, note: impl FnOnce(&mut Measured)) {
-        note(&mut self.measured.lock().expect("nobody panics with it"));
+        note(&mut self.measured.lock().unwrap());
     }
 }
 
@@ -135,8 +136,6 @@ struct Member {
     session: Session,
     shared: Arc<Shared>,
     random: ChaCha8Rng,
-    /// When it last got an answer, by the key that it asked.
-    answered: BTreeMap<String, Instant>,
     /// When it last told its progress.
     told: Option<Instant>,
     /// Has had no job yet since it was still.
@@ -152,10 +151,10 @@ impl Member {
         {
             config.insert_json5(key, value).expect("the setting exists");
         }
-        let session = zenoh::open(config).await.expect("somebody listens");
+        let session = zenoh::open(config).await.expect("the endpoint is open");
         let name = name(&format!("light-{number}"));
         let random = ChaCha8Rng::seed_from_u64(number as u64);
-        Member { name, session, shared, random, answered: BTreeMap::new(), told: None, begins: true }
+        Member { name, session, shared, random, told: None, begins: true }
     }
 
     async fn work(mut self) {
@@ -183,7 +182,7 @@ impl Member {
                     let wait = Duration::from_millis(milliseconds).mul_f64(self.random.random_range(0.5..1.0));
                     timeout(wait, woken.notified()).await.ok();
                 }
-                _ => {}
+                _ => sleep(PAUSE).await,
             }
         }
     }
@@ -196,67 +195,72 @@ impl Member {
     }
 
     async fn score(&mut self, job: Job) {
-        let episode = match self.shared.pace() {
-            Pace::Real => longest_episode(),
-            Pace::Quick => longest_episode() / 20,
-            Pace::Still | Pace::Instant => Duration::ZERO,
-        };
-        if !episode.is_zero() {
-            let longest = episode * job.seeds.len() as u32;
-            let mut left = self.random.random_range(longest / 2..longest);
-            // They all begin together, and should not go on so.
-            if mem::take(&mut self.begins) {
-                left = left.mul_f64(self.random.random());
-            }
-            let every = Duration::from_millis(job.progress_milliseconds);
-            for steps_done in 0.. {
-                // Like a real one, it does not tell more because its jobs are short.
-                if self.told.is_none_or(|told| told.elapsed() >= every) {
-                    self.told = Some(Instant::now());
-                    self.progress(&job, steps_done).await;
-                }
-                sleep(every.min(left)).await;
-                left = left.saturating_sub(every);
-                if left.is_zero() {
-                    break;
-                }
-            }
-        }
+        self.act(&job).await;
         let spec = environment::find("hopper").expect("hopper is known");
         let episodes = job.seeds.iter().map(|&seed| {
             let episode_return = (seed % 3000) as f64;
             EpisodeScore { seed, episode_return, length: 300, score: spec.normalised_score(episode_return) }
         });
         let report = ScoreReport::of(&job, self.name.clone(), name("f32"), episodes.collect());
-        // What was not acknowledged is delivered again.
+        // What was not answered is delivered again.
         while self.deliver(&report).await.is_none() {
-            sleep(Duration::from_millis(250)).await;
+            sleep(PAUSE).await;
+        }
+    }
+
+    /// Takes the time that a job takes, and tells its progress.
+    async fn act(&mut self, job: &Job) {
+        let episode = match self.shared.pace() {
+            Pace::Real => self.shared.episode,
+            Pace::Quick => self.shared.episode / 20,
+            Pace::Still => return,
+        };
+        let longest = episode * job.seeds.len() as u32;
+        let mut left = self.random.random_range(longest / 2..longest);
+        // They all begin together, and should not go on so.
+        if mem::take(&mut self.begins) {
+            left = left.mul_f64(self.random.random());
+        }
+        let every = Duration::from_millis(job.progress_milliseconds);
+        let mut steps_done = 0;
+        while !left.is_zero() {
+            // Like a real one, it does not tell more because its jobs are short.
+            if self.told.is_none_or(|told| told.elapsed() >= every) {
+                self.told = Some(Instant::now());
+                self.progress(job, steps_done).await;
+            }
+            sleep(every.min(left)).await;
+            left = left.saturating_sub(every);
+            steps_done += 1;
         }
     }
 
     async fn deliver(&mut self, report: &ScoreReport) -> Option<()> {
         let (answer, took) = self.ask::<ScoreReply>(keys::scores(&report.run), report).await?;
-        assert!(matches!(answer, ScoreReply::Recorded { .. }), "{answer:?}");
-        self.shared.note(|measured| measured.reports.push(took));
+        let recorded = matches!(answer, ScoreReply::Recorded { .. });
+        let scores = report.episodes.iter().map(|episode| (report.step, episode.seed, report.weights.to_string()));
+        self.shared.note(|measured| {
+            measured.reports.push(took);
+            match recorded {
+                true => measured.acknowledged.extend(scores),
+                false => measured.refused += 1,
+            }
+        });
         Some(())
     }
 
     async fn progress(&self, job: &Job, steps_done: u64) {
         let progress = Progress { steps_done, environment_steps: steps_done, ..Progress::of(job, self.name.clone()) };
-        let message = encode(&progress.signed(&job.lease)).expect("it is small");
+        let message = encode(&progress).expect("it is small");
         self.session.put(keys::progress(&job.run, &self.name), message).await.expect("the session is open");
     }
 
     /// The answer and how long it took.
     async fn ask<A: Message>(&mut self, key: String, question: &impl Message) -> Option<(A, Duration)> {
-        if let Some(&answered) = self.answered.get(&key) {
-            sleep_until((answered + APART).into()).await;
-        }
         let begin = Instant::now();
         let get = self.session.get(&key).payload(encode(question).expect("it is small")).timeout(ANSWER);
         let get = get.target(QueryTarget::All).consolidation(ConsolidationMode::None).await;
         let reply = get.expect("the session is open").recv_async().await.ok();
-        self.answered.insert(key, Instant::now());
         let Some(Ok(sample)) = reply.map(|reply| reply.into_result()) else {
             self.shared.note(|measured| measured.unanswered += 1);
             return None;

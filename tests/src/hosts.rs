@@ -1,6 +1,6 @@
-//! Hosts on one machine: network namespaces on a private bridge, whose packets can be lost, held up or doubled.
+//! Hosts on one machine: network namespaces on a private bridge, whose packets can be lost or held up.
 //!
-//! Needs root, `ip`, `tc` and `nft`, and a kernel of 5.17 or newer. The bridge has an address on this machine, so that a
+//! Needs root, `ip`, `tc` and `nft`. The bridge has an address on this machine, so that a
 //! router in the test's own process can be reached; what happens to packets happens outside the hosts, unseen by them.
 
 use std::fs;
@@ -29,8 +29,6 @@ pub struct Network {
 pub struct Host {
     /// Of the namespace, and of the outer end of the cable whose inner end is the host's eth0.
     name: String,
-    /// Its address on the bridge.
-    pub address: String,
     endpoint: String,
 }
 
@@ -63,19 +61,7 @@ impl Network {
         run(&format!("ip -n {name} addr add {address}/28 dev eth0"))?;
         run(&format!("ip -n {name} link set lo up"))?;
         run(&format!("ip -n {name} link set eth0 up"))?;
-        Ok(Host { name, address, endpoint: format!("tcp/{}:{port}", self.address) })
-    }
-
-    /// Another address of a host. Whoever speaks to it from this machine does so from another address, too.
-    ///
-    /// # Errors
-    /// Why there can be none here.
-    pub fn other_address(&self, host: &Host) -> Result<String, String> {
-        let ([here, there], bridge) = ([14, 13].map(address), &self.name);
-        run(&format!("ip addr add {here}/32 dev {bridge}"))?;
-        host.run(&format!("ip addr add {there}/32 dev eth0"))?;
-        run(&format!("ip route add {there}/32 dev {bridge} src {here}"))?;
-        Ok(there)
+        Ok(Host { name, endpoint: format!("tcp/{}:{port}", self.address) })
     }
 }
 
@@ -87,15 +73,8 @@ impl Drop for Network {
 }
 
 impl Line for Host {
-    const TROUBLES: &'static [Trouble] = &[
-        Trouble::Silent,
-        Trouble::Deaf,
-        Trouble::Mute,
-        Trouble::Unplugged,
-        Trouble::Slow,
-        Trouble::Lossy,
-        Trouble::Doubled,
-    ];
+    const TROUBLES: &'static [Trouble] =
+        &[Trouble::Silent, Trouble::Deaf, Trouble::Mute, Trouble::Unplugged, Trouble::Slow, Trouble::Lossy];
 
     fn endpoint(&self) -> String {
         self.endpoint.clone()
@@ -114,13 +93,6 @@ impl Line for Host {
             Trouble::Deaf => self.drop_packets(&[to], ""),
             Trouble::Mute => self.drop_packets(&[from], ""),
             Trouble::Lossy => self.drop_packets(&[from, to], &format!("numgen random mod 200 < {percent}")),
-            Trouble::Doubled => {
-                let rule = |device: &str| format!("numgen random mod 100 < {percent} dup to {device} ;");
-                let hook = |device: &str| format!("type filter hook egress device {device} priority 0 ;");
-                let chain = |device: &str| format!("chain doubled {{ {} {} }} ;", hook(device), rule(device));
-                let begin = self.at_both_ends(|device| format!("nft table netdev {name} {{ {} }}", chain(device)));
-                (begin, self.at_both_ends(|_| format!("nft delete table netdev {name}")))
-            }
             Trouble::Slow => {
                 let rate = 5000 / percent;
                 let limit = format!("tbf rate {rate}kbit burst 5kb limit 30kb");
@@ -140,14 +112,6 @@ impl Line for Host {
 }
 
 impl Host {
-    /// Runs a command on it.
-    ///
-    /// # Errors
-    /// What the command says.
-    pub fn run(&self, command: &str) -> Result<(), String> {
-        run(&format!("ip netns exec {} {command}", self.name))
-    }
-
     /// Commands that let the bridge drop those packets of this host that fulfil a condition, and those that undo it.
     fn drop_packets(&self, directions: &[(&str, &str)], condition: &str) -> (Vec<String>, Vec<String>) {
         let name = &self.name;
@@ -178,7 +142,7 @@ fn remove(of: impl Fn(u32) -> bool) {
             let name = entry.file_name().to_string_lossy().into_owned();
             let owner = name.strip_prefix(PREFIX).and_then(|rest| rest.split('-').next()?.parse().ok());
             if owner.is_some_and(&of) {
-                for command in ["ip netns del", "ip link del", "nft delete table bridge", "nft delete table netdev"] {
+                for command in ["ip netns del", "ip link del", "nft delete table bridge"] {
                     run(&format!("{command} {name}")).ok();
                 }
             }

@@ -5,14 +5,14 @@
 //! In reading order:
 //!
 //! - [`process`]: start a program, signal it, wait for it, read what it said.
-//! - [`system`]: a scratch folder with a tiny dataset and preset; learners and evaluators that use them.
-//! - [`router`]: a Zenoh router in the test's own process.
-//! - [`line`](mod@line): a connection on which things go wrong: a [`link`] of TCP, or a cable to a host of its own, in [`hosts`].
-//! - [`power`]: what a disk holds after a power cut.
-//! - [`crowd`]: hundreds of evaluators that only talk; [`made_up`]: messages of such as do not exist; [`pace`]: how fast a learner trains, and what slows it down.
-//! - [`certificates`]: one for each role, and sessions that show them.
+//! - [`setting`]: how long a run is; [`system`]: a scratch folder with a tiny dataset, and what is started in it; [`learner`]: what a
+//!   learner tells and leaves in its run's folder.
 //! - [`http`]: fetch a page, read a metric, serve a file.
-//! - [`pieces`]: somebody who speaks Zenoh's protocol byte by byte.
+//! - [`router`]: a Zenoh router in the test's own process; [`certificates`]: one for each role, and sessions that show them.
+//! - [`made_up`]: messages that tests make up; [`crowd`]: hundreds of evaluators that only talk; [`pace`]: how fast a learner
+//!   trains meanwhile.
+//! - [`line`](mod@line): a connection on which things go wrong: a [`link`] of TCP, or a cable to a host of its own, in [`hosts`].
+//! - [`power`]: what a disk holds after a power cut; [`small_disk`]: one that is soon full.
 //! - [`peers`]: programs that are not ours; where one is missing, a test is skipped or fails.
 //! - [`prometheus`]: one to start, and what to ask any; [`dashboard`]: what Grafana's panels ask it.
 //!
@@ -24,17 +24,18 @@ pub mod crowd;
 pub mod dashboard;
 pub mod hosts;
 pub mod http;
-pub mod knock;
+pub mod learner;
 pub mod line;
 pub mod link;
 pub mod made_up;
 pub mod pace;
 pub mod peers;
-pub mod pieces;
 pub mod power;
 pub mod process;
 pub mod prometheus;
 pub mod router;
+pub mod setting;
+pub mod small_disk;
 pub mod system;
 
 use std::time::{Duration, Instant};

@@ -10,7 +10,7 @@ use std::time::Duration;
 pub enum Trouble {
     /// Connections end, and new ones are turned away.
     Cut,
-    /// Nothing goes through, and nobody is told.
+    /// Nothing goes through, and neither end is told.
     Silent,
     /// Nothing reaches the program; what it sends arrives.
     Deaf,
@@ -22,8 +22,6 @@ pub enum Trouble {
     Slow,
     /// Some packets are lost.
     Lossy,
-    /// Some packets arrive more than once.
-    Doubled,
 }
 
 /// What the chaos test does to a connection, whatever that is made of.

@@ -1,5 +1,5 @@
-//! A network connection that a test can cut, freeze and slow down: whoever connects to it is led on to somebody else.
-//! Works on any machine, for any user.
+//! A network connection that a test can cut, freeze and slow down: it leads a program on to a port of this machine.
+//! Works for any user.
 
 use std::io::{ErrorKind, Read, Write};
 use std::net::{Shutdown, TcpListener, TcpStream};
@@ -28,7 +28,7 @@ struct State {
 }
 
 impl Link {
-    /// To a port that somebody may listen at, now or later.
+    /// To a port that may be opened now or later.
     pub fn to(port: u16) -> Link {
         let listener = TcpListener::bind("127.0.0.1:0").expect("there is a free port");
         let endpoint = format!("tcp/{}", listener.local_addr().expect("it is bound"));
@@ -39,11 +39,11 @@ impl Link {
                 if shared.cut.load(Relaxed) {
                     continue;
                 }
-                // With nobody there, the connection ends at once.
+                // If the port is closed, the connection ends at once.
                 let Ok(far) = TcpStream::connect(("127.0.0.1", port)) else { continue };
                 let streams = || Some([near.try_clone().ok()?, far.try_clone().ok()?]);
                 let Some(copies) = streams() else { continue };
-                let mut open = shared.streams.lock().expect("nobody panics with it");
+                let mut open = shared.streams.lock().expect("no thread panics with it");
                 open.retain(|stream| stream.peer_addr().is_ok());
                 open.extend(copies);
                 for (from, to) in [(&near, &far), (&far, &near)] {
@@ -73,7 +73,7 @@ impl Line for Link {
         match trouble {
             Trouble::Cut => {
                 state.cut.store(true, Relaxed);
-                for stream in state.streams.lock().expect("nobody panics with it").drain(..) {
+                for stream in state.streams.lock().expect("no thread panics with it").drain(..) {
                     stream.shutdown(Shutdown::Both).ok();
                 }
             }

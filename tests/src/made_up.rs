@@ -1,6 +1,6 @@
-//! Messages of evaluators that do not exist: well-formed, but nothing in them is true.
+//! Messages that tests make up: well-formed, but no learner or evaluator of ours has sent them.
 
-use quad_protocol::{EpisodeScore, Hash, JobRequest, Name, Progress, ScoreReport};
+use quad_protocol::{EpisodeScore, Hash, JobRequest, Name, Progress, Schema, ScoreReport, Snapshot};
 
 /// A name that is allowed.
 pub fn name(text: &str) -> Name {
@@ -9,11 +9,10 @@ pub fn name(text: &str) -> Name {
 
 /// Asks for work in one environment.
 pub fn claim(evaluator: &str, attempt: u64, environment: &str) -> JobRequest {
-    let (evaluator, precision) = (name(evaluator), name("f32"));
-    JobRequest::Claim { evaluator, attempt, environments: vec![environment.to_owned()], precision }
+    JobRequest::Claim { evaluator: name(evaluator), attempt, environments: vec![environment.to_owned()] }
 }
 
-/// Tells of a job that nobody handed out.
+/// Tells of a job that was never handed out.
 pub fn progress(run: &Name, evaluator: &str, steps_done: u64) -> Progress {
     Progress {
         evaluator: name(evaluator),
@@ -26,7 +25,6 @@ pub fn progress(run: &Name, evaluator: &str, steps_done: u64) -> Progress {
         steps_done,
         environment_steps: steps_done,
         episodes: 0,
-        proof: Hash::of(b"guessed"),
     }
 }
 
@@ -42,4 +40,11 @@ pub fn report(run: &Name, step: u64, seed: u64) -> ScoreReport {
         precision: name("f32"),
         episodes: vec![EpisodeScore { seed, episode_return: f64::NAN, length: 0, score: f64::NAN }],
     }
+}
+
+/// A policy for Hopper, whatever the tensors are.
+pub fn snapshot(run: &Name, incarnation: u64, step: u64, tensors: &[u8]) -> Snapshot {
+    let schema =
+        Schema { environment: "hopper".to_owned(), observation_dim: 11, action_dim: 3, policy: "diffusion".to_owned() };
+    Snapshot { run: run.clone(), incarnation, step, schema, hash: Hash::of(tensors), tensors: tensors.to_vec() }
 }

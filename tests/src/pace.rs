@@ -5,11 +5,11 @@ use std::fs;
 use std::thread;
 use std::time::{Duration, Instant};
 
-use crate::http;
-use crate::system::{Learner, Setting};
+use crate::learner::Learner;
+use crate::setting::Setting;
 
-/// A run that outlives any measurement, with more episodes than any crowd can score meanwhile.
-pub const ENDLESS: Setting =
+/// A run with more episodes than any crowd can score while it is measured.
+pub const BUSY: Setting =
     Setting { steps: 100_000_000, eval_interval: 30_000, episodes: 10_000, candidates: 1, hidden: 64, seed: 3 };
 /// After a change between quiet and loud, this long is not counted.
 pub const SETTLE: Duration = Duration::from_millis(500);
@@ -26,17 +26,16 @@ pub struct Pace {
 /// Lets `rounds` quiet and loud phases follow each other; `loud` begins and ends the noise. Gives the quiet pace and the loud
 /// one.
 pub fn compare(learner: &Learner, rounds: usize, phase: Duration, mut loud: impl FnMut(bool)) -> [Pace; 2] {
-    let page = learner.metrics();
     let mut phases = [Vec::new(), Vec::new()];
     for _ in 0..rounds {
         for (kind, found) in phases.iter_mut().enumerate() {
             loud(kind == 1);
             thread::sleep(SETTLE);
-            let (begin, steps, other) = (Instant::now(), steps(&page), other_threads(learner));
+            let (begin, steps, other) = (Instant::now(), steps(learner), other_threads(learner));
             thread::sleep(phase);
             let passed = begin.elapsed().as_secs_f64();
             found.push(Pace {
-                steps_per_second: (self::steps(&page) - steps) / passed,
+                steps_per_second: (self::steps(learner) - steps) / passed,
                 other_threads: (other_threads(learner) - other) / passed,
             });
         }
@@ -55,22 +54,8 @@ pub fn median(numbers: impl Iterator<Item = f64>) -> f64 {
     numbers[numbers.len() / 2]
 }
 
-/// Runs `work` on one core, and what it starts, too, where there is `taskset`.
-pub fn on_core<T: Send>(core: usize, work: impl FnOnce() -> T + Send) -> T {
-    let pinned = || {
-        // `…/PID/task/TID`
-        let thread = fs::read_link("/proc/thread-self").expect("Linux says which thread this is");
-        let thread = thread.file_name().and_then(|name| name.to_str()).expect("a number").to_owned();
-        let arguments = ["-p", "-c", &core.to_string(), &thread];
-        std::process::Command::new("taskset").args(arguments).output().ok();
-        work()
-    };
-    thread::scope(|scope| scope.spawn(pinned).join().expect("it does not panic"))
-}
-
-fn steps(page: &str) -> f64 {
-    let page = http::metrics(page).expect("the learner runs");
-    http::sum(&page, "quad_learner_gradient_steps_total", "")
+fn steps(learner: &Learner) -> f64 {
+    learner.metric("gradient_steps_total", "").expect("the learner runs")
 }
 
 /// Processor time of the threads that do not train, seconds.

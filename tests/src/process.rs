@@ -98,6 +98,12 @@ impl Process {
         eventually(&what, patience, || self.child.try_wait().expect("a child can be waited for"))
     }
 
+    /// Waits for its end, which must be a success.
+    pub fn assert_succeeds(&mut self, patience: Duration) {
+        let status = self.wait(patience);
+        assert!(status.success(), "{} ended with {status}", self.name);
+    }
+
     /// Tells it to leave; how long that took, and how it ended.
     pub fn terminate(&mut self, patience: Duration) -> (Duration, ExitStatus) {
         let start = Instant::now();

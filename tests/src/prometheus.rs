@@ -35,7 +35,7 @@ pub fn start(scratch: &Scratch, jobs: &[(&str, &[String])]) -> (Process, Prometh
 }
 
 impl Prometheus {
-    /// The values of an expression now, one for each series that has a finite one; nothing where nobody answers.
+    /// The values of an expression now, one for each series that has a finite one; nothing without an answer.
     pub fn query(&self, expression: &str) -> Option<Vec<f64>> {
         let (_, body) = http::get(&self.address, &format!("/api/v1/query?query={}", percent_encoded(expression)))?;
         let answer: Value = serde_json::from_str(&body).ok()?;

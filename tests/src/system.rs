@@ -1,4 +1,4 @@
-//! A scratch folder with a tiny dataset and preset, and learners and evaluators that use them.
+//! A scratch folder with a tiny dataset, and learners and evaluators that use it.
 
 use std::fs;
 use std::net::TcpListener;
@@ -6,84 +6,12 @@ use std::path::{Path, PathBuf};
 use std::process::Command;
 
 use quad_dataset::{D4rlWriter, Metadata, Row, environment};
-use quad_protocol::Hash;
-use serde_json::Value;
 use tempfile::TempDir;
 
+use crate::PATIENCE;
+use crate::learner::Learner;
 use crate::process::{Process, binary};
-use crate::{PATIENCE, eventually};
-
-/// What a test may choose of a training run; the rest of the preset is fixed and small.
-#[derive(Clone, Copy)]
-pub struct Setting {
-    /// Gradient steps.
-    pub steps: u64,
-    /// Gradient steps between two evaluations.
-    pub eval_interval: u64,
-    /// Episodes per evaluation.
-    pub episodes: u32,
-    /// N_a: what makes an evaluator's job long or short.
-    pub candidates: u32,
-    /// Width of the networks.
-    pub hidden: u32,
-    /// Seed of the run.
-    pub seed: u64,
-}
-
-impl Default for Setting {
-    /// Four evaluations, over within a second.
-    fn default() -> Setting {
-        Setting { steps: 80, eval_interval: 20, episodes: 6, candidates: 2, hidden: 16, seed: 1 }
-    }
-}
-
-impl Setting {
-    /// The steps that are evaluated.
-    pub fn evaluated_steps(&self) -> Vec<u64> {
-        (1..=self.steps).filter(|step| step % self.eval_interval == 0 || *step == self.steps).collect()
-    }
-
-    fn to_toml(self) -> String {
-        let Setting { steps, eval_interval, episodes, candidates, hidden, seed } = self;
-        format!(
-            r#"environment = "hopper"
-reward = "locomotion"
-steps = {steps}
-eval_interval = {eval_interval}
-episodes = {episodes}
-candidates = {candidates}
-seed = {seed}
-batch_size = 16
-algorithm = "quad"
-
-[agent]
-hidden = {hidden}
-critics = 2
-diffusion_steps = 2
-gamma = 0.99
-rho = 1.0
-guidance = "quad"
-tau = 1.0
-delta = 1e-6
-samples = 1
-target_reduce = "mean"
-actor_learning_rate = 1e-3
-critic_learning_rate = 1e-3
-gradient_clip = 1.0
-ema_rate = 5e-3
-nu_ema_rate = 5e-3
-actor_ema_every = 5
-actor_ema_start = 10
-
-[agent.eta]
-initial = 1.0
-rate = 1e-3
-minimum = 1e-3
-maximum = 100.0
-"#
-        )
-    }
-}
+use crate::setting::Setting;
 
 /// A folder that goes when the test is over.
 pub struct Scratch {
@@ -99,11 +27,7 @@ impl Scratch {
     /// The same inside of that folder.
     pub fn inside(parent: &Path) -> Scratch {
         let folder = tempfile::tempdir_in(parent).expect("there is room for a scratch folder");
-        let written = folder.path().join("written.hdf5");
-        write_dataset(&written);
-        // HDF5 locks the file it writes, and every process that another test starts meanwhile inherits the lock for as
-        // long as it lives. A copy has none.
-        fs::copy(&written, folder.path().join("tiny.hdf5")).expect("there is room for the dataset");
+        write_dataset(&folder.path().join("tiny.hdf5"));
         Scratch { folder }
     }
 
@@ -183,88 +107,6 @@ fn through(launcher: &[String], program: &str) -> Command {
     command
 }
 
-/// A learner and the folder of its run.
-pub struct Learner {
-    /// The process.
-    pub process: Process,
-    /// Its run folder.
-    pub run_dir: PathBuf,
-}
-
-impl Learner {
-    /// The endpoint that evaluators connect to, once it listens.
-    pub fn endpoint(&self) -> String {
-        self.endpoints()["zenoh"][0].as_str().expect("an endpoint is text").to_owned()
-    }
-
-    /// Address of its metrics page.
-    pub fn metrics(&self) -> String {
-        self.endpoints()["metrics"].as_str().expect("an address is text").to_owned()
-    }
-
-    fn endpoints(&self) -> Value {
-        let path = self.run_dir.join("endpoints.json");
-        eventually("the learner wrote endpoints.json", PATIENCE, || serde_json::from_slice(&fs::read(&path).ok()?).ok())
-    }
-
-    /// The lines of scores.jsonl so far.
-    pub fn scores(&self) -> Vec<Score> {
-        let text = fs::read_to_string(self.run_dir.join("scores.jsonl")).unwrap_or_default();
-        let complete = text.rfind('\n').map_or("", |end| &text[..end]);
-        complete.lines().map(|line| Score(serde_json::from_str(line).expect("a line is a JSON object"))).collect()
-    }
-
-    /// Fails unless every episode of every evaluation has exactly one score, measured with the snapshot on disk.
-    pub fn assert_complete(&self, setting: &Setting) {
-        let scores = self.scores();
-        let mut keys: Vec<_> = scores.iter().map(Score::key).collect();
-        keys.sort_unstable();
-        let count = keys.len();
-        keys.dedup();
-        assert_eq!(keys.len(), count, "a (step, seed) has two scores");
-        for step in setting.evaluated_steps() {
-            let of_step: Vec<_> = scores.iter().filter(|score| score.key().0 == step).collect();
-            assert_eq!(of_step.len(), setting.episodes as usize, "scores of step {step}");
-            let tensors = fs::read(self.snapshot(step)).expect("an evaluated snapshot is kept");
-            let hash = Hash::of(&tensors).to_string();
-            for score in of_step {
-                assert_eq!(score.text("weights"), hash, "weights of step {step}");
-            }
-        }
-        assert_eq!(count, setting.evaluated_steps().len() * setting.episodes as usize, "scores in all");
-    }
-
-    /// The snapshot that the learner saved after a gradient step.
-    pub fn snapshot(&self, step: u64) -> PathBuf {
-        self.run_dir.join(format!("snapshots/step_{step:09}.safetensors"))
-    }
-}
-
-/// A line of scores.jsonl.
-pub struct Score(Value);
-
-impl Score {
-    /// Gradient step and episode seed: what has to be scored exactly once.
-    pub fn key(&self) -> (u64, u64) {
-        (self.integer("step"), self.integer("seed"))
-    }
-
-    /// A field that is a whole number.
-    pub fn integer(&self, field: &str) -> u64 {
-        self.0[field].as_u64().unwrap_or_else(|| panic!("{field} is no whole number in {}", self.0))
-    }
-
-    /// A field that is a number.
-    pub fn number(&self, field: &str) -> f64 {
-        self.0[field].as_f64().unwrap_or_else(|| panic!("{field} is no number in {}", self.0))
-    }
-
-    /// A field that is text.
-    pub fn text(&self, field: &str) -> &str {
-        self.0[field].as_str().unwrap_or_else(|| panic!("{field} is no text in {}", self.0))
-    }
-}
-
 /// An evaluator.
 pub struct Evaluator {
     /// The process.
@@ -280,10 +122,15 @@ impl Evaluator {
     }
 }
 
-/// A port that was free a moment ago, for whoever must know it before its owner starts.
+/// A port that was free a moment ago, where it must be known before its owner starts.
 pub fn free_port() -> u16 {
     let listener = TcpListener::bind("127.0.0.1:0").expect("the system has free ports");
     listener.local_addr().expect("a bound socket has an address").port()
+}
+
+/// A TCP endpoint at such a port.
+pub fn free_endpoint() -> String {
+    format!("tcp/127.0.0.1:{}", free_port())
 }
 
 /// Ten episodes of three hundred steps: smooth, bounded, of different returns, and far from any physics.

@@ -1,18 +1,20 @@
 //! D4RL's HDF5 files, of all its versions, and AntMaze's.
 
+use crate::environment::EnvironmentSpec;
+use crate::error::DatasetError;
 use crate::hdf5_file::Hdf5File;
 use crate::recording::{Recording, RowKind};
-use crate::{DatasetError, EnvironmentSpec};
 
 /// Reads `observations`, `actions`, `rewards`, `terminals` and, if there, `timeouts` by the rules of D4RL's
 /// `qlearning_dataset`: the next observation is the following row's, whatever the file stores; timeouts and the last row
 /// make no transition. A terminal row's next observation belongs to another episode, but its mask is 0.
 ///
-/// Without timeouts, a row at which an episode reaches the environment's time limit counts as one.
+/// Without timeouts, a row at which an episode reaches the environment's time limit counts as one. Where the file stores
+/// `next_observations`, they are kept aside, to see whether the rows follow one another at all.
 pub(super) fn read(file: &Hdf5File, environment: Option<&EnvironmentSpec>) -> Result<Recording, DatasetError> {
     let observations = file.numbers("observations")?;
     let rows = observations.rows();
-    let actions = file.numbers("actions")?.of_rows(rows).map_err(|problem| file.error(problem))?;
+    let actions = file.actions("actions")?.of_rows(rows).map_err(|problem| file.error(problem))?;
     let terminals = file.flags("terminals", rows)?;
     let timeouts = match (file.has("timeouts"), environment) {
         (true, _) => file.flags("timeouts", rows)?,
@@ -33,25 +35,30 @@ pub(super) fn read(file: &Hdf5File, environment: Option<&EnvironmentSpec>) -> Re
         observations: observations.values,
         actions: actions.values,
         rewards: file.table("rewards", rows, 1)?,
-        next_observations: None,
+        unused_next_observations: match file.has("next_observations") {
+            true => Some(file.table("next_observations", rows, observations.width)?),
+            false => None,
+        },
         kinds: timeouts.iter().enumerate().map(kind).collect(),
         ends: ends.collect(),
         terminals,
         timeouts,
         goal,
-        parts: Vec::new(),
+        ..Recording::default()
     })
 }
 
-/// The rows at which an episode reaches `limit` steps.
+/// The rows at which an episode reaches `limit` steps, as D4RL counts them: the row after a timeout is number 0, but the row
+/// after a terminal is number 1, so that such an episode is cut off a step early.
 fn derive_timeouts(terminals: &[bool], limit: usize) -> Vec<bool> {
-    let mut steps = 0;
+    let mut number = 0;
     let timeout = |&terminal: &bool| {
-        steps += 1;
-        let timeout = steps == limit;
-        if terminal || timeout {
-            steps = 0;
-        }
+        let timeout = number + 1 == limit;
+        number = match (timeout, terminal) {
+            (true, _) => 0,
+            (false, true) => 1,
+            (false, false) => number + 1,
+        };
         timeout
     };
     terminals.iter().map(timeout).collect()
@@ -64,8 +71,17 @@ mod tests {
     #[test]
     fn the_time_limit_makes_timeouts_and_restarts_with_each_episode() {
         let (f, t) = (false, true);
-        // Episodes of 3 (limit), 1 (terminal), 3 (limit and terminal), 2 (open) steps.
-        let terminals = [f, f, f, t, f, f, t, f, f];
-        assert_eq!(derive_timeouts(&terminals, 3), [f, f, t, f, f, f, t, f, f]);
+        // Rows 0 to 2 reach the limit. Row 3 is terminal, so the count is 1 at row 4 and the limit at row 5; row 8 is at
+        // the limit and terminal, so the count starts at 0 again.
+        let terminals = [f, f, f, t, f, f, f, f, t, f, f, f];
+        assert_eq!(derive_timeouts(&terminals, 3), [f, f, t, f, f, t, f, f, t, f, f, t]);
+    }
+
+    #[test]
+    fn after_a_terminal_the_count_starts_at_1_as_in_d4rl() {
+        let terminals: Vec<bool> = (0..3000).map(|row| row == 500).collect();
+        let timeouts = derive_timeouts(&terminals, 1000);
+        let rows: Vec<usize> = (0..3000).filter(|&row| timeouts[row]).collect();
+        assert_eq!(rows, [1499, 2499]);
     }
 }

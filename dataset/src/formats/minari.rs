@@ -7,10 +7,10 @@ use std::path::{Path, PathBuf};
 use serde::Deserialize;
 
 use crate::array::Array;
-use crate::environment::{self, EnvironmentSpec};
+use crate::environment;
+use crate::error::{DatasetError, Problem};
 use crate::hdf5_file::Hdf5File;
 use crate::recording::{Recording, RowKind};
-use crate::{DatasetError, Problem};
 
 /// The file with the data; `metadata.json` lies beside it.
 pub(super) const DATA_FILE: &str = "main_data.hdf5";
@@ -59,7 +59,7 @@ impl Metadata {
         }
     }
 
-    /// The environment it was recorded in: our name for it if we have one, else Gymnasium's id.
+    /// The environment it was recorded in: our name for it if its simulation is ours, else Gymnasium's id.
     pub(super) fn environment(&self) -> Option<String> {
         let EnvironmentId { id } = serde_json::from_str(self.env_spec.as_ref()?).ok()?;
         Some(environment::find_gymnasium(&id).map_or(id, |environment| environment.name.clone()))
@@ -67,15 +67,9 @@ impl Metadata {
 }
 
 /// Reads all episodes. Every step is a transition, to the observation that its episode has for the following one; a mask
-/// is 0 where `terminations` is 1. An observation that is a Dict becomes a row by [`parts`].
-pub(super) fn read(
-    file: &Hdf5File,
-    metadata: &Metadata,
-    environment: Option<&EnvironmentSpec>,
-) -> Result<Recording, DatasetError> {
-    let claimed = metadata.environment().and_then(|name| environment::find(&name).ok());
-    let goal = environment.or(claimed).is_some_and(|environment| environment.goal.is_some());
-    let mut recording = Recording { goal, ..Recording::default() };
+/// is 0 where `terminations` is 1. An observation that is a Dict or a Tuple becomes a row by [`parts`].
+pub(super) fn read(file: &Hdf5File, metadata: &Metadata) -> Result<Recording, DatasetError> {
+    let mut recording = Recording::default();
     let episodes = episodes(file);
     if let Some(expected) = metadata.total_episodes.filter(|&expected| expected != episodes) {
         return Err(file.error(Problem::Episodes { found: episodes, expected }));
@@ -94,9 +88,9 @@ fn episodes(file: &Hdf5File) -> usize {
 /// Appends an episode of T steps as T + 1 rows, the last of which is its last state.
 fn append(file: &Hdf5File, episode: &str, recording: &mut Recording) -> Result<(), DatasetError> {
     let array = |name: &str| format!("{episode}/{name}");
-    let actions = file.numbers::<f32>(&array("actions"))?;
+    let actions = file.actions(&array("actions"))?;
     let steps = actions.rows();
-    let observations = observations(file, &array("observations"), steps + 1, recording.goal)?;
+    let observations = observations(file, &array("observations"), steps + 1)?;
     if recording.parts.is_empty() {
         (recording.observation_dim, recording.action_dim) = (observations.width, actions.width);
     }
@@ -120,11 +114,11 @@ fn append(file: &Hdf5File, episode: &str, recording: &mut Recording) -> Result<(
     Ok(())
 }
 
-/// An array, or the arrays of a Dict side by side.
-fn observations(file: &Hdf5File, name: &str, rows: usize, goal: bool) -> Result<Array<f32>, DatasetError> {
+/// An array, or the arrays of a Dict or a Tuple side by side.
+fn observations(file: &Hdf5File, name: &str, rows: usize) -> Result<Array<f32>, DatasetError> {
     let Some(members) = file.members(name) else { return file.numbers(name) };
     let error = |problem| file.error(problem);
-    let columns = parts(members, goal).into_iter().map(|part| {
+    let columns = parts(members).into_iter().map(|part| {
         let column = file.numbers(&format!("{name}/{part}"))?;
         column.of_rows(rows).map_err(error)
     });
@@ -135,12 +129,10 @@ fn observations(file: &Hdf5File, name: &str, rows: usize, goal: bool) -> Result<
     Array::new(name, &[rows, width], values).map_err(error)
 }
 
-/// Which arrays of a Dict make a row, and in which order: in AntMaze, where the ant is and then the rest of its state,
-/// as in D4RL's observation, which does not hold the goal; elsewhere all of them in alphabetical order, as Gymnasium
-/// flattens a Dict.
-fn parts(members: Vec<String>, goal: bool) -> Vec<String> {
-    match goal {
-        true => ["achieved_goal", "observation"].map(str::to_owned).to_vec(),
-        false => members,
-    }
+/// The arrays of a row in their order: those of a Dict by name, those of a Tuple by number, which Minari calls `_index_0`,
+/// `_index_1` and so on.
+fn parts(mut names: Vec<String>) -> Vec<String> {
+    let number = |name: &String| name.strip_prefix("_index_").and_then(|number| number.parse::<usize>().ok());
+    names.sort_by_key(number); // Names without a number keep their order.
+    names
 }

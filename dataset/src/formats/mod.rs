@@ -10,10 +10,10 @@ use std::io::Read;
 use std::path::{Path, PathBuf};
 
 use crate::environment::{self, EnvironmentSpec};
+use crate::error::{DatasetError, Problem};
 use crate::hdf5_file::{self, Hdf5File};
 use crate::npz_file::{self, NpzFile};
 use crate::recording::Recording;
-use crate::{DatasetError, Problem};
 
 pub use minari::minari_folder;
 
@@ -87,9 +87,12 @@ impl Source {
         }
     }
 
-    /// Refuses another environment's recording. Environments that share their physics suit each other.
+    /// Refuses another environment's recording. Environments that share their physics suit each other. OGBench's files do
+    /// not name theirs, but its mazes, whose sizes are those of ours, have other starts and goals.
     pub(crate) fn check_environment(&self, asked: &EnvironmentSpec) -> Result<(), Problem> {
-        let Some(claimed) = self.environment() else { return Ok(()) };
+        let maze_of_ogbench =
+            || (matches!(self, Self::OgBench(_)) && asked.goal.is_some()).then(|| "OGBench".to_owned());
+        let Some(claimed) = self.environment().or_else(maze_of_ogbench) else { return Ok(()) };
         let simulation = environment::find(&claimed).map(EnvironmentSpec::simulation);
         match simulation == Ok(asked.simulation()) {
             true => Ok(()),
@@ -102,22 +105,12 @@ impl Source {
         matches!(self, Self::D4rl(file) if !file.has("timeouts"))
     }
 
-    /// The next observations that a D4RL file stores although the rules take the following row's.
-    pub(crate) fn unused_next_observations(&self, recording: &Recording) -> Result<Option<Vec<f32>>, DatasetError> {
-        match self {
-            Self::D4rl(file) if file.has("next_observations") => {
-                file.table("next_observations", recording.rows(), recording.observation_dim).map(Some)
-            }
-            _ => Ok(None),
-        }
-    }
-
-    /// Reads all of it. The environment says what the source may leave open: a time limit, and what makes an observation.
+    /// Reads all of it. The environment says what a D4RL file may leave open: a time limit, and whether there is a goal.
     pub(crate) fn read(&mut self, environment: Option<&EnvironmentSpec>) -> Result<Recording, DatasetError> {
         match self {
             Self::D4rl(file) => d4rl::read(file, environment),
             Self::Own(file) => own::read(file),
-            Self::Minari(file, metadata) => minari::read(file, metadata, environment),
+            Self::Minari(file, metadata) => minari::read(file, metadata),
             Self::OgBench(file) => ogbench::read(file),
         }
     }

@@ -1,6 +1,6 @@
 //! OGBench's npz files.
 
-use crate::DatasetError;
+use crate::error::DatasetError;
 use crate::npz_file::NpzFile;
 use crate::recording::{Recording, RowKind};
 
@@ -13,7 +13,7 @@ use crate::recording::{Recording, RowKind};
 pub(super) fn read(file: &mut NpzFile) -> Result<Recording, DatasetError> {
     let observations = file.numbers("observations")?;
     let (rows, observation_dim) = (observations.rows(), observations.width);
-    let actions = file.numbers("actions")?.of_rows(rows).map_err(|problem| file.error(problem))?;
+    let actions = file.actions("actions")?.of_rows(rows).map_err(|problem| file.error(problem))?;
     let terminals = file.flags("terminals", rows)?;
     let masks = match file.has("masks") {
         true => file.flags("masks", rows)?,
@@ -46,7 +46,6 @@ pub(super) fn read(file: &mut NpzFile) -> Result<Recording, DatasetError> {
         timeouts: (0..rows).map(|row| ends[row] && masks[row]).collect(),
         ends,
         next_observations,
-        goal: false,
-        parts: Vec::new(),
+        ..Recording::default()
     })
 }

@@ -1,6 +1,6 @@
 //! The layout for people's own data: HDF5, one row a transition.
 
-use crate::DatasetError;
+use crate::error::DatasetError;
 use crate::hdf5_file::Hdf5File;
 use crate::recording::{Recording, RowKind};
 
@@ -13,7 +13,7 @@ pub(super) const LAYOUT: &str = "transitions";
 pub(super) fn read(file: &Hdf5File) -> Result<Recording, DatasetError> {
     let observations = file.numbers("observations")?;
     let (rows, observation_dim) = (observations.rows(), observations.width);
-    let actions = file.numbers("actions")?.of_rows(rows).map_err(|problem| file.error(problem))?;
+    let actions = file.actions("actions")?.of_rows(rows).map_err(|problem| file.error(problem))?;
     let next_observations = file.table("next_observations", rows, observation_dim)?;
     let mut recording = Recording {
         observation_dim,

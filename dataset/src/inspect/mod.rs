@@ -12,10 +12,10 @@ use serde::Serialize;
 
 use crate::checks;
 use crate::environment::{self, EnvironmentSpec};
+use crate::error::{DatasetError, Problem};
 use crate::formats::Source;
 use crate::recording::RowKind;
 use crate::statistics::Spread;
-use crate::{DatasetError, Problem};
 
 pub use histogram::Histogram;
 
@@ -134,7 +134,7 @@ pub fn inspect(
 
     let other = environment.and_then(|environment| source.check_environment(environment).err());
     let refused: Vec<Problem> = other.into_iter().chain(checks::problems(&recording, spec)).collect();
-    let findings = findings::findings(&source, &recording, spec)?;
+    let findings = findings::findings(&source, &recording, spec);
 
     let episodes = recording.episodes();
     let lengths: Vec<f64> = episodes.iter().map(|episode| episode.length as f64).collect();

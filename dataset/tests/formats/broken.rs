@@ -134,7 +134,7 @@ fn a_group_in_an_arrays_place() {
     file.unlink("rewards").unwrap();
     file.create_group("rewards").unwrap();
     drop(file);
-    assert_eq!(subject.error(), "array `rewards` cannot be read");
+    assert_eq!(subject.error(), "`rewards` is a group of arrays, but must be an array");
 }
 
 #[test]

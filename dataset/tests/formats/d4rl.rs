@@ -3,7 +3,9 @@
 use std::path::Path;
 
 use ndarray::Array2;
-use quad_dataset::{Batch, BatchSampler, EnvironmentSpec, RewardRule, environment, recorded_environment};
+use quad_dataset::{
+    Batch, BatchSampler, EnvironmentSpec, ReadOptions, RewardRule, Transitions, environment, recorded_environment,
+};
 use tempfile::tempdir;
 
 use crate::{all, compare, hopper, peers, read, shared};
@@ -54,8 +56,23 @@ fn v0_has_timeouts_from_the_time_limit() {
 }
 
 #[test]
-fn v1_stores_next_observations_that_nobody_reads() {
+fn v1_stores_next_observations_that_are_not_used() {
     compare_generated("v1");
+}
+
+#[test]
+fn rows_that_do_not_follow_one_another_are_refused() {
+    let folder = tempdir().unwrap();
+    let path = folder.path().join("generated.hdf5");
+    if peers(&["generate", "shuffled", path.to_str().unwrap()]) {
+        let options = ReadOptions { environment: Some(hopper()), reward: RewardRule::AsIs };
+        let error = Transitions::read(&path, &options).err().unwrap();
+        // Of 600 rows two end an episode, and after the last one there is nothing to compare it with.
+        let expected = "array `next_observations`, row 0: not the observation of the row that follows, though the episode \
+                        goes on there (597 such rows)";
+        assert!(error.to_string().ends_with(expected), "{error}");
+        assert!(error.hint().contains("`layout`") && error.hint().contains("timeouts"), "{}", error.hint());
+    }
 }
 
 #[test]

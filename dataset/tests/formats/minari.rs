@@ -26,9 +26,12 @@ impl Root {
         self.dataset().join("data/metadata.json")
     }
 
+    fn read(&self, environment: Option<&'static EnvironmentSpec>) -> Result<Transitions, DatasetError> {
+        Transitions::read(self.dataset(), &ReadOptions { environment, reward: RewardRule::AsIs })
+    }
+
     fn error(&self) -> DatasetError {
-        let options = ReadOptions { environment: Some(hopper()), reward: RewardRule::AsIs };
-        Transitions::read(self.dataset(), &options).err().unwrap()
+        self.read(Some(hopper())).err().unwrap()
     }
 }
 
@@ -52,19 +55,45 @@ fn observations_in_an_array() {
 }
 
 #[test]
-fn antmaze_has_a_dict_whose_goal_is_left_out() {
-    let Some(root) = Root::new("antmaze") else { return };
-    let umaze = environment::find("antmaze-umaze").unwrap();
-    compare_with_minari(root.0.path(), "made/up-v0", "antmaze", Some(umaze));
-    let text = root.error().to_string();
-    assert!(text.ends_with("recorded in `antmaze-umaze`, which is not `hopper`"), "{text}");
+fn another_simulation_is_learnt_from_but_not_scored_in_ours() {
+    for (kind, id, ours) in [("antmaze", "AntMaze_UMaze-v4", "antmaze-umaze"), ("walker2d", "Walker2d-v5", "walker2d")]
+    {
+        let Some(root) = Root::new(kind) else { return };
+        assert_eq!(recorded_environment(root.dataset()).unwrap().as_deref(), Some(id));
+        let error = root.read(environment::find(ours).ok()).err().unwrap();
+        assert!(error.to_string().ends_with(&format!("recorded in `{id}`, which is not `{ours}`")), "{error}");
+        assert!(error.hint().contains("--preset own-data"), "{}", error.hint());
+        compare_with_minari(root.0.path(), "made/up-v0", kind, None);
+    }
 }
 
 #[test]
-fn another_dict_is_flattened_in_alphabetical_order() {
+fn a_dict_becomes_a_row_in_alphabetical_order() {
     let Some(root) = Root::new("own") else { return };
     assert_eq!(recorded_environment(root.dataset()).unwrap().as_deref(), Some("Robot-v0"));
     compare_with_minari(root.0.path(), "made/up-v0", "own", None);
+}
+
+#[test]
+fn a_tuple_becomes_a_row_in_its_own_order() {
+    let Some(root) = Root::new("tuple") else { return };
+    compare_with_minari(root.0.path(), "made/up-v0", "tuple", None);
+}
+
+#[test]
+fn a_dict_in_a_dict() {
+    let Some(root) = Root::new("nested") else { return };
+    let error = root.read(None).err().unwrap();
+    let expected = "`episode_0/observations/achieved_goal` is a group of arrays, but must be an array";
+    assert!(error.to_string().ends_with(expected), "{error}");
+    assert!(error.hint().contains("Dict") && !error.hint().contains("damaged"), "{}", error.hint());
+}
+
+#[test]
+fn discrete_actions() {
+    let Some(root) = Root::new("discrete") else { return };
+    let error = root.read(None).err().unwrap().to_string();
+    assert!(error.contains("array `episode_0/actions` holds whole numbers, as if actions were discrete"), "{error}");
 }
 
 #[test]

@@ -2,7 +2,7 @@
 
 use std::path::{Path, PathBuf};
 
-use quad_dataset::{DatasetError, ReadOptions, RewardRule, Transitions};
+use quad_dataset::{DatasetError, ReadOptions, RewardRule, Transitions, environment};
 use tempfile::{TempDir, tempdir};
 
 use crate::{compare, hopper, peers};
@@ -36,6 +36,23 @@ fn without_rewards_there_is_nothing_to_learn() {
     let error = error(&path);
     assert!(error.to_string().ends_with("array `rewards` is missing"), "{error}");
     assert!(error.hint().contains("make_env_and_datasets"), "{}", error.hint());
+}
+
+#[test]
+fn a_maze_of_ogbench_is_learnt_from_but_not_scored_in_one_of_ours() {
+    let Some((_folder, path)) = written("maze") else { return };
+    let read = |environment| Transitions::read(&path, &ReadOptions { environment, reward: RewardRule::AsIs });
+    assert!(read(None).is_ok());
+    let error = read(environment::find("antmaze-medium").ok()).err().unwrap();
+    assert!(error.to_string().ends_with("recorded in `OGBench`, which is not `antmaze-medium`"), "{error}");
+    assert!(error.hint().contains("--preset own-data"), "{}", error.hint());
+}
+
+#[test]
+fn discrete_actions() {
+    let Some((_folder, path)) = written("discrete") else { return };
+    let error = error(&path).to_string();
+    assert!(error.contains("array `actions` holds whole numbers, as if actions were discrete"), "{error}");
 }
 
 #[test]

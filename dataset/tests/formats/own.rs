@@ -41,29 +41,50 @@ fn the_ten_lines_of_the_page_write_what_is_read() {
     assert_eq!(figures, (3, 6.0, 39.0, None));
 }
 
-#[test]
-fn without_timeouts_a_row_that_starts_elsewhere_begins_an_episode() {
+/// Writes a small file with `peers.py write-own` and reads it; `None` where there is no Python.
+fn read_own(arguments: &[&str]) -> Option<Result<Transitions, DatasetError>> {
     let folder = tempdir().unwrap();
     let path = folder.path().join("own.hdf5");
-    if peers(&["write-own", path.to_str().unwrap()]) {
-        let transitions = read(&path, None, RewardRule::AsIs);
-        assert_eq!((transitions.len(), transitions.statistics().episodes), (9, 3));
+    let arguments = [&["write-own", path.to_str().unwrap()], arguments].concat();
+    let options = ReadOptions { environment: None, reward: RewardRule::AsIs };
+    peers(&arguments).then(|| Transitions::read(&path, &options))
+}
+
+#[test]
+fn without_timeouts_a_row_that_starts_elsewhere_begins_an_episode() {
+    let Some(transitions) = read_own(&[]) else { return };
+    let transitions = transitions.unwrap();
+    assert_eq!((transitions.len(), transitions.statistics().episodes), (9, 3));
+}
+
+#[test]
+fn the_layout_is_read_however_the_text_is_stored() {
+    for layout in ["text", "bytes", "padded", "utf-8", "variable-ascii", "one-element"] {
+        let Some(transitions) = read_own(&[layout]) else { return };
+        // By D4RL's rules there would be 8 and not 9: the last row makes no transition.
+        assert_eq!(transitions.map(|transitions| transitions.len()).ok(), Some(9), "{layout}");
     }
 }
 
 #[test]
-fn a_layout_that_nobody_knows() {
-    let folder = tempdir().unwrap();
-    let path = folder.path().join("own.hdf5");
-    if peers(&["write-own", path.to_str().unwrap()]) {
-        let file = hdf5::File::open_rw(&path).unwrap();
-        file.delete_attr("layout").unwrap();
-        let value: hdf5::types::VarLenUnicode = "transition".parse().unwrap();
-        file.new_attr::<hdf5::types::VarLenUnicode>().create("layout").unwrap().write_scalar(&value).unwrap();
-        drop(file);
-        let options = ReadOptions { environment: None, reward: RewardRule::AsIs };
-        let error: DatasetError = Transitions::read(&path, &options).err().unwrap();
-        let expected = "the attribute `layout` is \"transition\", but the only value with a meaning is \"transitions\"";
+fn a_layout_without_a_meaning() {
+    for (layout, found) in [("unknown", "\"transition\""), ("number", "\"\"")] {
+        let Some(result) = read_own(&[layout]) else { return };
+        let error = result.err().unwrap().to_string();
+        let expected =
+            format!("the attribute `layout` is {found}, but the only value with a meaning is \"transitions\"");
+        assert!(error.ends_with(&expected), "{error}");
+    }
+}
+
+#[test]
+fn discrete_actions() {
+    for kind in ["int64", "uint8"] {
+        let Some(result) = read_own(&["text", kind]) else { return };
+        let error = result.err().unwrap();
+        let expected =
+            "array `actions` holds whole numbers, as if actions were discrete; only continuous ones can be learnt";
         assert!(error.to_string().ends_with(expected), "{error}");
+        assert!(error.hint().contains("float32"), "{}", error.hint());
     }
 }

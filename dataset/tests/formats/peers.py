@@ -18,8 +18,10 @@ def generate(variant, out):
     rng = np.random.default_rng(7)
     # (length, terminal at its end, timeout at its end); the last episode is cut off by the end of the file.
     episodes = [(5, True, False), (8, False, True), (4, True, True), (1, True, False), (1, False, True), (6, False, False)]
-    if variant in ("no-timeouts", "v0"):
+    if variant == "v0":
         episodes = [(LIMIT, False, False), (3, True, False), (LIMIT, True, False), (LIMIT + 5, False, False)]
+    if variant in ("v1", "shuffled"):
+        episodes = [(300, True, False), (200, False, True), (100, False, False)]
     n = sum(length for length, _, _ in episodes)
     terminals, timeouts = np.zeros(n, bool), np.zeros(n, bool)
     end = -1
@@ -28,7 +30,7 @@ def generate(variant, out):
         terminals[end], timeouts[end] = terminal, timeout
     observations = rng.normal(size=(n, 11))
     # A dropped timeout row whose successor starts where it would have led: one trajectory goes on through it.
-    if variant not in ("no-timeouts", "v0"):
+    if variant not in ("v0", "v1", "shuffled"):
         observations[13] = observations[12]
     actions = np.clip(rng.normal(size=(n, 3)), -1, 1)
     rewards = rng.normal(size=n)
@@ -40,14 +42,18 @@ def generate(variant, out):
         if variant == "integers":
             column["terminals"] = column["terminals"].astype(np.uint8)
             column["timeouts"] = column["timeouts"].astype(np.int8)
-        if variant in ("no-timeouts", "v0"):
+        if variant == "v0":
             del column["timeouts"]
         for name, values in column.items():
             file.create_dataset(name, data=values, compression="gzip", compression_opts=4)
         file["observations"] = observations.astype(dtype)
         file["actions"] = actions.astype(dtype)
-        if variant == "v1":  # what it stores there is another thing than the following row
-            file["next_observations"] = rng.normal(size=(n, 11)).astype(dtype)
+        if variant in ("v1", "shuffled"):
+            # Of a replay buffer, a row inside an episode may lead elsewhere; of shuffled rows, nearly all do.
+            following = np.roll(observations, -1, axis=0)
+            elsewhere = slice(0, n) if variant == "shuffled" else slice(100, 101)
+            following[elsewhere] = rng.normal(size=following[elsewhere].shape)
+            file["next_observations"] = following.astype(dtype)
             file["infos/qpos"], file["infos/qvel"] = np.zeros((n, 6)), np.zeros((n, 6))
 
 
@@ -80,11 +86,15 @@ def reference(path, limit, goal, out):
             timeouts = file["timeouts"][()].reshape(-1).astype(bool)
         else:
             timeouts = np.zeros(len(rewards), bool)
-            start = 0
+            episode_step = 0
             for i in range(len(rewards)):
-                timeouts[i] = i - start + 1 == limit
-                if terminals[i] or timeouts[i]:
-                    start = i + 1
+                timeouts[i] = episode_step == limit - 1
+                if timeouts[i]:
+                    episode_step = 0
+                    continue
+                if terminals[i]:
+                    episode_step = 0
+                episode_step += 1
 
     kept = [i for i in range(len(rewards) - 1) if not timeouts[i]]
     s, s_next = observations[kept], observations[[i + 1 for i in kept]]
@@ -122,52 +132,76 @@ def write_reference(out, s, a, r, s_next, done, trajectories, returns):
         file["statistics"] = np.array(figures, np.float64)
 
 
+# Of each dataset that Minari writes: the environment's id, and the parts of an observation in the order of a row.
+ROBOTS = {
+    "hopper": ("Hopper-v5", None),
+    "walker2d": ("Walker2d-v5", None),
+    "antmaze": ("AntMaze_UMaze-v4", ["achieved_goal", "desired_goal", "observation"]),
+    "own": ("Robot-v0", ["place", "speed"]),
+    "tuple": ("Robot-v0", range(12)),
+    "nested": ("FrankaKitchen-v1", None),
+    "discrete": ("CartPole-v1", None),
+}
+
+
 def make_robot(kind):
     """An environment of which Minari asks only for the spaces."""
     import gymnasium
-    from gymnasium.spaces import Box, Dict
+    from gymnasium.spaces import Box, Dict, Discrete, Tuple
 
     box = lambda n: Box(-np.inf, np.inf, (n,), np.float64)
     goals = {"achieved_goal": box(2), "desired_goal": box(2)}
     robot = gymnasium.Env()
     robot.observation_space = {
         "hopper": box(11),
+        "walker2d": box(17),
         "antmaze": Dict(goals | {"observation": box(27)}),
         "own": Dict({"speed": box(1), "place": box(3)}),
+        "tuple": Tuple([box(1) for _ in range(12)]),
+        "nested": Dict({"achieved_goal": Dict({"kettle": box(7)}), "observation": box(59)}),
+        "discrete": box(4),
     }[kind]
-    robot.action_space = Box(-1, 1, ({"hopper": 3, "antmaze": 8, "own": 2}[kind],), np.float32)
+    robot.action_space = Box(-1, 1, ({"hopper": 3, "walker2d": 6, "antmaze": 8}.get(kind, 2),), np.float32)
+    if kind == "discrete":
+        robot.action_space = Discrete(2)
     return robot
 
 
 def write_minari(kind, id):
-    """A dataset of a few episodes, written by Minari itself: of Hopper, of AntMaze, or of an environment of its own."""
+    """A dataset of a few episodes of one of the `ROBOTS`, written by Minari itself."""
     import minari
     from gymnasium.envs.registration import EnvSpec
     from minari.data_collector import EpisodeBuffer
 
     rng = np.random.default_rng(9)
-    names = {"hopper": "Hopper-v5", "antmaze": "AntMaze_UMaze-v4", "own": "Robot-v0"}
     robot = make_robot(kind)
-    space, actions = robot.observation_space, robot.action_space.shape[0]
     episodes = []
     for length, terminal in [(5, True), (9, False), (1, True), (7, False)]:
-        draw = lambda space: rng.normal(size=(length + 1, *space.shape)).astype(space.dtype)
-        observations = draw(space) if kind == "hopper" else {key: draw(part) for key, part in space.items()}
+
+        def draw(space):
+            if hasattr(space, "items"):
+                return {key: draw(part) for key, part in space.items()}
+            if hasattr(space, "spaces"):
+                return tuple(draw(part) for part in space.spaces)
+            return rng.normal(size=(length + 1, *space.shape)).astype(space.dtype)
+
         last = np.arange(length) == length - 1
+        actions = rng.uniform(-1, 1, size=(length, *robot.action_space.shape)).astype(np.float32)
         episodes.append(EpisodeBuffer(
-            observations=observations,
-            actions=rng.uniform(-1, 1, size=(length, actions)).astype(np.float32),
+            observations=draw(robot.observation_space),
+            actions=(actions > 0).astype(np.int64) if kind == "discrete" else actions,
             rewards=list(rng.normal(size=length)),
             terminations=list(last & terminal),
             truncations=list(last & (not terminal)),
         ))
+    spec = EnvSpec(id=ROBOTS[kind][0], entry_point="peers:make_robot", kwargs={"kind": kind}, max_episode_steps=1000)
     minari.create_dataset_from_buffers(
         id,
         buffer=episodes,
-        env=EnvSpec(id=names[kind], entry_point="peers:make_robot", kwargs={"kind": kind}, max_episode_steps=1000),
+        env=spec,
         algorithm_name="noise",
-        author="nobody",
-        author_email="nobody@example.org",
+        author="a test",
+        author_email="test@example.org",
         code_permalink="none",
         data_format="hdf5",
     )
@@ -177,7 +211,7 @@ def minari_reference(kind, id, out):
     """The transitions that Minari reads."""
     import minari
 
-    keys = {"hopper": None, "antmaze": ["achieved_goal", "observation"], "own": ["place", "speed"]}[kind]
+    _, keys = ROBOTS[kind]
     columns, trajectories, returns = [[], [], [], [], []], [], []
     for episode in minari.load_dataset(id).iterate_episodes():
         seen = episode.observations
@@ -187,8 +221,6 @@ def minari_reference(kind, id, out):
             column.append(values)
         rewards = episode.rewards.astype(np.float32).astype(np.float64)
         trajectories.append(range(first, first + len(rewards)))
-        if kind == "antmaze" and rewards.max() > 0:
-            rewards = rewards[: np.argmax(rewards > 0) + 1]
         returns.append(rewards.sum())
     write_reference(out, *map(np.concatenate, columns), trajectories, returns)
 
@@ -211,6 +243,10 @@ def write_ogbench(variant, out):
     }
     if variant == "goals":
         del arrays["rewards"], arrays["masks"]
+    if variant == "maze":
+        arrays["observations"], arrays["actions"] = np.zeros((n, 29), np.float32), np.zeros((n, 8), np.float32)
+    if variant == "discrete":
+        arrays["actions"] = rng.integers(0, 2, size=(n, 1))
     if variant == "fortran":
         arrays["observations"] = np.asfortranarray(arrays["observations"])
     np.savez_compressed(out, **arrays)
@@ -240,7 +276,7 @@ def ogbench_reference(path, out):
 
 
 def write_log(out):
-    """Somebody's log: 12 steps of a robot in episodes of 4 (it fell), 6 (stopped) and 2 (still going) steps."""
+    """A user's log: 12 steps of a robot in episodes of 4 (it fell), 6 (stopped) and 2 (still going) steps."""
     i = np.arange(12)
     state = 10.0 * i[:, None] + np.arange(5)
     action = np.tile([0.5, -0.5], (12, 1))
@@ -248,18 +284,31 @@ def write_log(out):
 
 
 def run(script):
-    """A script of somebody else's."""
+    """Runs another script."""
     exec(compile(open(script).read(), script, "exec"), {})
 
 
-def write_own(out):
+# The attribute `layout` as h5py writes a str, and as NumPy's bytes, C, C++, Julia and MATLAB have it.
+LAYOUTS = {
+    "text": "transitions",
+    "bytes": np.bytes_("transitions"),
+    "padded": np.array("transitions", h5py.string_dtype("ascii", 40)),
+    "utf-8": np.array("transitions", h5py.string_dtype("utf-8", 11)),
+    "variable-ascii": np.array("transitions", h5py.string_dtype("ascii")),
+    "one-element": np.array(["transitions"], h5py.string_dtype("ascii", 11)),
+    "unknown": "transition",
+    "number": 3,
+}
+
+
+def write_own(out, layout="text", action="float32"):
     """Three episodes of three rows in the layout for people's own data, without timeouts and without terminals."""
     steps = np.arange(9) + 10.0 * (np.arange(9) // 3)
     with h5py.File(out, "w") as file:
-        file.attrs["layout"] = "transitions"
+        file.attrs["layout"] = LAYOUTS[layout]
         file["observations"] = np.stack([steps, -steps], axis=1)
         file["next_observations"] = np.stack([steps + 1, -steps - 1], axis=1)
-        file["actions"] = np.zeros((9, 1), np.float32)
+        file["actions"] = np.zeros((9, 1), action)
         file["rewards"] = np.ones(9, np.int64)
         file["terminals"] = np.zeros(9, np.float32)
 

@@ -1,7 +1,6 @@
 //! The product of rounded operands by AMX: whole tiles of 16 × 16 sums at a time.
 
-use super::bf16::Pair;
-use super::{COLUMNS, Strided};
+use super::{COLUMNS, Pair, Strided, has_bf16};
 use std::arch::asm;
 use std::arch::x86_64::__cpuid_count;
 use std::sync::LazyLock;
@@ -15,7 +14,7 @@ const ROWS: usize = 2 * TILE;
 pub(super) fn available() -> bool {
     static AVAILABLE: LazyLock<bool> = LazyLock::new(|| {
         const TILES_AND_BF16: u32 = 1 << 24 | 1 << 22;
-        super::bf16::has_registers() && __cpuid_count(7, 0).edx & TILES_AND_BF16 == TILES_AND_BF16 && may_use_tiles()
+        has_bf16() && __cpuid_count(7, 0).edx & TILES_AND_BF16 == TILES_AND_BF16 && may_use_tiles()
     });
     *AVAILABLE
 }
@@ -85,7 +84,7 @@ pub(super) unsafe fn multiply(m: usize, n: usize, pairs: usize, a: Strided<Pair>
         }
     }
     if blocks > 0 {
-        // SAFETY: has no operands; nothing is left in the tiles that anybody reads.
+        // SAFETY: has no operands; what is left in the tiles is not needed.
         unsafe { asm!("tilerelease", options(nostack, nomem)) };
     }
 }

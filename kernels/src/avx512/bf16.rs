@@ -1,6 +1,6 @@
 //! The product with its operands rounded to bfloat16 and its sums in f32.
 
-use super::{Ahead, COLUMNS, LANES, Line, ROWS, Strided, amx};
+use super::{Ahead, COLUMNS, LANES, Line, Pair, ROWS, Strided, amx, has_bf16};
 use std::arch::x86_64::{
     __cpuid, __m512bh, __m512i, _MM_HINT_T0, _mm_prefetch, _mm512_cvtne2ps_pbh, _mm512_dpbf16_ps, _mm512_loadu_ps,
     _mm512_loadu_si512, _mm512_permutexvar_epi16, _mm512_set1_epi32, _mm512_setzero_ps, _mm512_store_si512,
@@ -8,27 +8,17 @@ use std::arch::x86_64::{
 };
 use std::cell::RefCell;
 
-/// Two neighbours of a sum's terms in one element.
-pub(super) type Pair = i32;
-
 /// Whether this CPU multiplies so, and faster than in f32: by AMX, or by AVX512-BF16, which nearly doubles the speed of
 /// AMD's CPUs but is slower than f32 on Intel's (0.6 times, where it was measured).
 pub(crate) fn available() -> bool {
     const INTEL: [u32; 3] = [u32::from_le_bytes(*b"Genu"), u32::from_le_bytes(*b"ineI"), u32::from_le_bytes(*b"ntel")];
     let vendor = __cpuid(0);
-    amx::available() || has_registers() && [vendor.ebx, vendor.edx, vendor.ecx] != INTEL
+    amx::available() || has_bf16() && [vendor.ebx, vendor.edx, vendor.ecx] != INTEL
 }
 
 /// Which of the two it takes.
 pub(crate) fn instructions() -> &'static str {
     if amx::available() { "amx" } else { "avx512" }
-}
-
-/// Whether this CPU has AVX512-BF16.
-pub(super) fn has_registers() -> bool {
-    is_x86_feature_detected!("avx512f")
-        && is_x86_feature_detected!("avx512bw")
-        && is_x86_feature_detected!("avx512bf16")
 }
 
 #[inline]

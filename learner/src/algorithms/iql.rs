@@ -6,9 +6,9 @@
 #[allow(clippy::unwrap_used)]
 mod golden;
 
+use super::optimiser::{cosine_decay, follow};
+use super::random::{Purpose, stream};
 use super::*;
-use crate::optimiser::{cosine_decay, follow};
-use crate::random::{Purpose, stream};
 use candle_core::DType;
 use quad_policy::{Ensemble, EnsembleShape, GaussianPolicy, GaussianShape, Layout, Part, Weights, gaussian_mean};
 use serde::Deserialize;

@@ -4,11 +4,13 @@
 //! state as named tensors, and a table of metrics. A new one is a file here, a line in [`ALGORITHMS`] and a preset.
 
 mod iql;
+pub mod optimiser;
 pub mod quad;
+mod random;
 
-use crate::optimiser::{Adam, AdamStep};
 use candle_core::backprop::GradStore;
 use candle_core::{Device, Result, Tensor};
+use optimiser::{Adam, AdamStep};
 use quad_dataset::Batch;
 use quad_policy::{Description, PolicyError, Precision, Tensors};
 use serde::de::DeserializeOwned;
@@ -69,7 +71,7 @@ pub struct Setting {
     pub total_steps: u64,
     /// Seed of initial weights and noise.
     pub seed: u64,
-    /// Arithmetic of what no gradient is taken of.
+    /// Precision of forward passes without a gradient.
     pub precision: Precision,
     /// Where the tensors lie.
     pub device: Device,
@@ -196,12 +198,12 @@ fn check_rate(field: &'static str, value: f32) -> std::result::Result<(), AgentE
     check(field, value, value > 0.0 && value <= 1.0, "in (0, 1]")
 }
 
-/// That a number of things is one that somebody could mean.
+/// That a number of things is within 1..=`most`.
 fn check_count(field: &'static str, value: usize, most: usize) -> std::result::Result<(), AgentError> {
     check(field, value, (1..=most).contains(&value), "a whole number from 1 on, of reasonable size")
 }
 
-/// Tensors `[]` as numbers; from a GPU in one copy, since it works on its own until somebody reads from it.
+/// Tensors `[]` as numbers; from a GPU in one copy, because each copy waits for the GPU.
 fn numbers(x: &[&Tensor]) -> Result<Vec<f32>> {
     match x.iter().all(|x| x.device().is_cpu()) {
         true => x.iter().map(|x| x.to_scalar()).collect(),
@@ -209,6 +211,9 @@ fn numbers(x: &[&Tensor]) -> Result<Vec<f32>> {
     }
 }
 
+#[cfg(test)]
+#[allow(clippy::unwrap_used)]
+mod golden;
 #[cfg(test)]
 #[allow(clippy::unwrap_used)]
 mod tests;

@@ -1,78 +1,95 @@
-//! Whether somebody is there to connect to.
+//! Certificates, and the endpoints at which learner and evaluators meet.
 
 use std::io::ErrorKind;
+use std::net::{Ipv4Addr, TcpListener};
+use std::path::Path;
 use std::time::Duration;
 
 use tokio::net::TcpStream;
+use tokio::runtime::Builder;
 use tokio::time::timeout;
 use zenoh::Session;
 
-use super::Findings;
-use crate::{Endpoints, open_session};
+use super::findings::Findings;
+use crate::certificates::{Certificates, Role};
+use crate::endpoints::{Endpoints, address_of};
+use crate::session::open_session;
 
 /// A connection across the world takes half a second.
 const CONNECT: Duration = Duration::from_secs(3);
-/// The same with what Zenoh, and perhaps TLS, have to say to each other.
+/// The same with Zenoh's own handshake, and perhaps TLS's.
 const SESSION: Duration = Duration::from_secs(5);
 
-/// Connects to the endpoint that is to be connected to, first by TCP alone, then with Zenoh; gives the session if there is
-/// one.
+/// Checks the certificates in `folder`, which are to be those of `role`. Gives them if a connection can be tried with them.
+pub fn certificates(findings: &mut Findings, folder: &Path, role: Role) -> Option<Certificates> {
+    let found = Certificates::check(folder, role);
+    match &found {
+        Err(error) => findings.fail("certificate", error.to_string(), error.hint()),
+        Ok(soon) if soon.expire_soon() => findings.warn("certificate", soon.to_string(), "make a new one before then"),
+        Ok(good) => findings.ok("certificate", good.to_string()),
+    }
+    found.ok()
+}
+
+/// Checks whether a learner can listen at a port of this machine.
+pub fn port(findings: &mut Findings, port: u16) {
+    match TcpListener::bind((Ipv4Addr::LOCALHOST, port)) {
+        Ok(_) => findings.ok("port", format!("tcp/127.0.0.1:{port} is free for the learner to listen at")),
+        Err(error) => {
+            let hint =
+                "if another learner has it, choose a free one by --listen tcp/127.0.0.1:0, or a router by --connect";
+            findings.warn("port", format!("tcp/127.0.0.1:{port} cannot be listened at: {error}"), hint);
+        }
+    }
+}
+
+/// Connects to the first endpoint to connect to, by TCP alone and then with Zenoh, and does further checks over the session
+/// if there is one.
 ///
-/// Needs a multi-thread tokio runtime.
-pub async fn reach(findings: &mut Findings, endpoints: &Endpoints) -> Option<Session> {
+/// # Errors
+/// No thread can be started, or the further checks cannot be done.
+pub fn connected(
+    findings: &mut Findings,
+    endpoints: &Endpoints,
+    further: impl AsyncFnOnce(&mut Findings, &Session) -> anyhow::Result<()>,
+) -> anyhow::Result<()> {
+    let runtime = Builder::new_multi_thread().worker_threads(2).enable_all().build()?;
+    let done = runtime.block_on(async {
+        let Some(session) = connect(findings, endpoints).await else { return Ok(()) };
+        let done = further(findings, &session).await;
+        session.close().await.ok();
+        done
+    });
+    runtime.shutdown_background();
+    done
+}
+
+async fn connect(findings: &mut Findings, endpoints: &Endpoints) -> Option<Session> {
     let endpoint = endpoints.connect.first()?;
-    let address = address(endpoint);
-    let connected = match timeout(CONNECT, TcpStream::connect(address)).await {
-        Ok(connected) => connected.map_err(|error| (error.to_string(), hint(error.kind()))),
-        Err(_) => Err((format!("no answer within {CONNECT:?}"), hint(ErrorKind::TimedOut))),
-    };
-    if let Err((reason, hint)) = connected {
-        findings.fail("connection", format!("{address}: {reason}"), hint);
+    let address = address_of(endpoint);
+    let reached =
+        timeout(CONNECT, TcpStream::connect(address)).await.unwrap_or_else(|_| Err(ErrorKind::TimedOut.into()));
+    if let Err(error) = reached {
+        let hint = match error.kind() {
+            ErrorKind::ConnectionRefused => {
+                "that machine is there, but nothing listens at this port: is the learner or router started, and does \
+                 it listen for other machines, as at tcp/0.0.0.0:7447, or only at 127.0.0.1?"
+            }
+            ErrorKind::TimedOut => "does a firewall drop what goes to this port, or is the address of another network?",
+            _ => "is the name spelt right, and is there a network?",
+        };
+        findings.fail("connection", format!("{address}: {error}"), hint);
         return None;
     }
-    let (reason, hint) = match timeout(SESSION, open_session(endpoints)).await {
+    let reason = match timeout(SESSION, open_session(endpoints)).await {
         Ok(Ok(session)) => {
             findings.ok("connection", format!("{endpoint} is there, and speaks Zenoh"));
             return Some(session);
         }
-        Ok(Err(error)) => (format!("{endpoint}: {error}"), "the endpoint must be one of a learner or a Zenoh router"),
-        Err(_) => (
-            format!("something listens at {address}, but there is no Zenoh session with it after {SESSION:?}"),
-            "is it a learner or a Zenoh router, of the same protocol (tcp or tls), and are its certificates of the same authority?",
-        ),
+        Ok(Err(error)) => format!("{endpoint}: {error}"),
+        Err(_) => format!("something listens at {address}, but there is no Zenoh session with it after {SESSION:?}"),
     };
+    let hint = "is it a learner or a Zenoh router, of the same protocol (tcp or tls), with certificates of the same authority?";
     findings.fail("connection", reason, hint);
     None
-}
-
-/// HOST:PORT of an endpoint, which begins with its protocol and may end in options.
-fn address(endpoint: &str) -> &str {
-    let address = endpoint.split_once('/').map_or(endpoint, |(_, rest)| rest);
-    address.split(['?', '#']).next().unwrap_or(address)
-}
-
-fn hint(kind: ErrorKind) -> &'static str {
-    match kind {
-        ErrorKind::ConnectionRefused => {
-            "that machine is there, but nobody listens at this port: is the learner or router started, and does it listen at an address that others reach, like tcp/0.0.0.0:7447, rather than at 127.0.0.1?"
-        }
-        ErrorKind::TimedOut => "does a firewall drop what goes to this port, or is the address of another network?",
-        _ => "is the name spelt right, and is there a network?",
-    }
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn addresses_of_endpoints() {
-        for (endpoint, expected) in [
-            ("tcp/127.0.0.1:7447", "127.0.0.1:7447"),
-            ("tls/learner.example:7447#iface=eth0", "learner.example:7447"),
-            ("tcp/[::1]:7447?prio=1-7", "[::1]:7447"),
-        ] {
-            assert_eq!(address(endpoint), expected);
-        }
-    }
 }

@@ -15,41 +15,34 @@ pub fn are_there() -> bool {
 
 fn build() -> Result<(), String> {
     let mut command = Command::new("docker");
-    command.current_dir(repository()).args(["compose", "build", "--quiet", "learner", "evaluator", "firewall"]);
+    command.current_dir(repository()).args(["compose", "build", "--quiet", "learner", "evaluator"]);
     // That ours cannot be built is a failure, and nothing to skip a test for.
     assert!(succeeds(&mut command), "the images cannot be built");
     Ok(())
 }
 
-/// Makes sure that the images which ours are made from, and those of router and Prometheus, are on this machine.
+/// Makes stand-ins for the images which ours are made from, and for those of router and Prometheus, where a script can.
+/// Everywhere else, Docker fetches them.
 fn base_images() -> Result<(), String> {
     if !succeeds(Command::new("docker").arg("info").stderr(Stdio::null())) {
         return Err("no Docker engine answers".to_owned());
     }
-    let named = ["docker-compose.yml", "deploy/Dockerfile"]
-        .map(|file| std::fs::read_to_string(repository().join(file)).expect("the repository has its files"));
-    let images: Vec<&str> = named
-        .iter()
-        .flat_map(|text| text.lines())
-        .filter_map(|line| line.trim().strip_prefix("image: ").or(line.strip_prefix("FROM "))?.split(' ').next())
-        // Our own and the Dockerfile's stages have no tag; Grafana is scaled to none.
-        .filter(|image| image.contains(':') && !image.starts_with("grafana/"))
-        .collect();
     let beside = repository().join("../shared/docker/stand-ins");
     let stand_ins = std::env::var_os("QUAD_STAND_INS").map_or(beside, PathBuf::from);
-    if stand_ins.exists() {
-        return match succeeds(Command::new(&stand_ins).args(&images)) {
-            true => Ok(()),
-            false => Err(format!("{} failed", stand_ins.display())),
-        };
+    if !stand_ins.exists() {
+        return Ok(());
     }
-    for image in images {
-        let there = succeeds(Command::new("docker").args(["image", "inspect", image]).stderr(Stdio::null()));
-        if !there && !succeeds(Command::new("docker").args(["pull", "--quiet", image])) {
-            return Err(format!("{image} can be had neither from a registry nor from a script for stand-ins"));
-        }
+    let named = ["docker-compose.yml", "deploy/Dockerfile"]
+        .map(|file| std::fs::read_to_string(repository().join(file)).expect("the repository has its files"));
+    let lines = named.iter().flat_map(|text| text.lines());
+    let images =
+        lines.filter_map(|line| line.trim().strip_prefix("image: ").or(line.strip_prefix("FROM "))?.split(' ').next());
+    // Our own and the Dockerfile's stages have no tag; Grafana is scaled to none.
+    let images = images.filter(|image| image.contains(':') && !image.starts_with("grafana/"));
+    match succeeds(Command::new(&stand_ins).args(images)) {
+        true => Ok(()),
+        false => Err(format!("{} failed", stand_ins.display())),
     }
-    Ok(())
 }
 
 fn succeeds(command: &mut Command) -> bool {

@@ -1,4 +1,4 @@
-//! Everything at once, as it is: healthy, seen by Prometheus, and complete in the end.
+//! Everything at once, with the settings that Compose has: healthy, seen by Prometheus, and complete in the end.
 
 use quad_tests::prometheus::Prometheus;
 use quad_tests::{dashboard, eventually};
@@ -10,7 +10,7 @@ use crate::compose::{Compose, PATIENCE, inspect};
 const EVALUATORS: usize = 4;
 
 #[test]
-#[ignore = "builds the images: cargo test --release --workspace --test docker -- --ignored"]
+#[ignore = "ten minutes, after the images"]
 fn compose_runs_the_whole_system() {
     let Some(compose) = Compose::project("whole", "--steps 12000 --eval-interval 1000 --episodes 8") else { return };
     compose.run(&["up", "--detach", "--scale", "evaluator=4", "--scale", "grafana=0"]);
@@ -31,9 +31,6 @@ fn compose_runs_the_whole_system() {
         assert_eq!(health, "healthy", "{container}");
         assert!(!["", "0", "root"].contains(&user), "{container} runs as {user:?}");
     }
-
-    // It has to be root.
-    assert_eq!(inspect(&compose.container("firewall"), "{{.State.Health.Status}}"), "healthy", "firewall");
 
     let verdict = compose.assert_run_is_complete("whole", None);
     assert!(verdict.contains("96 of 96 episodes are scored"), "{verdict}");

@@ -1,6 +1,6 @@
 //! Tests: the update against an independent implementation (docs/golden.md).
 
-use super::super::tests::{Golden, check_update, devices, fresh, golden_batch, golden_setting, golden_table, goldens};
+use super::super::golden::{Golden, check_update, devices, fresh, golden_batch, golden_setting, golden_table, goldens};
 use super::*;
 use quad_policy::{ActionNoise, load_policy};
 
@@ -23,7 +23,7 @@ fn check(golden: &Golden, device: &Device) {
     let mut iql = Iql::new(config, golden_setting(golden, device)).unwrap();
     let mut state = golden.state.clone();
     iql.load(&mut state).unwrap();
-    assert!(state.is_empty(), "tensors that nobody reads: {:?}", state.keys());
+    assert!(state.is_empty(), "tensors that are not read: {:?}", state.keys());
 
     let (description, tensors) = iql.policy().unwrap();
     let policy = load_policy(&description.to_safetensors(&tensors).unwrap(), Precision::F32).unwrap();

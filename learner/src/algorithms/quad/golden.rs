@@ -1,6 +1,6 @@
 //! Tests: the update against an independent implementation (docs/golden.md).
 
-use super::super::tests::{Golden, check_update, devices, fresh, golden_batch, golden_setting, golden_table, goldens};
+use super::super::golden::{Golden, check_update, devices, fresh, golden_batch, golden_setting, golden_table, goldens};
 use super::*;
 
 fn start(golden: &Golden, device: &Device) -> Quad {
@@ -12,7 +12,7 @@ fn start(golden: &Golden, device: &Device) -> Quad {
         state.remove("nu_squared");
     }
     quad.load(&mut state).unwrap();
-    assert!(state.is_empty(), "tensors that nobody reads: {:?}", state.keys());
+    assert!(state.is_empty(), "tensors that are not read: {:?}", state.keys());
     quad
 }
 
@@ -46,6 +46,66 @@ fn golden_update() {
     for golden in goldens("quad") {
         devices().iter().for_each(|device| check(&golden, device));
     }
+}
+
+/// Whatever the algorithm holds beside them: what is published are the EMAs of actor and critics.
+#[test]
+fn the_policy_is_of_the_target_networks() {
+    for golden in goldens("quad") {
+        let (_, policy) = start(&golden, &Device::Cpu).policy().unwrap();
+        let networks = ["actor.", "critic."].map(|network| policy.keys().any(|name| name.starts_with(network)));
+        assert_eq!(networks, [true, true]);
+        for (name, tensor) in policy {
+            let [found, expected] = [&tensor, &golden.state[&format!("target_{name}")]]
+                .map(|tensor| tensor.flatten_all().unwrap().to_vec1::<f32>().unwrap());
+            assert_eq!(found, expected, "{name}");
+        }
+    }
+}
+
+/// Line 12 of Algorithm 1: dual ascent by at most `eta.rate`, within the bounds.
+#[test]
+fn eta_moves_by_at_most_its_rate_and_stays_within_its_bounds() {
+    let golden = goldens("quad").into_iter().find(|golden| golden.config["agent"]["guidance"] == "quad").unwrap();
+    // ε ten times as large makes a BC loss near 100, which is far above or far below the threshold.
+    let moved = |threshold: f32, minimum: f32, maximum: f32| {
+        let (batch, mut noise) = (golden_batch(&golden, &Device::Cpu), noise(&golden, &Device::Cpu));
+        noise.epsilon = (noise.epsilon * 10.0).unwrap();
+        let mut quad = start(&golden, &Device::Cpu);
+        quad.config.eta = Eta { initial: 1.0, threshold: Some(threshold), rate: 0.25, minimum, maximum };
+        quad.eta = Tensor::new(1f32, &Device::Cpu).unwrap();
+        quad.step(0, &batch, &noise).unwrap();
+        quad.eta.to_scalar::<f32>().unwrap()
+    };
+    assert_eq!((moved(0.1, 0.0, 9.0), moved(1e4, 0.0, 9.0)), (1.25, 0.75));
+    assert_eq!((moved(0.1, 0.0, 1.125), moved(1e4, 0.875, 9.0)), (1.125, 0.875));
+}
+
+#[test]
+fn the_noise_of_a_step_is_repeatable_and_no_other_steps() {
+    let golden = goldens("quad").remove(0);
+    let quad = start(&golden, &Device::Cpu);
+    let numbers = |step: u64| {
+        let Noise { next, t, epsilon } = quad.noise(step).unwrap();
+        let [next, epsilon] = [next, epsilon].map(|x| x.flatten_all().unwrap().to_vec1::<f32>().unwrap());
+        (next, t, epsilon)
+    };
+    assert_eq!(numbers(0), numbers(0));
+    let (next, t, epsilon) = numbers(0);
+    let other = numbers(1);
+    assert!(next != other.0 && t != other.1 && epsilon != other.2);
+}
+
+#[test]
+fn every_denoising_step_is_drawn_equally_often() {
+    let golden = goldens("quad").remove(0);
+    let quad = start(&golden, &Device::Cpu);
+    let mut counts = vec![0; quad.config.diffusion_steps];
+    (0..1000).for_each(|step| quad.noise(step).unwrap().t.iter().for_each(|t| counts[*t as usize - 1] += 1));
+    let expected = 1000 * quad.setting.batch_size / counts.len();
+    // Six standard deviations of a binomial count.
+    let room = 6.0 * (expected as f64).sqrt();
+    assert!(counts.iter().all(|count| (f64::from(*count) - expected as f64).abs() < room), "{counts:?}");
 }
 
 #[test]

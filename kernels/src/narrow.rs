@@ -1,0 +1,196 @@
+//! The narrow first and last layer of a network, fused with the activations beside them.
+//!
+//! Matrices are row-major slices; `width` is the number of columns.
+
+use crate::activation::{mish, mish_and_slope};
+use crate::vectorised::vectorised;
+
+/// Lanes that the loops work on at a time: one AVX-512 register of f32.
+const LANES: usize = 16;
+
+/// `acc + Σ_j coefficients[j] · vectors[j·stride + at ..][..LANES]`.
+#[inline(always)]
+fn combine(mut acc: [f32; LANES], coefficients: &[f32], vectors: &[f32], stride: usize, at: usize) -> [f32; LANES] {
+    for (j, c) in coefficients.iter().enumerate() {
+        let v = &vectors[j * stride + at..][..LANES];
+        for l in 0..LANES {
+            acc[l] = c.mul_add(v[l], acc[l]);
+        }
+    }
+    acc
+}
+
+/// The same for one column.
+#[inline(always)]
+fn combine_one(mut acc: f32, coefficients: &[f32], vectors: &[f32], stride: usize, at: usize) -> f32 {
+    for (j, c) in coefficients.iter().enumerate() {
+        acc = c.mul_add(vectors[j * stride + at], acc);
+    }
+    acc
+}
+
+#[inline(always)]
+fn load(x: &[f32], at: usize) -> [f32; LANES] {
+    let mut lanes = [0.0; LANES];
+    lanes.copy_from_slice(&x[at..at + LANES]);
+    lanes
+}
+
+/// Operands of the first layer: what the rows share, and what they do not.
+pub struct FirstLayer<'a> {
+    /// Pre-activation of the state part, one row per state: `states × width`.
+    pub base: &'a [f32],
+    /// Consecutive rows that share a state.
+    pub repeat: usize,
+    /// Added to every row: the bias, and for the actor the time embedding's part.
+    pub shift: &'a [f32],
+    /// `rows × action_dim`; the action may have no numbers at all.
+    pub actions: &'a [f32],
+    /// The kernel's rows that multiply the action: `action_dim × width`.
+    pub kernel: &'a [f32],
+}
+
+impl FirstLayer<'_> {
+    /// The action of a row; empty where the network has none.
+    #[inline(always)]
+    fn action(&self, row: usize) -> &[f32] {
+        let action_dim = self.kernel.len() / self.shift.len();
+        &self.actions[row * action_dim..][..action_dim]
+    }
+
+    /// base + shift + a · kernel of one row, [`LANES`] columns from `at` on.
+    #[inline(always)]
+    fn before_activation(&self, base: &[f32], a: &[f32], at: usize) -> [f32; LANES] {
+        let (mut sum, shift) = (load(base, at), load(self.shift, at));
+        for l in 0..LANES {
+            sum[l] += shift[l];
+        }
+        combine(sum, a, self.kernel, self.shift.len(), at)
+    }
+}
+
+vectorised! {
+    /// `out = mish(base + shift + actions · kernel)`, `rows × width`.
+    pub fn first_layer(layer: &FirstLayer<'_>, out: &mut [f32]) {
+        let width = layer.shift.len();
+        for (row, out) in out.chunks_exact_mut(width).enumerate() {
+            let a = layer.action(row);
+            let base = &layer.base[row / layer.repeat * width..][..width];
+            let whole = width - width % LANES;
+            for at in (0..whole).step_by(LANES) {
+                let acc = layer.before_activation(base, a, at);
+                let out = &mut out[at..at + LANES];
+                for l in 0..LANES {
+                    out[l] = mish(acc[l]);
+                }
+            }
+            for at in whole..width {
+                out[at] = mish(combine_one(base[at] + layer.shift[at], a, layer.kernel, width, at));
+            }
+        }
+    }
+}
+
+vectorised! {
+    /// `first_layer` that also keeps the slope for the backward pass.
+    pub fn first_layer_slope(layer: &FirstLayer<'_>, out: &mut [f32], slope: &mut [f32]) {
+        let width = layer.shift.len();
+        for (row, (out, slope)) in out.chunks_exact_mut(width).zip(slope.chunks_exact_mut(width)).enumerate() {
+            let a = layer.action(row);
+            let base = &layer.base[row / layer.repeat * width..][..width];
+            let whole = width - width % LANES;
+            for at in (0..whole).step_by(LANES) {
+                let acc = layer.before_activation(base, a, at);
+                let (out, slope) = (&mut out[at..at + LANES], &mut slope[at..at + LANES]);
+                for l in 0..LANES {
+                    (out[l], slope[l]) = mish_and_slope(acc[l]);
+                }
+            }
+            for at in whole..width {
+                let x = combine_one(base[at] + layer.shift[at], a, layer.kernel, width, at);
+                (out[at], slope[at]) = mish_and_slope(x);
+            }
+        }
+    }
+}
+
+vectorised! {
+    /// `slope = slope ⊙ (coefficients · vectors)`: the gradient before an activation whose output feeds a narrow
+    /// linear layer. `coefficients` is `rows × n`, `vectors` `n × width`.
+    pub fn scale_by_combination(slope: &mut [f32], coefficients: &[f32], vectors: &[f32], width: usize) {
+        let n = vectors.len() / width;
+        for (slope, c) in slope.chunks_exact_mut(width).zip(coefficients.chunks_exact(n)) {
+            let whole = width - width % LANES;
+            for at in (0..whole).step_by(LANES) {
+                let acc = combine([0.0; LANES], c, vectors, width, at);
+                let slope = &mut slope[at..at + LANES];
+                for l in 0..LANES {
+                    slope[l] *= acc[l];
+                }
+            }
+            for (at, slope) in slope.iter_mut().enumerate().skip(whole) {
+                *slope *= combine_one(0.0, c, vectors, width, at);
+            }
+        }
+    }
+}
+
+vectorised! {
+    /// `out[row, j] = offset[j] + x[row] · vectors[j]`: a narrow linear layer. `vectors` is `n × width`.
+    pub fn dots(x: &[f32], vectors: &[f32], offset: &[f32], out: &mut [f32], width: usize) {
+        for (x, out) in x.chunks_exact(width).zip(out.chunks_exact_mut(offset.len())) {
+            for ((out, v), offset) in out.iter_mut().zip(vectors.chunks_exact(width)).zip(offset) {
+                let whole = width - width % LANES;
+                let mut acc = [0.0_f32; LANES];
+                for at in (0..whole).step_by(LANES) {
+                    let (x, v) = (load(x, at), load(v, at));
+                    for l in 0..LANES {
+                        acc[l] = x[l].mul_add(v[l], acc[l]);
+                    }
+                }
+                let mut sum = *offset;
+                for l in acc {
+                    sum += l;
+                }
+                for at in whole..width {
+                    sum = x[at].mul_add(v[at], sum);
+                }
+                *out = sum;
+            }
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::activation::tests::mish_f64;
+
+    #[test]
+    fn widths_that_fill_no_register_are_handled() {
+        for width in [1, 5, 16, 23] {
+            let x: Vec<f32> = (0..3 * width).map(|i| i as f32 * 0.1 - 1.0).collect();
+            let v: Vec<f32> = (0..2 * width).map(|i| (i as f32).sin()).collect();
+            let mut out = [0.0; 6];
+            dots(&x, &v, &[0.5, -0.5], &mut out, width);
+            for (row, out) in out.chunks(2).enumerate() {
+                for (j, out) in out.iter().enumerate() {
+                    let sum: f32 = (0..width).map(|h| x[row * width + h] * v[j * width + h]).sum();
+                    assert!((out - (sum + [0.5, -0.5][j])).abs() < 1e-5);
+                }
+            }
+            let layer =
+                FirstLayer { base: &x, repeat: 1, shift: &v[..width], actions: &[0.3, -0.2, 0.9], kernel: &v[width..] };
+            let (mut plain, mut y, mut slope) = (vec![0.0; 3 * width], vec![0.0; 3 * width], vec![0.0; 3 * width]);
+            first_layer(&layer, &mut plain);
+            first_layer_slope(&layer, &mut y, &mut slope);
+            assert_eq!(plain.len(), y.len());
+            for i in 0..3 * width {
+                let pre = x[i] + v[i % width] + [0.3, -0.2, 0.9][i / width] * v[width + i % width];
+                let (y64, slope64) = mish_f64(f64::from(pre));
+                assert!((f64::from(plain[i]) - y64).abs() < 1e-5 && (f64::from(y[i]) - y64).abs() < 1e-5);
+                assert!((f64::from(slope[i]) - slope64).abs() < 1e-5);
+            }
+        }
+    }
+}

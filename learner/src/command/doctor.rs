@@ -1,0 +1,44 @@
+//! `learner doctor`: checks a machine before a run is started on it.
+
+use quad_policy::Precision;
+use quad_service::doctor::{self, Findings};
+use quad_service::{Endpoints, Role};
+
+use crate::cli::DoctorArgs;
+use crate::data;
+
+/// Where a learner listens by default.
+const PORT: u16 = 7447;
+
+/// Does all checks.
+///
+/// # Errors
+/// The checks cannot be done; what they find is no error.
+pub fn examine(args: &DoctorArgs) -> anyhow::Result<Findings> {
+    let mut findings = Findings::default();
+    doctor::threads(&mut findings);
+    let fastest = if Precision::Bf16.is_available() { "bf16, by --precision bf16" } else { "f32" };
+    findings.ok("precision", format!("this CPU is fastest in {fastest}"));
+    hdf5(&mut findings);
+    doctor::folder(&mut findings, "run folder", &args.run_dir, "another folder is chosen by --run-dir");
+    match data::cache::folder() {
+        Ok(folder) => doctor::folder(&mut findings, "datasets", &folder, "D4RL_DATASET_DIR chooses another folder"),
+        Err(error) => findings.warn("datasets", format!("{error:#}"), "name a folder in D4RL_DATASET_DIR"),
+    }
+    let folder = args.certificates.as_deref();
+    let certificates = folder.and_then(|folder| doctor::certificates(&mut findings, folder, Role::Learner));
+    let Some(endpoint) = &args.connect else {
+        doctor::port(&mut findings, PORT);
+        return Ok(findings);
+    };
+    let endpoints = Endpoints { connect: vec![endpoint.clone()], certificates, ..Endpoints::default() };
+    doctor::connected(&mut findings, &endpoints, async |_, _| Ok(()))?;
+    Ok(findings)
+}
+
+fn hdf5(findings: &mut Findings) {
+    match quad_dataset::hdf5_library() {
+        (version, true) => findings.ok("HDF5", format!("{version}, with compression")),
+        (version, false) => findings.fail("HDF5", format!("{version}, without zlib"), "install Debian's libhdf5-103-1"),
+    }
+}

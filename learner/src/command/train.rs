@@ -1,0 +1,267 @@
+//! `learner train`, from the command line to the report.
+
+use std::path::{Path, PathBuf};
+use std::time::{Duration, SystemTime, UNIX_EPOCH};
+
+use anyhow::{Context, anyhow};
+use quad_dataset::{DatasetError, ReadOptions, Transitions, environment};
+use quad_policy::Precision;
+use quad_protocol::Name;
+use quad_service::{
+    Certificates, CertificatesError, Endpoints, Health, Hint, Role, SessionError, default_endpoint, hinted,
+    stay_in_background,
+};
+use tokio::sync::mpsc;
+use tracing::{debug, info, warn};
+
+use crate::cli::{TrainArgs, print};
+use crate::config::{DatasetInfo, Experiment, RunConfig, RunInfo, presets, resolve};
+use crate::data::{LocalDataset, Source};
+use crate::report::{RunReport, learning_curves};
+use crate::run::{self, Begun, Log, Past, RunDir};
+use crate::service::{Display, Ending, Life, MainLoop, Metrics, Run, STUCK, Threads, open_network};
+
+/// Where evaluators look by default.
+const DEFAULT_PORT: u16 = 7447;
+/// How long a run that has failed may write its report.
+const REPORT_PATIENCE: Duration = Duration::from_secs(5);
+/// For a run without evaluations, which needs no known port: several of them may run at a time.
+const ANY_PORT: u16 = 0;
+
+/// Does it; an error is a run that did not come to its end.
+pub fn train(args: &TrainArgs) -> anyhow::Result<()> {
+    let experiment = resolve(&args.preset, &args.changes())?;
+    let named = experiment.dataset.clone().ok_or_else(|| anyhow!("preset {} names no dataset", args.preset));
+    let source = Source::parse(&named.hint(record_hint(&experiment))?)?;
+    source.check_environment(&experiment.environment)?;
+    let path = match &args.run_dir {
+        Some(path) => path.clone(),
+        None => default_run_dir(&args.preset, &experiment)?,
+    };
+    let name = run_name(&path)?;
+    let begun = run::open(&path, args.fresh)?;
+    let endpoints = endpoints(args, experiment.eval_interval)?;
+
+    args.device.check(experiment.precision)?;
+    let dataset = source.obtain().hint(record_hint(&experiment))?;
+
+    let options =
+        ReadOptions { environment: environment::find(&experiment.environment).ok(), reward: experiment.reward };
+    let transitions = read_dataset(&dataset.path, &options)?;
+    check_batch(&transitions, &experiment).hint("record more data, or ask for less with --set batch_size=N")?;
+    let config = run_config(args, &name, experiment, dataset, &transitions)?;
+    if let Some(begun) = &begun {
+        begun.check_same(&config)?;
+    }
+    info!("{}", config.dataset.summary());
+    info!("{}", config.experiment.summary()?);
+    if !config.experiment.precision.is_available() {
+        warn!("{}", Precision::UNAVAILABLE);
+    }
+    debug!("{config:?}");
+
+    // Zenoh and the training thread have threads of their own; this runtime serves the metrics and the main loop.
+    let mut runtime = tokio::runtime::Builder::new_multi_thread();
+    let runtime = runtime.worker_threads(2).on_thread_start(stay_in_background).enable_all().build()?;
+    let ended = runtime.block_on(run_to_its_end(args, endpoints, &path, begun, name, &config, transitions));
+    let concluded = ended.and_then(|(run_dir, ending)| conclude(&run_dir, &config, ending));
+    // Without waiting for a thread that waits for a broken disk.
+    runtime.shutdown_background();
+    concluded
+}
+
+fn record_hint(experiment: &Experiment) -> String {
+    format!(
+        "give a file by --dataset FILE; `evaluator collect --env {} --out FILE` records one",
+        experiment.environment
+    )
+}
+
+fn read_dataset(path: &Path, options: &ReadOptions) -> anyhow::Result<Transitions> {
+    let result = Transitions::read(path, options);
+    let hint = result.as_ref().err().map(DatasetError::hint).unwrap_or_default();
+    result.with_context(|| format!("cannot learn from {}", path.display())).hint(hint)
+}
+
+/// A batch never holds a transition twice while there are others, so it cannot be larger than the dataset.
+fn check_batch(transitions: &Transitions, experiment: &Experiment) -> anyhow::Result<()> {
+    let (there, batch) = (transitions.len(), experiment.batch_size);
+    anyhow::ensure!(there >= batch as usize, "{there} transitions are fewer than a batch of {batch}");
+    Ok(())
+}
+
+async fn run_to_its_end(
+    args: &TrainArgs,
+    endpoints: Endpoints,
+    path: &Path,
+    begun: Option<Begun>,
+    name: Name,
+    config: &RunConfig,
+    transitions: Transitions,
+) -> anyhow::Result<(RunDir, Ending)> {
+    let steps = config.experiment.steps;
+    let (metrics, registry) = Metrics::new(&name, steps, config.experiment.definition()?.metrics)?;
+    let health = Health::default();
+    let server = quad_service::serve_metrics(args.metrics, registry, health.clone()).await?;
+    let opening = open_network(&endpoints).await.hint_of(|error| {
+        error.downcast_ref().map_or("join a router with --connect, or listen with --listen", SessionError::hint)
+    })?;
+    // From here on nothing outside can be wrong any more, so a refused start leaves no folder behind.
+    let (run_dir, scores, past) = take_up(path, begun, args.fresh, config)?;
+    let (tell, events) = mpsc::unbounded_channel();
+    // A later start has a larger number; the low bits tell two apart that start in the same millisecond.
+    let life = Life { run: name, incarnation: now()? << 16 | u64::from(rand::random::<u16>()) };
+    let checkpoint_every = Duration::from_secs(args.checkpoint_seconds);
+    let run = Run { life: life.clone(), config, dir: &run_dir, scores, past, checkpoint_every };
+    let threads = Threads::start(run, transitions, &metrics, &health, &tell)?;
+    let main_loop = MainLoop {
+        life,
+        run_dir: run_dir.clone(),
+        display: Display::start(metrics.clone(), steps),
+        metrics,
+        metrics_address: server.address.to_string(),
+        endpoints,
+        events,
+        threads,
+        beat: health.part("main", STUCK),
+        health,
+    };
+    Ok((run_dir, main_loop.run(opening).await))
+}
+
+/// The run's folder, and what is in it already.
+fn take_up(path: &Path, begun: Option<Begun>, fresh: bool, config: &RunConfig) -> anyhow::Result<(RunDir, Log, Past)> {
+    match begun {
+        Some(begun) if !fresh => return begun.go_on(&config.experiment),
+        Some(begun) => begun.set_aside()?,
+        None => {}
+    }
+    let (run_dir, scores) = RunDir::create(path, config)?;
+    Ok((run_dir, scores, Past::default()))
+}
+
+/// Milliseconds since 1970.
+fn now() -> anyhow::Result<u64> {
+    Ok(SystemTime::now().duration_since(UNIX_EPOCH)?.as_millis() as u64)
+}
+
+fn endpoints(args: &TrainArgs, eval_interval: u64) -> anyhow::Result<Endpoints> {
+    let certificates = args.certificates.as_deref().map(|folder| Certificates::read(folder, Role::Learner));
+    let certificates = certificates.transpose().hint_of(CertificatesError::hint)?;
+    let port = if eval_interval == 0 { ANY_PORT } else { DEFAULT_PORT };
+    let listen = match (&args.listen, &args.connect) {
+        (None, None) => vec![default_endpoint(certificates.as_ref(), port)],
+        (listen, _) => Vec::from_iter(listen.clone()),
+    };
+    let endpoints = Endpoints { listen, connect: Vec::from_iter(args.connect.clone()), certificates };
+    endpoints.check().hint_of(SessionError::hint)?;
+    if let Some(endpoint) = endpoints.open_to_all() {
+        warn!(
+            "every machine that reaches {endpoint} may read weights and send scores: in a network that you do not trust, use \
+             --certificates DIR (docs/security.md)"
+        );
+    }
+    Ok(endpoints)
+}
+
+/// Writes the report, however the run ended; a run that did not complete is an error.
+fn conclude(run_dir: &RunDir, config: &RunConfig, ending: Ending) -> anyhow::Result<()> {
+    let folder = run_dir.path().display();
+    let reported = match &ending {
+        // Perhaps of a disk that hangs.
+        Ending::Failed(_) => {
+            let run_dir = run_dir.clone();
+            within(REPORT_PATIENCE, move || summarise(&run_dir))
+        }
+        _ => summarise(run_dir),
+    };
+    let kept =
+        format!("everything up to the newest checkpoint is kept in {folder}; the same command goes on from there");
+    let error = match ending {
+        Ending::Complete => return all_scored(reported?),
+        Ending::Failed(error) => error,
+        Ending::Interrupted => {
+            anyhow!("interrupted before the end of {} steps and their evaluations", config.experiment.steps)
+        }
+    };
+    if let Err(error) = reported {
+        warn!("the run has no report: {error:#}");
+    }
+    Err(hinted(error, kept))
+}
+
+/// That no episode was given up.
+fn all_scored(report: RunReport) -> anyhow::Result<()> {
+    let missing: usize = report.missing.iter().map(|missing| missing.episodes).sum();
+    if missing == 0 {
+        return Ok(());
+    }
+    let hint = "the log says why; when that is mended, the same command hands them out again";
+    Err(anyhow!("training is complete, but {missing} episodes have no score")).hint(hint)
+}
+
+/// Does it on another thread, which is not waited for any longer.
+fn within<T: Send + 'static>(
+    patience: Duration,
+    work: impl FnOnce() -> anyhow::Result<T> + Send + 'static,
+) -> anyhow::Result<T> {
+    let (tell, told) = std::sync::mpsc::channel();
+    std::thread::spawn(move || tell.send(work()));
+    told.recv_timeout(patience).unwrap_or_else(|_| Err(anyhow!("it took longer than {patience:?}")))
+}
+
+fn summarise(run_dir: &RunDir) -> anyhow::Result<RunReport> {
+    let report = RunReport::read(run_dir.path())?;
+    let mut text = String::new();
+    if !report.evaluations.is_empty() {
+        run_dir.write_json("report.json", &report)?;
+        let picture = run_dir.learning_curve();
+        learning_curves(&picture, std::slice::from_ref(&report))?;
+        text = format!("\n{}\nlearning curve: {}\n", report.table(), picture.display());
+    }
+    print(&format!("{text}run folder: {}", run_dir.path().display()))?;
+    Ok(report)
+}
+
+fn default_run_dir(preset: &str, experiment: &Experiment) -> anyhow::Result<PathBuf> {
+    let variant = experiment.hyperparameters()?.variant();
+    Ok(Path::new("runs").join(format!("{}-{variant}-seed{}", presets::label(preset), experiment.seed)))
+}
+
+/// The folder's name, which is also the run's place in Zenoh's key space.
+fn run_name(path: &Path) -> anyhow::Result<Name> {
+    let folder = path.file_name().and_then(|name| name.to_str()).unwrap_or_default();
+    Name::new(folder)
+        .with_context(|| format!("the run folder {} gives no name for the run", path.display()))
+        .hint("its last part must be 1 to 64 letters, digits, dots, dashes or underscores")
+}
+
+fn run_config(
+    args: &TrainArgs,
+    name: &Name,
+    experiment: Experiment,
+    dataset: LocalDataset,
+    transitions: &Transitions,
+) -> anyhow::Result<RunConfig> {
+    let statistics = transitions.statistics();
+    Ok(RunConfig {
+        run: RunInfo {
+            name: name.to_string(),
+            started: now()?,
+            preset: presets::label(&args.preset),
+            version: env!("CARGO_PKG_VERSION").to_owned(),
+            device: args.device,
+        },
+        dataset: DatasetInfo {
+            path: dataset.path,
+            sha256: Some(dataset.sha256),
+            transitions: statistics.transitions as u64,
+            episodes: statistics.episodes as u64,
+            min_return: statistics.return_min,
+            mean_return: statistics.return_mean,
+            max_return: statistics.return_max,
+            mean_score: statistics.score_mean,
+        },
+        experiment,
+    })
+}

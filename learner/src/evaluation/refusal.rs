@@ -1,0 +1,46 @@
+//! Why a message about a job or its scores is not accepted.
+
+/// Why a message is not accepted.
+#[derive(Clone, Copy, Debug, PartialEq, thiserror::Error)]
+pub(crate) enum Refusal {
+    #[error("it is for another run")]
+    Run,
+    #[error("it is for another incarnation of the learner")]
+    Incarnation,
+    #[error("no such job is open")]
+    Job,
+    #[error("the job was handed out to another evaluator")]
+    Evaluator,
+    #[error("the job is not further than before")]
+    NotAdvanced,
+    #[error("there is no evaluation of that step")]
+    Step,
+    #[error("the evaluation of that step is about other weights")]
+    Weights,
+    #[error("seed {0} is not in the evaluation, or twice in the report")]
+    Seed(u64),
+    #[error("the episode with seed {0} has an impossible length, return or score")]
+    Episode(u64),
+}
+
+impl Refusal {
+    /// The reason as a metric's label.
+    pub fn label(self) -> &'static str {
+        match self {
+            Self::Run => "unknown_run",
+            Self::Incarnation => "unknown_incarnation",
+            Self::Job => "unknown_job",
+            Self::Evaluator => "wrong_evaluator",
+            Self::NotAdvanced => "not_advanced",
+            Self::Step => "unknown_step",
+            Self::Weights => "unknown_weights",
+            Self::Seed(_) => "unknown_seed",
+            Self::Episode(_) => "impossible_episode",
+        }
+    }
+}
+
+/// `refusal`, unless `holds`.
+pub(super) fn require(holds: bool, refusal: Refusal) -> Result<(), Refusal> {
+    if holds { Ok(()) } else { Err(refusal) }
+}

@@ -1,0 +1,52 @@
+//! Which reports are accepted.
+
+use std::collections::BTreeSet;
+
+use quad_protocol::{EpisodeScore, ScoreReport};
+
+use super::refusal::{Refusal, require};
+use super::scoreboard::Scoreboard;
+
+/// Largest relative difference between a score and the one computed from its return; it allows for rounding only.
+const SCORE_TOLERANCE: f64 = 1e-6;
+
+/// A report that passed every check, split into new scores and scores that are recorded already.
+#[derive(Clone, Debug, PartialEq)]
+pub(crate) struct Validated {
+    /// Episodes that had no score yet.
+    pub new: Vec<EpisodeScore>,
+    /// Number of episodes that had a score already.
+    pub duplicates: u32,
+}
+
+impl Scoreboard {
+    /// Checks a report against the evaluation that it is about, and says what in it is new. Changes nothing: the caller writes
+    /// the new scores down first, then calls [`record`](Self::record).
+    pub fn validate(&self, report: &ScoreReport) -> Result<Validated, Refusal> {
+        require(report.run == self.rules.run, Refusal::Run)?;
+        let evaluation = self.evaluations.get(&report.step).ok_or(Refusal::Step)?;
+        require(evaluation.weights == report.weights, Refusal::Weights)?;
+        let mut validated = Validated { new: Vec::new(), duplicates: 0 };
+        let mut seen = BTreeSet::new();
+        for score in &report.episodes {
+            require(seen.insert(score.seed), Refusal::Seed(score.seed))?;
+            let is_scored = evaluation.is_scored(score.seed).ok_or(Refusal::Seed(score.seed))?;
+            require(self.is_possible(score), Refusal::Episode(score.seed))?;
+            match is_scored {
+                true => validated.duplicates += 1,
+                false => validated.new.push(*score),
+            }
+        }
+        Ok(validated)
+    }
+
+    fn is_possible(&self, score: &EpisodeScore) -> bool {
+        let task = &self.rules.task;
+        let expected = task.score(score.episode_return);
+        let longest = task.max_episode_steps().unwrap_or(usize::MAX);
+        let length_fits = (1..=longest).contains(&(score.length as usize));
+        length_fits
+            && expected.is_finite()
+            && (score.score - expected).abs() <= SCORE_TOLERANCE * expected.abs().max(1.0)
+    }
+}

@@ -1,0 +1,216 @@
+//! `learner verify`: reads a run's folder and nothing else, and says whether what a run promises has held.
+
+use std::collections::{BTreeMap, BTreeSet};
+use std::fmt;
+use std::path::Path;
+
+use quad_protocol::{Hash, episode_seeds};
+
+use super::error::RunDirError;
+use super::folder::RunDir;
+use super::lines::ScoreLine;
+use crate::config::settings;
+
+/// Findings of one kind that are listed one by one; the rest is counted.
+const LISTED: usize = 5;
+
+/// Evaluators compute in f32 or bf16, by the fastest instructions of their CPU, and each of these rounds in its own way.
+const OTHER_ARITHMETIC: &str =
+    "not comparable, because the evaluators computed in another precision or by other instructions";
+
+/// What was found in a folder.
+#[derive(Debug, Default, PartialEq)]
+pub struct Findings {
+    /// What was looked for: `scored` or `compared`.
+    pub what: &'static str,
+    /// Episodes that are.
+    pub found: usize,
+    /// Of how many.
+    pub expected: usize,
+    /// What is wrong, kind by kind.
+    pub wrong: BTreeMap<&'static str, Vec<String>>,
+}
+
+impl Findings {
+    /// Whether every promise has held.
+    pub fn all_held(&self) -> bool {
+        self.wrong.is_empty()
+    }
+
+    fn add(&mut self, kind: &'static str, what: String) {
+        self.wrong.entry(kind).or_default().push(what);
+    }
+}
+
+impl fmt::Display for Findings {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        write!(f, "{} of {} episodes are {}", self.found, self.expected, self.what)?;
+        for (kind, found) in &self.wrong {
+            let listed = found.iter().take(LISTED).cloned().collect::<Vec<_>>().join("; ");
+            let more = if found.len() > LISTED { "; …" } else { "" };
+            write!(f, "\n{kind} ({}): {listed}{more}", found.len())?;
+        }
+        Ok(())
+    }
+}
+
+/// Checks that each episode of each evaluation of a run is scored exactly once, with the weights that are on disk.
+///
+/// # Errors
+/// There is no run in the folder, or a file cannot be read.
+pub fn verify(path: &Path) -> Result<Findings, RunDirError> {
+    let (dir, config) = RunDir::open(path)?;
+    let experiment = &config.experiment;
+    let mut planned: BTreeMap<u64, BTreeSet<u64>> = experiment
+        .schedule()
+        .evaluated_steps()
+        .map(|step| (step, BTreeSet::from_iter(episode_seeds(experiment.seed, step, experiment.episodes))))
+        .collect();
+    let expected = planned.values().map(BTreeSet::len).sum();
+    let mut found = Findings { what: "scored", expected, ..Findings::default() };
+    let mut hashes: BTreeMap<u64, Option<String>> = BTreeMap::new();
+    let mut seen = BTreeSet::new();
+    for ScoreLine { step, seed, weights, episode_return, score, .. } in dir.read_scores()? {
+        let name = format!("step {step}, seed {seed}");
+        let hash = hashes
+            .entry(step)
+            .or_insert_with(|| dir.read_snapshot(step).ok().map(|tensors| Hash::of(&tensors).to_string()));
+        match hash {
+            None => found.add("scored, but the snapshot is gone", name.clone()),
+            Some(hash) if *hash != weights => found.add("scored with other weights than are on disk", name.clone()),
+            Some(_) => {}
+        }
+        if !(episode_return.is_finite() && score.is_finite()) {
+            found.add("not a number", name.clone());
+        }
+        if !seen.insert((step, seed)) {
+            found.add("scored twice", name);
+        } else if planned.get_mut(&step).is_some_and(|seeds| seeds.remove(&seed)) {
+            found.found += 1;
+        } else {
+            found.add("no episode of this run", name);
+        }
+    }
+    for (step, seeds) in planned {
+        for seed in seeds {
+            found.add("without a score", format!("step {step}, seed {seed}"));
+        }
+    }
+    Ok(found)
+}
+
+/// Checks that each score of a run is in another run of the same configuration, too: bit for bit, of the same weights.
+///
+/// # Errors
+/// As [`verify`].
+pub fn compare(path: &Path, other: &Path) -> Result<Findings, RunDirError> {
+    let mut found = Findings { what: "compared", ..Findings::default() };
+    let [(dir, config), (other_dir, other_config)] = [RunDir::open(path)?, RunDir::open(other)?];
+    let [a, b] = [&config, &other_config].map(settings::of_run);
+    for key in settings::differences(&a, &b) {
+        found.add("settings that differ", key.clone());
+    }
+    let by_key = |lines: Vec<ScoreLine>| -> BTreeMap<(u64, u64), ScoreLine> {
+        lines.into_iter().map(|line| ((line.step, line.seed), line)).collect()
+    };
+    let [ours, theirs] = [by_key(dir.read_scores()?), by_key(other_dir.read_scores()?)];
+    found.expected = ours.len();
+    for (key @ (step, seed), line) in &ours {
+        let name = format!("step {step}, seed {seed}");
+        let Some(same) = theirs.get(key) else {
+            found.add("not scored there", name);
+            continue;
+        };
+        let bits = |line: &ScoreLine| (line.episode_return.to_bits(), line.length);
+        if line.weights != same.weights {
+            found.add("weights that differ", name);
+        } else if line.precision != same.precision {
+            let (here, there) = (&line.precision, &same.precision);
+            found.add(OTHER_ARITHMETIC, format!("{name} ({here} here, {there} there)"));
+        } else if bits(line) != bits(same) {
+            found.add("scores that differ", name);
+        } else {
+            found.found += 1;
+        }
+    }
+    Ok(found)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::config::RunConfig;
+
+    /// A run that is as it should be, but for what is done to its lines: evaluations of steps 10 and 15, three episodes each.
+    fn write(path: &Path, change: impl FnOnce(&mut Vec<ScoreLine>)) {
+        let mut config = RunConfig::example("hopper-demo", 4);
+        let experiment = &mut config.experiment;
+        (experiment.steps, experiment.eval_interval, experiment.episodes) = (15, 10, 3);
+        let (run, mut log) = RunDir::create(path, &config).unwrap();
+        let mut lines = Vec::new();
+        for step in [10, 15] {
+            let tensors = [step as u8; 100];
+            run.write_snapshot(step, &tensors).unwrap();
+            lines.extend(episode_seeds(4, step, 3).into_iter().map(|seed| ScoreLine {
+                step,
+                seed,
+                episode_return: seed as f64,
+                length: 5,
+                score: 1.0,
+                weights: Hash::of(&tensors).to_string(),
+                precision: "f32-avx512".into(),
+                evaluator: "e".into(),
+            }));
+        }
+        change(&mut lines);
+        log.append(&lines).unwrap();
+    }
+
+    #[test]
+    fn each_broken_promise_is_found() {
+        type Change = fn(&mut Vec<ScoreLine>);
+        let changes: [(&str, Change); 6] = [
+            ("", |_| ()),
+            ("without a score", |lines| drop(lines.pop())),
+            ("scored twice", |lines| lines.push(lines[0].clone())),
+            ("no episode of this run", |lines| lines.push(ScoreLine { seed: 1, ..lines[0].clone() })),
+            ("scored with other weights than are on disk", |lines| lines[2].weights = lines[3].weights.clone()),
+            ("scored, but the snapshot is gone", |lines| lines.push(ScoreLine { step: 12, ..lines[0].clone() })),
+        ];
+        for (expected, change) in changes {
+            let folder = tempfile::tempdir().unwrap();
+            let path = folder.path().join("a");
+            write(&path, change);
+            let found = verify(&path).unwrap();
+            assert_eq!(found.all_held(), expected.is_empty(), "{found}");
+            assert!(expected.is_empty() || found.wrong.contains_key(expected), "{expected}: {found}");
+            assert_eq!(found.expected, 6);
+        }
+    }
+
+    #[test]
+    fn two_runs_are_compared_bit_for_bit() {
+        let folder = tempfile::tempdir().unwrap();
+        let [ours, theirs] = ["a", "b"].map(|name| folder.path().join(name));
+        write(&ours, |_| ());
+        type Change = fn(&mut Vec<ScoreLine>);
+        let changes: [(Change, usize, &[&str]); 6] = [
+            (|_| (), 6, &[]),
+            (|lines| lines[0].episode_return = lines[0].episode_return.next_up(), 5, &["scores that differ"]),
+            (|lines| lines.truncate(2), 2, &["not scored there"]),
+            (|lines| lines[5].weights = "00".into(), 5, &["weights that differ"]),
+            (|lines| lines.clear(), 0, &["not scored there"]),
+            (|lines| lines[0].precision = "bf16-amx".into(), 5, &[OTHER_ARITHMETIC]),
+        ];
+        for (change, same, wrong) in changes {
+            std::fs::remove_dir_all(&theirs).ok();
+            write(&theirs, change);
+            let found = compare(&ours, &theirs).unwrap();
+            assert!(found.found == same && found.wrong.keys().eq(wrong), "{wrong:?}: {found}");
+            // What only the other one has does not matter.
+            assert!(wrong != ["not scored there"] || compare(&theirs, &ours).unwrap().all_held());
+        }
+        let found = compare(&ours, &theirs).unwrap().to_string();
+        assert!(found.contains("f32-avx512 here, bf16-amx there"), "{found}");
+    }
+}

@@ -1,0 +1,253 @@
+//! Who has which job, and what is scored: the scoreboard and the evaluators behind one lock.
+//!
+//! Every thread may call it. The lock is held for microseconds, never across input or output: what takes time, like writing
+//! scores down, the caller does between two calls.
+
+use std::collections::{BTreeMap, BTreeSet};
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+use std::time::Instant;
+
+use quad_protocol::{EpisodeScore, Hash, JobReply, JobRequest, Name, Progress, ScoreReply, ScoreReport, episode_seeds};
+use tracing::{debug, warn};
+
+use super::evaluators::Evaluators;
+use super::events::{Event, Events};
+use super::metrics::Metrics;
+use super::rejection::Rejection;
+use crate::evaluation::{
+    Claim, Claimed, Earlier, HandedBack, Lost, OtherWeights, Refusal, Rules, Scoreboard, Validated,
+};
+
+/// Of what an evaluator says about a job that it could not do, so much is passed on, in characters.
+const LONGEST_REASON: usize = 300;
+/// Most names of which it is told that two evaluators use them.
+const MOST_NAMES_TOLD: usize = 100;
+
+/// Which episodes each evaluation of a run has.
+#[derive(Clone, Copy, Debug)]
+pub(crate) struct EvaluationPlan {
+    /// Seed of the run.
+    pub seed: u64,
+    /// Episodes per evaluation.
+    pub episodes: u32,
+}
+
+/// Reaches the state. Clones share it.
+#[derive(Clone, Debug)]
+pub(crate) struct Coordinator {
+    state: Arc<Mutex<State>>,
+    plan: EvaluationPlan,
+    incarnation: u64,
+    metrics: Metrics,
+    events: Events,
+}
+
+#[derive(Debug)]
+struct State {
+    scoreboard: Scoreboard,
+    evaluators: Evaluators,
+    /// Steps of which it was told that a job failed.
+    failures_told: BTreeSet<u64>,
+    /// Names of which it was told that two evaluators use them.
+    names_told: BTreeSet<Name>,
+}
+
+impl Coordinator {
+    /// Without evaluations; see [`Scoreboard::new`].
+    pub fn new(
+        rules: Rules,
+        plan: EvaluationPlan,
+        earlier: BTreeMap<u64, Earlier>,
+        metrics: Metrics,
+        events: Events,
+    ) -> Self {
+        let incarnation = rules.incarnation;
+        let state = State {
+            scoreboard: Scoreboard::new(rules, earlier),
+            evaluators: Evaluators::new(metrics.evaluators.clone(), Instant::now()),
+            failures_told: BTreeSet::new(),
+            names_told: BTreeSet::new(),
+        };
+        Self { state: Arc::new(Mutex::new(state)), plan, incarnation, metrics, events }
+    }
+
+    // A thread that panicked here ends the run.
+    fn lock(&self) -> MutexGuard<'_, State> {
+        self.state.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+
+    /// Opens the evaluation of a snapshot.
+    ///
+    /// # Errors
+    /// The step is known with other weights.
+    pub fn open(&self, step: u64, weights: Hash) -> Result<(), OtherWeights> {
+        let seeds = episode_seeds(self.plan.seed, step, self.plan.episodes);
+        let mut state = self.lock();
+        if let Some(scores) = state.scoreboard.add_evaluation(step, weights, &seeds)? {
+            self.show(step, &scores);
+        }
+        self.count(&state);
+        Ok(())
+    }
+
+    /// Hash of the snapshot of a step that is evaluated.
+    pub fn weights(&self, step: u64) -> Option<Hash> {
+        self.lock().scoreboard.weights(step)
+    }
+
+    /// Episodes that have no score yet, and may still get one.
+    pub fn pending(&self) -> usize {
+        self.lock().scoreboard.pending()
+    }
+
+    /// Answers an evaluator that asks for a job or hands one back.
+    pub fn job(&self, request: &JobRequest) -> JobReply {
+        let mut state = self.lock();
+        match request {
+            JobRequest::Claim { evaluator, attempt, environments } => {
+                let present = state.evaluators.count();
+                let claim = Claim { evaluator, attempt: *attempt, environments, present };
+                let claimed = state.scoreboard.claim(claim, Instant::now());
+                self.claimed(&mut state, evaluator, claimed)
+            }
+            JobRequest::HandBack { evaluator, job, failed } => {
+                let when = failed.is_some().then(Instant::now);
+                let handed_back = state.scoreboard.hand_back(evaluator, *job, when);
+                let accepted = handed_back.is_some();
+                if let Some(HandedBack { step, given_up }) = handed_back {
+                    match failed {
+                        Some(reason) => self.failed(&mut state, step, evaluator, reason),
+                        None => self.metrics.evaluation.jobs_handed_back.inc(),
+                    }
+                    self.given_up(&state, given_up);
+                }
+                JobReply::HandedBack { incarnation: self.incarnation, accepted }
+            }
+        }
+    }
+
+    fn claimed(&self, state: &mut State, evaluator: &Name, claimed: Claimed) -> JobReply {
+        match claimed {
+            Claimed::Job { job, again } => {
+                if !again {
+                    debug!(job = job.id, step = job.step, %evaluator, "handed out");
+                    self.metrics.evaluation.jobs_handed_out.inc();
+                }
+                JobReply::Job(job)
+            }
+            Claimed::Wait { time, has_another } => {
+                let names = &mut state.names_told;
+                if has_another && names.len() < MOST_NAMES_TOLD && names.insert(evaluator.clone()) {
+                    self.events.send(Event::SameName(evaluator.clone())).ok();
+                }
+                JobReply::Wait { incarnation: self.incarnation, milliseconds: time.as_millis() as u64 }
+            }
+        }
+    }
+
+    /// Takes in how far an evaluator is.
+    pub fn progress(&self, progress: Progress) -> Result<(), Rejection> {
+        let (mut state, now) = (self.lock(), Instant::now());
+        state.scoreboard.progress(&progress, now)?;
+        state.evaluators.heard(progress, now)
+    }
+
+    /// An evaluator has connected.
+    pub fn joined(&self, evaluator: Name) -> Result<(), Rejection> {
+        self.lock().evaluators.joined(evaluator)
+    }
+
+    /// An evaluator has left: its job goes to others.
+    pub fn left(&self, evaluator: &Name) {
+        let mut state = self.lock();
+        let lost = state.scoreboard.evaluator_gone(evaluator, Instant::now());
+        state.evaluators.left(evaluator, lost.jobs);
+        self.lost(&state, lost);
+    }
+
+    /// What is new in a report, which changes nothing yet.
+    pub fn validate(&self, report: &ScoreReport) -> Result<Validated, Refusal> {
+        self.lock().scoreboard.validate(report)
+    }
+
+    /// Lets an evaluator keep its job whose scores have come but are not on the disk yet.
+    pub fn keep(&self, report: &ScoreReport) {
+        self.lock().scoreboard.keep(report, Instant::now());
+    }
+
+    /// Counts scores that are on the disk. Gives the acknowledgement.
+    pub fn record(&self, report: &ScoreReport, validated: &Validated) -> ScoreReply {
+        let Validated { new, duplicates } = validated;
+        let mut state = self.lock();
+        let recorded = state.scoreboard.record(report, new);
+        let evaluation = &self.metrics.evaluation;
+        evaluation.scores_recorded.inc_by(new.len() as u64);
+        evaluation.scores_duplicate.inc_by((*duplicates).into());
+        evaluation.jobs_completed.inc_by(recorded.jobs_completed as u64);
+        if let Some(scores) = recorded.evaluation_completed {
+            self.show(report.step, &scores);
+            self.events.send(Event::Evaluated { step: report.step, scores }).ok();
+        }
+        self.count(&state);
+        ScoreReply::Recorded { incarnation: self.incarnation, new: new.len() as u32, duplicates: *duplicates }
+    }
+
+    /// The answer to a report that is never accepted.
+    pub fn refused(&self, refusal: Refusal) -> ScoreReply {
+        ScoreReply::Refused { incarnation: self.incarnation, reason: refusal.to_string() }
+    }
+
+    /// Takes back jobs whose lease has run out, and forgets evaluators that are long gone; to be called several times a
+    /// second. Gives what people are to be told.
+    pub fn tick(&self) -> Vec<String> {
+        let (mut state, now) = (self.lock(), Instant::now());
+        let mut lines = state.evaluators.tick(now);
+        let expired = state.scoreboard.expire(now);
+        if expired.jobs > 0 {
+            lines.push(format!("{} jobs made no progress; they go to others", expired.jobs));
+        }
+        self.lost(&state, expired);
+        self.metrics.evaluation.episodes_missing.set(state.scoreboard.missing().len() as i64);
+        lines
+    }
+
+    /// An evaluator could not do a job, which is told once for each step.
+    fn failed(&self, state: &mut State, step: u64, evaluator: &Name, reason: &str) {
+        self.metrics.evaluation.jobs_failed.inc();
+        let reason: String = reason.chars().filter(|c| !c.is_control()).take(LONGEST_REASON).collect();
+        debug!(step, %evaluator, reason, "a job failed");
+        if state.failures_told.insert(step) {
+            self.events.send(Event::JobFailed { step, evaluator: evaluator.clone(), reason }).ok();
+        }
+    }
+
+    fn lost(&self, state: &State, lost: Lost) {
+        self.metrics.evaluation.jobs_expired.inc_by(lost.jobs as u64);
+        self.given_up(state, lost.given_up);
+    }
+
+    fn given_up(&self, state: &State, episodes: Vec<(u64, u64)>) {
+        for (step, seed) in &episodes {
+            warn!(step, seed, "an episode is given up: too many evaluators were lost with it or could not do it");
+        }
+        if !episodes.is_empty() {
+            self.events.send(Event::GivenUp(episodes)).ok();
+        }
+        self.count(state);
+    }
+
+    fn count(&self, state: &State) {
+        self.metrics.evaluation.episodes_pending.set(state.scoreboard.pending() as i64);
+    }
+
+    /// Lets the metrics show a complete evaluation, if it is the newest.
+    fn show(&self, step: u64, scores: &[EpisodeScore]) {
+        let evaluation = &self.metrics.evaluation;
+        if let Ok(step) = i64::try_from(step)
+            && step >= evaluation.step.get()
+        {
+            evaluation.score.set(scores.iter().map(|score| score.score).sum::<f64>() / scores.len() as f64);
+            evaluation.step.set(step);
+        }
+    }
+}

@@ -1,0 +1,150 @@
+//! Which evaluators are connected, when each last told its progress, and what people are told of that.
+
+use std::collections::{BTreeMap, BTreeSet};
+use std::mem;
+use std::time::{Duration, Instant};
+
+use quad_protocol::{Name, Progress};
+
+use super::metrics::EvaluatorMetrics;
+use super::rejection::Rejection;
+
+/// The metrics of an evaluator that has left are dropped this long after its last progress message.
+const FORGET_AFTER: Duration = Duration::from_secs(600);
+/// Most evaluators that the learner tracks: far above any real pool, to bound the memory that made-up names take.
+const MOST_EVALUATORS: usize = 1024;
+/// So many are told one by one in each period, the rest as a number at its end.
+const ONE_BY_ONE: usize = 20;
+const PERIOD: Duration = Duration::from_secs(10);
+
+/// Those that are connected, and those that were heard of not long ago.
+#[derive(Debug)]
+pub(super) struct Evaluators {
+    metrics: EvaluatorMetrics,
+    present: BTreeSet<Name>,
+    last_seen: BTreeMap<Name, Instant>,
+    news: News,
+}
+
+impl Evaluators {
+    pub fn new(metrics: EvaluatorMetrics, now: Instant) -> Self {
+        let news = News { since: now, told: 0, joined: 0, left: 0, lines: Vec::new() };
+        Self { metrics, present: BTreeSet::new(), last_seen: BTreeMap::new(), news }
+    }
+
+    /// How many are connected.
+    pub fn count(&self) -> usize {
+        self.present.len()
+    }
+
+    /// One is connected.
+    pub fn joined(&mut self, evaluator: Name) -> Result<(), Rejection> {
+        if self.present.len() >= MOST_EVALUATORS && !self.present.contains(&evaluator) {
+            return Err(Rejection::Crowd);
+        }
+        let line = format!("evaluator {evaluator} is here");
+        if self.present.insert(evaluator) && !self.news.tell(line) {
+            self.news.joined += 1;
+        }
+        self.metrics.present.set(self.present.len() as i64);
+        Ok(())
+    }
+
+    /// One has left; `jobs` of it were taken back.
+    pub fn left(&mut self, evaluator: &Name, jobs: usize) {
+        if !self.present.remove(evaluator) {
+            return;
+        }
+        self.metrics.present.set(self.present.len() as i64);
+        let line = match jobs {
+            0 => format!("evaluator {evaluator} has left"),
+            _ => format!("evaluator {evaluator} has left; its {jobs} unfinished jobs go to others"),
+        };
+        if !self.news.tell(line) {
+            self.news.left += 1;
+        }
+    }
+
+    /// One told its progress.
+    pub fn heard(&mut self, progress: Progress, now: Instant) -> Result<(), Rejection> {
+        if self.last_seen.len() >= MOST_EVALUATORS && !self.last_seen.contains_key(&progress.evaluator) {
+            return Err(Rejection::Crowd);
+        }
+        self.metrics.observe(&progress);
+        self.last_seen.insert(progress.evaluator, now);
+        Ok(())
+    }
+
+    /// Forgets those that are long gone. Gives what people are to be told since the last time.
+    pub fn tick(&mut self, now: Instant) -> Vec<String> {
+        let (present, metrics) = (&self.present, &self.metrics);
+        self.last_seen.retain(|evaluator, seen| {
+            let keep = present.contains(evaluator) || now.duration_since(*seen) < FORGET_AFTER;
+            if !keep {
+                metrics.forget(evaluator);
+            }
+            keep
+        });
+        self.news.take(now)
+    }
+}
+
+/// What is to be told: each of a few that come or go, and how many there were of many.
+#[derive(Debug)]
+struct News {
+    since: Instant,
+    told: usize,
+    joined: usize,
+    left: usize,
+    lines: Vec<String>,
+}
+
+impl News {
+    /// Whether it may be told by itself.
+    fn tell(&mut self, line: String) -> bool {
+        self.told += 1;
+        let may = self.told <= ONE_BY_ONE;
+        if may {
+            self.lines.push(line);
+        }
+        may
+    }
+
+    fn take(&mut self, now: Instant) -> Vec<String> {
+        if now.duration_since(self.since) >= PERIOD {
+            if self.joined + self.left > 0 {
+                self.lines.push(format!("{} more evaluators came and {} left", self.joined, self.left));
+            }
+            (self.since, self.told, self.joined, self.left) = (now, 0, 0, 0);
+        }
+        mem::take(&mut self.lines)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::service::metrics::Metrics;
+
+    fn name(number: usize) -> Name {
+        Name::new(format!("e-{number}")).unwrap()
+    }
+
+    #[test]
+    fn many_that_come_and_go_are_told_in_one_line_and_bounded() {
+        let (metrics, _) = Metrics::new(&Name::new("run").unwrap(), 1, &[]).unwrap();
+        let now = Instant::now();
+        let mut evaluators = Evaluators::new(metrics.evaluators, now);
+        for number in 0..2 * MOST_EVALUATORS {
+            assert_eq!(evaluators.joined(name(number)).is_ok(), number < MOST_EVALUATORS);
+        }
+        for number in 0..2 * MOST_EVALUATORS {
+            evaluators.left(&name(number), 0);
+        }
+        assert_eq!(evaluators.tick(now).len(), ONE_BY_ONE, "the period is not over");
+        let more = format!("{} more evaluators came and {MOST_EVALUATORS} left", MOST_EVALUATORS - ONE_BY_ONE);
+        assert_eq!(evaluators.tick(now + PERIOD), [more]);
+        evaluators.joined(name(7)).unwrap();
+        assert_eq!(evaluators.tick(now + PERIOD), ["evaluator e-7 is here"], "a new period");
+    }
+}

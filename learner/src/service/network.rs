@@ -1,0 +1,78 @@
+//! How a run gets online: the session is opened while training begins, and everything is declared on it.
+
+use std::time::Duration;
+
+use quad_service::{Endpoints, SessionError};
+use tokio::task::JoinHandle;
+use tokio::time::timeout;
+use tracing::warn;
+use zenoh::Session;
+
+use super::duplicate::Life;
+use super::services::Services;
+use super::snapshots::RETRY;
+use super::wire::Wire;
+use crate::run::{RunDir, RunEndpoints};
+
+/// Listening takes milliseconds. A session that takes longer waits for a router; training starts without it.
+const SESSION_PATIENCE: Duration = Duration::from_secs(1);
+
+/// A Zenoh session that may still wait for a router.
+pub(crate) enum Opening {
+    Open(Session),
+    Waits(JoinHandle<Result<Session, SessionError>>),
+}
+
+/// Starts to open the session. What cannot work, like listening at a port in use, is an error at once.
+pub(crate) async fn open_network(endpoints: &Endpoints) -> anyhow::Result<Opening> {
+    let endpoints = endpoints.clone();
+    let mut opening = tokio::spawn(async move { quad_service::open_session(&endpoints).await });
+    match timeout(SESSION_PATIENCE, &mut opening).await {
+        Ok(session) => Ok(Opening::Open(session??)),
+        Err(_) => Ok(Opening::Waits(opening)),
+    }
+}
+
+/// A run that evaluators can find.
+pub(super) struct Online {
+    pub wire: Wire,
+    /// Where they find it.
+    pub reachable_at: Vec<String>,
+}
+
+/// Declares the run as soon as the session is open, and says in its folder where it is. It is to run as a task of its own:
+/// to be sure that there is no other learner of the name takes seconds, and Zenoh may keep a task waiting.
+pub(super) async fn go_online(
+    opening: Opening,
+    endpoints: Endpoints,
+    life: Life,
+    services: Services,
+    run_dir: RunDir,
+    metrics_address: String,
+) -> anyhow::Result<Online> {
+    let session = match opening {
+        Opening::Open(session) => session,
+        Opening::Waits(opening) => opening.await??,
+    };
+    let reachable_at = quad_service::reachable_at(&session, &endpoints).await?;
+    let wire = Wire::declare(session, &life, &services).await?;
+    tokio::spawn(write_endpoints(run_dir, RunEndpoints { zenoh: reachable_at.clone(), metrics: metrics_address }));
+    Ok(Online { wire, reachable_at })
+}
+
+/// Writes where the learner can be reached, as soon as the disk takes it. Nothing but the user's scripts needs it.
+async fn write_endpoints(run_dir: RunDir, endpoints: RunEndpoints) {
+    let mut said = false;
+    loop {
+        let (run_dir, endpoints) = (run_dir.clone(), endpoints.clone());
+        match tokio::task::spawn_blocking(move || run_dir.write_endpoints(&endpoints)).await {
+            Ok(Err(error)) if !said => {
+                said = true;
+                warn!("{:#}; it is tried again until the disk takes it", anyhow::Error::from(error));
+            }
+            Ok(Err(_)) => {}
+            Ok(Ok(())) | Err(_) => return,
+        }
+        tokio::time::sleep(RETRY).await;
+    }
+}

@@ -1,0 +1,103 @@
+//! A query that came in over Zenoh, until it is answered.
+
+use std::mem;
+
+use quad_protocol::{Message, decode, encode};
+use tracing::debug;
+use zenoh::Wait;
+use zenoh::bytes::ZBytes;
+use zenoh::query::Query;
+
+use super::metrics::Metrics;
+use super::rejection::Rejection;
+
+/// Largest message to the learner, bytes; a score report of the largest job is 1.4 KB. A learner that listens hears of none
+/// that Zenoh sends in several pieces, which begins at 32,700 bytes at the earliest.
+const MOST_BYTES: usize = 30 * 1024;
+
+/// A query and the message that came with it.
+pub(super) struct Request {
+    query: Query,
+    payload: ZBytes,
+}
+
+impl Request {
+    /// Keeps nothing of a query that is larger than a message may be.
+    pub fn new(mut query: Query) -> Self {
+        drop(query.attachment_mut().map(mem::take));
+        let payload = query.payload_mut().map(mem::take).unwrap_or_default();
+        Self { query, payload }
+    }
+
+    /// What it asks for.
+    pub fn key(&self) -> &str {
+        self.query.key_expr().as_str()
+    }
+
+    /// What came with it; it is not kept.
+    pub fn message<M: Message>(&mut self) -> Result<M, Rejection> {
+        read(&mem::take(&mut self.payload))
+    }
+
+    /// Answers it.
+    pub fn reply<M: Message>(self, message: &M) {
+        match encode(message) {
+            Ok(bytes) => self.send(bytes.into()),
+            Err(error) => self.send_error(&error.to_string()),
+        }
+    }
+
+    /// Answers it with what is encoded already.
+    pub fn send(self, bytes: ZBytes) {
+        let key = self.query.key_expr().clone();
+        if let Err(error) = self.query.reply(key, bytes).wait() {
+            debug!(%error, "an answer could not be sent");
+        }
+    }
+
+    /// Counts it as not accepted, and says why.
+    pub fn reject(self, rejection: &Rejection, metrics: &Metrics) {
+        debug!(%rejection, "a message was not accepted");
+        metrics.reject(rejection.label());
+        self.send_error(&rejection.to_string());
+    }
+
+    fn send_error(self, text: &str) {
+        if let Err(error) = self.query.reply_err(text).wait() {
+            debug!(%error, "an error could not be sent");
+        }
+    }
+}
+
+/// The message in a payload.
+pub(super) fn read<M: Message>(payload: &ZBytes) -> Result<M, Rejection> {
+    match payload.len() {
+        0 => Err(Rejection::Empty),
+        1..=MOST_BYTES => Ok(decode(&payload.to_bytes())?),
+        _ => Err(Rejection::Oversized),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use quad_protocol::{EpisodeScore, Hash, Name, ScoreReport};
+
+    use super::*;
+
+    #[test]
+    fn an_honest_message_is_far_from_too_large() {
+        let longest = Name::new("n".repeat(Name::MAX_LENGTH)).unwrap();
+        let episode = EpisodeScore { seed: 1, episode_return: 1.0, length: 1, score: 1.0 };
+        let report = ScoreReport {
+            evaluator: longest.clone(),
+            run: longest.clone(),
+            incarnation: 1,
+            job: 1,
+            step: 1,
+            weights: Hash::of(b"weights"),
+            precision: longest,
+            episodes: vec![episode; 256], // more than an evaluator would do
+        };
+        assert!(encode(&report).unwrap().len() < MOST_BYTES / 2);
+    }
+}

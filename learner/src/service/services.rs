@@ -1,0 +1,111 @@
+//! What becomes of each kind of message: which thread answers it.
+
+use std::sync::mpsc::{Receiver, SyncSender, sync_channel};
+
+use quad_protocol::{JobRequest, Progress, ScoreReport, keys};
+use tracing::debug;
+use zenoh::sample::{Sample, SampleKind};
+
+use super::coordinator::Coordinator;
+use super::events::Events;
+use super::metrics::Metrics;
+use super::pool::Pool;
+use super::rejection::Rejection;
+use super::requests::{Request, read};
+use super::scores::Delivery;
+use super::weights::Weights;
+
+/// Threads that answer claims, and queries that may wait for them. Evaluators ask again if there is no room.
+const ANSWER_THREADS: usize = 4;
+/// Threads that answer with weights: megabytes, which may have to be read from a disk that hangs.
+const WEIGHTS_THREADS: usize = 4;
+const MOST_WAITING: usize = 1024;
+
+/// What answers queries.
+#[derive(Clone)]
+pub(super) struct Services {
+    pub coordinator: Coordinator,
+    pub weights: Weights,
+    /// Reaches the thread `scores`.
+    pub deliveries: SyncSender<Delivery>,
+    pub answers: Pool,
+    pub weights_answers: Pool,
+    pub metrics: Metrics,
+    pub events: Events,
+}
+
+impl Services {
+    /// Starts the threads that answer. What is to go to the thread `scores` comes out of the queue.
+    pub fn start(
+        coordinator: Coordinator,
+        weights: Weights,
+        metrics: Metrics,
+        events: Events,
+    ) -> std::io::Result<(Self, Receiver<Delivery>)> {
+        let (deliveries, waiting) = sync_channel(MOST_WAITING);
+        let answers = Pool::start("answers", ANSWER_THREADS, MOST_WAITING, &events)?;
+        let weights_answers = Pool::start("weights", WEIGHTS_THREADS, MOST_WAITING, &events)?;
+        Ok((Self { coordinator, weights, deliveries, answers, weights_answers, metrics, events }, waiting))
+    }
+
+    pub fn job(&self, mut request: Request) {
+        let (coordinator, metrics) = (self.coordinator.clone(), self.metrics.clone());
+        let answer = move || match request.message::<JobRequest>() {
+            Ok(message) => request.reply(&coordinator.job(&message)),
+            Err(rejection) => request.reject(&rejection, &metrics),
+        };
+        self.count_busy(self.answers.give(answer));
+    }
+
+    pub fn report(&self, mut request: Request) {
+        let accepted = match request.message::<ScoreReport>() {
+            Ok(report) => {
+                // Until its scores are on the disk.
+                self.coordinator.keep(&report);
+                self.deliveries.try_send(Some((request, report))).is_ok()
+            }
+            Err(rejection) => {
+                let metrics = self.metrics.clone();
+                self.answers.give(move || request.reject(&rejection, &metrics))
+            }
+        };
+        self.count_busy(accepted);
+    }
+
+    pub fn weights(&self, request: Request) {
+        let (weights, metrics) = (self.weights.clone(), self.metrics.clone());
+        let answer =
+            move || match keys::step_of(request.key()).ok_or(Rejection::NoSnapshot).and_then(|of| weights.of(of)) {
+                Ok(bytes) => request.send(bytes),
+                Err(rejection) => request.reject(&rejection, &metrics),
+            };
+        self.count_busy(self.weights_answers.give(answer));
+    }
+
+    /// Without an answer the evaluator asks again.
+    fn count_busy(&self, accepted: bool) {
+        if !accepted {
+            self.metrics.reject("busy");
+        }
+    }
+
+    pub fn progress(&self, sample: &Sample) {
+        let progress = read::<Progress>(sample.payload());
+        self.take_in(progress.and_then(|progress| self.coordinator.progress(progress)));
+    }
+
+    pub fn evaluator(&self, token: &Sample) {
+        let Some(evaluator) = keys::evaluator_of(token.key_expr().as_str()) else { return };
+        match token.kind() {
+            SampleKind::Put => self.take_in(self.coordinator.joined(evaluator)),
+            SampleKind::Delete => self.coordinator.left(&evaluator),
+        }
+    }
+
+    fn take_in(&self, result: Result<(), Rejection>) {
+        if let Err(rejection) = result {
+            debug!(%rejection, "a message was not accepted");
+            self.metrics.reject(rejection.label());
+        }
+    }
+}

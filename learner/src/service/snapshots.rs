@@ -1,0 +1,119 @@
+//! The thread `snapshots`: writes what training makes to the disk, publishes the snapshots that are to be evaluated, and opens
+//! their evaluations, in this order.
+
+use std::collections::BTreeMap;
+use std::time::{Duration, SystemTime, UNIX_EPOCH};
+
+use quad_protocol::{Hash, Origin};
+use quad_service::{Beat, hinted, stay_in_background};
+use tracing::debug;
+
+use super::disk::DiskStatus;
+use super::events::{Event, Events};
+use super::metrics::Metrics;
+use super::weights::Weights;
+use crate::evaluation::OtherWeights;
+use crate::run::{Checkpoint, Log, RunDir, RunDirError};
+use crate::train::{Outbox, TrainedPolicy, Work};
+
+/// How long the disk is left alone after it has refused something.
+pub(super) const RETRY: Duration = Duration::from_secs(2);
+
+/// State of the thread.
+pub(super) struct Snapshots {
+    pub outbox: Outbox,
+    /// What snapshots say of their origin; the step is set for each.
+    pub origin: Origin,
+    pub run_dir: RunDir,
+    /// `metrics.jsonl`.
+    pub rows: Log,
+    pub weights: Weights,
+    pub metrics: Metrics,
+    pub events: Events,
+    /// Snapshots of an earlier life, by step: training may come by them again.
+    pub known: BTreeMap<u64, Hash>,
+    pub disk: DiskStatus,
+}
+
+impl Snapshots {
+    /// The thread's work, until the outbox is closed and empty. What the disk refuses is tried again until it is taken.
+    pub fn run(mut self, beat: &Beat) -> anyhow::Result<()> {
+        stay_in_background();
+        while let Some(work) = self.outbox.next(beat) {
+            match self.carry_out(&work) {
+                Ok(()) => {
+                    self.disk.well(beat);
+                    self.outbox.done(&work);
+                }
+                Err(error) if matches!(error.downcast_ref(), Some(RunDirError::Io { .. })) => {
+                    self.disk.refused(beat, &format!("{error:#}"));
+                    self.outbox.put_back(work);
+                    std::thread::sleep(RETRY);
+                }
+                Err(error) => return Err(with_hint(error)),
+            }
+        }
+        Ok(())
+    }
+
+    fn carry_out(&mut self, work: &Work) -> anyhow::Result<()> {
+        match work {
+            Work::Snapshot(policy) => self.snapshot(policy),
+            Work::Checkpoint(checkpoint) => self.checkpoint(checkpoint),
+            Work::Rows(rows) => Ok(self.rows.append(rows)?),
+            Work::Ended(outcome) => {
+                self.events.send(Event::TrainingEnded(*outcome)).ok();
+                Ok(())
+            }
+        }
+    }
+
+    /// Writes a snapshot; only then is its evaluation opened and the snapshot published.
+    fn snapshot(&mut self, trained: &TrainedPolicy) -> anyhow::Result<()> {
+        let TrainedPolicy { step, policy, evaluate } = trained;
+        let tensors = Origin { step: *step, ..self.origin.clone() }.attach(&policy.bytes)?;
+        let hash = Hash::of(&tensors);
+        self.metrics.evaluation.snapshot_bytes.set(tensors.len() as i64);
+        match self.known.get(step) {
+            None => self.run_dir.write_snapshot(*step, &tensors)?,
+            Some(known) if *known == hash => {}
+            // It has scores already: neither overwritten nor published.
+            Some(known) => {
+                return Err(OtherWeights { step: *step, found: hash, scored: known.to_string() }.into());
+            }
+        }
+        if *evaluate {
+            self.weights.publish(*step, policy.kind, hash, tensors)?;
+            self.metrics.evaluation.snapshots_published.inc();
+            self.events.send(Event::Published { step: *step }).ok();
+        }
+        Ok(())
+    }
+
+    fn checkpoint(&self, checkpoint: &Checkpoint) -> anyhow::Result<()> {
+        self.run_dir.write_checkpoint(checkpoint)?;
+        let Checkpoint { step, state } = checkpoint;
+        debug!(step, bytes = state.len(), "checkpoint");
+        let disk = &self.metrics.disk;
+        disk.checkpoint_step.set(i64::try_from(*step).unwrap_or(i64::MAX));
+        disk.checkpoint_bytes.set(state.len() as i64);
+        let now = SystemTime::now().duration_since(UNIX_EPOCH).unwrap_or_default();
+        disk.checkpoint_timestamp.set(now.as_secs_f64());
+        Ok(())
+    }
+}
+
+/// With what to do about it.
+fn with_hint(error: anyhow::Error) -> anyhow::Error {
+    if let Some(hint) = error.downcast_ref().map(RunDirError::hint) {
+        return hinted(error, hint);
+    }
+    match error.is::<OtherWeights>() {
+        true => hinted(
+            error,
+            "another kind of processor, another number of threads or another version computes other bits: go on where the \
+             run was before, or begin anew with --fresh",
+        ),
+        false => error,
+    }
+}

@@ -1,0 +1,152 @@
+//! The threads of a run, started together and ended in order.
+
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::thread::JoinHandle;
+use std::time::Duration;
+
+use quad_dataset::{Task, Transitions};
+use quad_protocol::Origin;
+use quad_service::Health;
+
+use super::coordinator::{Coordinator, EvaluationPlan};
+use super::disk::DiskStatus;
+use super::duplicate::Life;
+use super::events::{Events, Saved};
+use super::metrics::Metrics;
+use super::scores::Scores;
+use super::services::Services;
+use super::snapshots::Snapshots;
+use super::spawn::spawn_alive;
+use super::weights::Weights;
+use crate::config::RunConfig;
+use crate::evaluation::Rules;
+use crate::run::{Log, Past, RunDir};
+use crate::train::{Outbox, Training};
+
+/// Most episodes in one job: two evaluators share an evaluation of ten. And most if hundreds wait.
+const JOB_EPISODES: [usize; 2] = [5, 40];
+/// An evaluator tells its progress three times meanwhile or more often, and Zenoh notices a lost one after about 5 s.
+const LEASE: Duration = Duration::from_secs(15);
+/// A thread that answers others, or writes to the disk, is stuck if it has said nothing for so long.
+pub(crate) const STUCK: Duration = Duration::from_secs(30);
+/// So is training, whose slowest steps take seconds.
+const TRAINING_STUCK: Duration = Duration::from_secs(300);
+
+/// What a run is, and how far it is.
+pub(crate) struct Run<'a> {
+    pub life: Life,
+    pub config: &'a RunConfig,
+    /// Its folder.
+    pub dir: &'a RunDir,
+    /// Its scores, to be appended to.
+    pub scores: Log,
+    /// What earlier learners have reached.
+    pub past: Past,
+    /// Least time between two checkpoints.
+    pub checkpoint_every: Duration,
+}
+
+/// The running threads.
+pub(crate) struct Threads {
+    pub(super) services: Services,
+    outbox: Outbox,
+    stop: Arc<AtomicBool>,
+    training: JoinHandle<()>,
+    snapshots: JoinHandle<()>,
+    scores: JoinHandle<()>,
+}
+
+impl Threads {
+    /// Starts them all.
+    pub fn start(
+        run: Run<'_>,
+        transitions: Transitions,
+        metrics: &Metrics,
+        health: &Health,
+        events: &Events,
+    ) -> anyhow::Result<Self> {
+        let Run { life, config, dir, scores, past, checkpoint_every } = run;
+        let Past { checkpoint, snapshots: known, scores: earlier } = past;
+        let experiment = &config.experiment;
+        let task = Task::new(&experiment.environment, transitions.observation_dim(), transitions.action_dim());
+        let rules = Rules {
+            run: life.run.clone(),
+            incarnation: life.incarnation,
+            task: task.clone(),
+            instance: experiment.seed,
+            candidates: experiment.candidates,
+            job_episodes: JOB_EPISODES,
+            lease: LEASE,
+        };
+        let origin = Origin {
+            environment: task.environment.clone(),
+            seed: experiment.seed,
+            step: 0,
+            episodes: experiment.episodes,
+            candidates: experiment.candidates,
+        };
+        let plan = EvaluationPlan { seed: experiment.seed, episodes: experiment.episodes };
+        let coordinator = Coordinator::new(rules, plan, earlier, metrics.clone(), events.clone());
+        for (&step, &hash) in &known {
+            coordinator.open(step, hash)?;
+        }
+        let weights = Weights::new(life.run, life.incarnation, task, dir.clone(), coordinator.clone());
+        let (services, deliveries) =
+            Services::start(coordinator.clone(), weights.clone(), metrics.clone(), events.clone())?;
+
+        let disk = |what| DiskStatus::new(what, &metrics.disk, events.clone());
+        let scores =
+            Scores { log: scores, deliveries, coordinator, metrics: metrics.clone(), disk: disk(Saved::Scores) };
+        let scores = spawn_alive("scores", events, health.part("scores", STUCK), move |beat| scores.run(beat))?;
+
+        let step = checkpoint.as_ref().map_or(0, |checkpoint| checkpoint.step);
+        metrics.training.gradient_steps.inc_by(step);
+        let (rows, seconds_before) = dir.metrics_log(step)?;
+        let outbox = Outbox::default();
+        let snapshots = Snapshots {
+            outbox: outbox.clone(),
+            origin,
+            run_dir: dir.clone(),
+            rows,
+            weights,
+            metrics: metrics.clone(),
+            events: events.clone(),
+            known,
+            disk: disk(Saved::Run),
+        };
+        let snapshots =
+            spawn_alive("snapshots", events, health.part("snapshots", STUCK), move |beat| snapshots.run(beat))?;
+
+        let stop = Arc::new(AtomicBool::new(false));
+        let training = Training {
+            experiment: experiment.clone(),
+            device: config.run.device,
+            transitions,
+            checkpoint,
+            checkpoint_every,
+            seconds_before,
+            metrics: metrics.training.clone(),
+            outbox: outbox.clone(),
+            stop: stop.clone(),
+        };
+        let training =
+            spawn_alive("training", events, health.part("training", TRAINING_STUCK), move |beat| training.run(beat))?;
+        Ok(Self { services, outbox, stop, training, snapshots, scores })
+    }
+
+    /// Asks training to end after its current step.
+    pub fn stop_training(&self) {
+        self.stop.store(true, Ordering::Relaxed);
+    }
+
+    /// Ends them: what was handed over is on disk afterwards. A thread that failed has told the main loop so.
+    pub fn join(self) {
+        self.stop_training();
+        self.training.join().ok();
+        self.outbox.close();
+        self.snapshots.join().ok();
+        self.services.deliveries.send(None).ok();
+        self.scores.join().ok();
+    }
+}

@@ -1,0 +1,89 @@
+//! Snapshots on the wire: each is published once, and evaluators that have missed it can ask for it.
+
+use std::sync::{Arc, Mutex, OnceLock, PoisonError};
+
+use anyhow::Context;
+use quad_dataset::Task;
+use quad_policy::Description;
+use quad_protocol::{Hash, Name, Schema, Snapshot, encode, keys};
+use tracing::debug;
+use zenoh::bytes::ZBytes;
+use zenoh::qos::CongestionControl;
+use zenoh::{Session, Wait};
+
+use super::coordinator::Coordinator;
+use super::rejection::Rejection;
+use crate::run::RunDir;
+
+/// What all snapshots of a run have in common, and where they are. Clones share it.
+#[derive(Clone)]
+pub(super) struct Weights {
+    run: Name,
+    incarnation: u64,
+    /// The environment that the policies act in.
+    task: Task,
+    run_dir: RunDir,
+    coordinator: Coordinator,
+    /// There as soon as the learner is online.
+    session: Arc<OnceLock<Session>>,
+    /// The newest, by step, ready to be sent; older ones are read from the disk.
+    newest: Arc<Mutex<Option<(u64, ZBytes)>>>,
+}
+
+impl Weights {
+    pub fn new(run: Name, incarnation: u64, task: Task, run_dir: RunDir, coordinator: Coordinator) -> Self {
+        Self { run, incarnation, task, run_dir, coordinator, session: Arc::default(), newest: Arc::default() }
+    }
+
+    /// From now on snapshots are published.
+    pub fn online(&self, session: &Session) {
+        self.session.set(session.clone()).ok();
+    }
+
+    /// Opens the evaluation of a snapshot that is on the disk, and publishes it.
+    ///
+    /// # Errors
+    /// It is too large to be sent, or the step is known with other weights.
+    pub fn publish(&self, step: u64, kind: &str, hash: Hash, tensors: Vec<u8>) -> anyhow::Result<()> {
+        let bytes = self.message(step, kind, hash, tensors)?;
+        *self.newest.lock().unwrap_or_else(PoisonError::into_inner) = Some((step, bytes.clone()));
+        // The jobs must exist first: evaluators ask for one as soon as the snapshot arrives.
+        self.coordinator.open(step, hash)?;
+        if let Some(session) = self.session.get() {
+            // An evaluator that does not read loses the snapshot instead of delaying the others. It asks when it gets a job.
+            let put = session.put(keys::weights(&self.run), bytes).congestion_control(CongestionControl::Drop);
+            if let Err(error) = put.wait() {
+                debug!(%error, step, "the snapshot could not be published");
+            }
+        }
+        Ok(())
+    }
+
+    /// The snapshot of a step, for an evaluator that asks.
+    pub fn of(&self, step: u64) -> Result<ZBytes, Rejection> {
+        let newest = self.newest.lock().unwrap_or_else(PoisonError::into_inner).clone();
+        if let Some((_, bytes)) = newest.filter(|(newest, _)| *newest == step) {
+            return Ok(bytes);
+        }
+        let hash = self.coordinator.weights(step).ok_or(Rejection::NoSnapshot)?;
+        self.read(step, hash).map_err(Rejection::Unreadable)
+    }
+
+    fn read(&self, step: u64, hash: Hash) -> anyhow::Result<ZBytes> {
+        let tensors = self.run_dir.read_snapshot(step)?;
+        anyhow::ensure!(Hash::of(&tensors) == hash, "the file was changed");
+        let kind = Description::read(&tensors)?.kind();
+        self.message(step, kind, hash, tensors)
+    }
+
+    fn message(&self, step: u64, kind: &str, hash: Hash, tensors: Vec<u8>) -> anyhow::Result<ZBytes> {
+        let schema = Schema {
+            environment: self.task.environment.clone(),
+            observation_dim: self.task.observation_dim as u32,
+            action_dim: self.task.action_dim as u32,
+            policy: kind.to_owned(),
+        };
+        let snapshot = Snapshot { run: self.run.clone(), incarnation: self.incarnation, step, schema, hash, tensors };
+        Ok(encode(&snapshot).context("the snapshot cannot be sent to evaluators")?.into())
+    }
+}

@@ -1,0 +1,137 @@
+//! An algorithm at work in a run: counts its updates, hands over its policy, and saves and loads its whole state.
+
+use super::pool::run_awake;
+use crate::algorithms::{Algorithm, AlgorithmError, Definition, Metric, Minibatch};
+use candle_core::Device;
+use quad_dataset::Batch;
+use quad_policy::{PolicyError, check_finite, read_tensors};
+use safetensors::SafeTensors;
+use serde::{Deserialize, Serialize};
+use std::collections::HashMap;
+
+/// Key of the counters in the metadata of a saved state.
+const COUNTERS: &str = "state";
+
+/// An algorithm, where it runs, and how far it is.
+pub struct Agent {
+    definition: Definition,
+    algorithm: Box<dyn Algorithm>,
+    device: Device,
+    /// Updates done.
+    step: u64,
+}
+
+/// What a saved state holds beside its tensors.
+#[derive(Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+struct Counters {
+    algorithm: String,
+    step: u64,
+}
+
+/// A policy as a file.
+#[derive(Debug)]
+pub struct PolicyFile {
+    /// What kind of policy it is, e.g. `diffusion`.
+    pub kind: &'static str,
+    /// A safetensors file that says so, too, and which shapes its networks have.
+    pub bytes: Vec<u8>,
+}
+
+/// A saved state that cannot be gone on from.
+#[derive(Debug, thiserror::Error)]
+pub enum StateError {
+    /// Not a state of this learner's.
+    #[error("this is not a state that a learner has saved: {0}")]
+    Content(String),
+    /// Of another algorithm.
+    #[error("the state is of the algorithm {found}, this run is of {expected}")]
+    Algorithm {
+        /// The state's.
+        found: String,
+        /// The run's.
+        expected: &'static str,
+    },
+    /// Its tensors are not the algorithm's.
+    #[error(transparent)]
+    Policy(#[from] PolicyError),
+}
+
+impl Agent {
+    /// At step 0.
+    pub fn new(definition: Definition, algorithm: Box<dyn Algorithm>, device: Device) -> Self {
+        Self { definition, algorithm, device, step: 0 }
+    }
+
+    /// What an update measures.
+    pub fn metrics(&self) -> &'static [Metric] {
+        self.definition.metrics
+    }
+
+    /// Updates done.
+    pub fn step(&self) -> u64 {
+        self.step
+    }
+
+    /// One update. Gives the values of the metrics, in their order.
+    ///
+    /// # Errors
+    /// The batch does not fit the networks, or candle fails.
+    pub fn update(&mut self, batch: &Batch) -> Result<Vec<f32>, AlgorithmError> {
+        let batch = Minibatch::new(batch, &self.device)?;
+        let (algorithm, step) = (&mut self.algorithm, self.step);
+        let values = match self.device.is_cpu() {
+            true => run_awake(|| algorithm.update(step, &batch))?,
+            false => algorithm.update(step, &batch)?,
+        };
+        self.step += 1;
+        Ok(values)
+    }
+
+    /// The policy as it is now.
+    ///
+    /// # Errors
+    /// A weight that is not finite.
+    pub fn policy(&self) -> Result<PolicyFile, AlgorithmError> {
+        let (description, tensors) = self.algorithm.policy()?;
+        Ok(PolicyFile { kind: description.kind(), bytes: description.to_safetensors(&tensors)? })
+    }
+
+    /// Everything that decides the future of the run, as one safetensors file: the same bytes for the same state.
+    ///
+    /// # Errors
+    /// A number that is not finite: a state with no future.
+    pub fn save(&self) -> Result<Vec<u8>, AlgorithmError> {
+        let mut tensors = self.algorithm.state()?;
+        for (name, tensor) in &mut tensors {
+            check_finite(name, tensor)?;
+            *tensor = tensor.to_device(&Device::Cpu)?;
+        }
+        let counters = Counters { algorithm: self.definition.name.to_owned(), step: self.step };
+        let counters = serde_json::to_string(&counters).map_err(PolicyError::from)?;
+        let metadata = HashMap::from([(COUNTERS.to_owned(), counters)]);
+        Ok(safetensors::serialize(tensors, Some(metadata)).map_err(PolicyError::from)?)
+    }
+
+    /// Goes on from a saved state, bit for bit, if the run's configuration is the same.
+    ///
+    /// # Errors
+    /// A file that is not the whole state of this algorithm; the agent is not to be used then.
+    pub fn load(&mut self, bytes: &[u8]) -> Result<(), StateError> {
+        let (_, metadata) = SafeTensors::read_metadata(bytes).map_err(PolicyError::from)?;
+        let counters = metadata.metadata().as_ref().and_then(|metadata| metadata.get(COUNTERS));
+        let counters = counters.ok_or_else(|| StateError::Content("it has no counters".to_owned()))?;
+        let counters: Counters =
+            serde_json::from_str(counters).map_err(|error| StateError::Content(error.to_string()))?;
+        if counters.algorithm != self.definition.name {
+            return Err(StateError::Algorithm { found: counters.algorithm, expected: self.definition.name });
+        }
+        let mut tensors = read_tensors(bytes)?;
+        self.algorithm.load(&mut tensors)?;
+        if let Some(name) = tensors.into_keys().next() {
+            return Err(PolicyError::Unexpected(name).into());
+        }
+        self.step = counters.step;
+        Ok(())
+    }
+}

@@ -1,0 +1,23 @@
+//! Gradient steps. This room owns the algorithm while it trains, and the batches.
+//!
+//! All of it runs on the thread `training` (with rayon's pool for the arithmetic), which never waits for a network or a
+//! metric, and for the disk only when far too much waits for it: what it makes goes into the [`Outbox`], from which the
+//! thread `snapshots` takes it. The room `service` starts it.
+//!
+//! In reading order: `training` (the thread's work), `steps` (the loop), `agent` (an algorithm at work, saved and loaded),
+//! `device` (where it computes), `pool` (rayon's threads kept awake), `outbox`, `metrics`.
+
+pub mod agent;
+mod device;
+mod metrics;
+mod outbox;
+mod pool;
+mod steps;
+#[cfg(test)]
+mod tests;
+mod training;
+
+pub(crate) use metrics::{Registrar, TrainingMetrics};
+pub(crate) use outbox::{Outbox, TrainedPolicy, Work};
+pub(crate) use steps::Outcome;
+pub(crate) use training::Training;

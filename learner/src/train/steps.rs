@@ -1,0 +1,211 @@
+//! The loop of gradient steps: samples a batch, updates the agent, again and again.
+
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::time::{Duration, Instant};
+
+use quad_dataset::{Batch, BatchSampler, Transitions};
+use quad_policy::PolicyError;
+use quad_service::Beat;
+use serde::ser::SerializeMap;
+use serde::{Serialize, Serializer};
+use tracing::debug;
+
+use super::agent::Agent;
+use super::metrics::TrainingMetrics;
+use super::outbox::{Outbox, TrainedPolicy};
+use crate::algorithms::{AlgorithmError, Metric};
+use crate::config::Schedule;
+use crate::run::Checkpoint;
+
+/// Gradient steps that a line of `metrics.jsonl` averages over.
+const STEPS_PER_ROW: u64 = 100;
+/// Least time of training that is spent between two checkpoints for each second that one takes: saving costs at most 1 %.
+const TRAINING_PER_SAVING: u32 = 100;
+
+/// What is to be done.
+#[derive(Clone, Copy, Debug)]
+pub(crate) struct Plan {
+    /// How many gradient steps, and which are evaluated.
+    pub schedule: Schedule,
+    /// Least time between two checkpoints.
+    pub checkpoint_every: Duration,
+    /// Seconds of training in earlier lives of the run.
+    pub seconds_before: f64,
+}
+
+/// Where the results go, and who ends the loop early.
+pub(crate) struct Outlets<'a> {
+    /// Gauges that the metrics page and the progress display read.
+    pub metrics: &'a TrainingMetrics,
+    /// Takes rows, snapshots and checkpoints.
+    pub outbox: &'a Outbox,
+    /// Set by the main loop to end training early.
+    pub stop: &'a AtomicBool,
+    /// Told after every step.
+    pub beat: &'a Beat,
+}
+
+/// A line of `metrics.jsonl`: means over the gradient steps since the line before.
+#[derive(Clone, Debug)]
+pub(crate) struct Row {
+    /// Gradient steps done.
+    pub step: u64,
+    /// Since training began.
+    pub seconds: f64,
+    /// What was measured.
+    pub metrics: &'static [Metric],
+    /// The means, in the order of `metrics`.
+    pub values: Vec<f32>,
+}
+
+impl Serialize for Row {
+    fn serialize<S: Serializer>(&self, serializer: S) -> Result<S::Ok, S::Error> {
+        let mut map = serializer.serialize_map(Some(2 + self.values.len()))?;
+        map.serialize_entry("step", &self.step)?;
+        map.serialize_entry("seconds", &self.seconds)?;
+        for (metric, value) in self.metrics.iter().zip(&self.values) {
+            map.serialize_entry(metric.name, value)?;
+        }
+        map.end()
+    }
+}
+
+/// How training ended well.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(crate) enum Outcome {
+    /// All steps are done.
+    Completed,
+    /// It was stopped after this many.
+    Stopped {
+        /// Gradient steps done.
+        step: u64,
+    },
+}
+
+/// Why training cannot go on.
+#[derive(Debug, thiserror::Error)]
+pub(crate) enum TrainError {
+    /// Something is not a number any more.
+    #[error("training diverged: at gradient step {step} {what}")]
+    Diverged {
+        /// The step.
+        step: u64,
+        /// The metric and its value, or the tensor.
+        what: String,
+    },
+    /// The update failed.
+    #[error("gradient step {step} failed")]
+    Update {
+        /// The step.
+        step: u64,
+        /// Why.
+        source: AlgorithmError,
+    },
+}
+
+impl TrainError {
+    fn at(step: u64, source: AlgorithmError) -> Self {
+        match source {
+            AlgorithmError::Policy(error @ PolicyError::NotFinite(_)) => {
+                Self::Diverged { step, what: error.to_string() }
+            }
+            source => Self::Update { step, source },
+        }
+    }
+}
+
+/// Trains until all steps are done or it is told to stop. Either way a checkpoint of the last step is handed over.
+pub(crate) fn train(
+    agent: &mut Agent,
+    transitions: &Transitions,
+    sampler: &mut BatchSampler,
+    plan: Plan,
+    outlets: &Outlets<'_>,
+) -> Result<Outcome, TrainError> {
+    let start = Instant::now();
+    let mut batch = Batch::default();
+    let mut mean = RowMean::new(agent.metrics());
+    let mut next_checkpoint = start + plan.checkpoint_every;
+    while agent.step() < plan.schedule.steps {
+        let begin = Instant::now();
+        let step = agent.step() + 1;
+        sampler.next(transitions, &mut batch);
+        let values = agent.update(&batch).map_err(|source| TrainError::at(step, source))?;
+        check_finite(step, agent.metrics(), &values)?;
+        let updated = Instant::now();
+        outlets.beat.alive();
+        outlets.metrics.observe(&values, updated - begin);
+        mean.add(&values);
+
+        let last = step == plan.schedule.steps;
+        let stopped = !last && outlets.stop.load(Ordering::Relaxed);
+        if step.is_multiple_of(STEPS_PER_ROW) || last || stopped {
+            let seconds = plan.seconds_before + start.elapsed().as_secs_f64();
+            outlets.outbox.row(mean.take(step, seconds));
+        }
+        hand_over_policy(agent, plan.schedule, outlets)?;
+        if last || stopped || updated >= next_checkpoint {
+            let took = hand_over_state(agent, outlets)?;
+            next_checkpoint = Instant::now() + plan.checkpoint_every.max(TRAINING_PER_SAVING * took);
+        }
+        if stopped {
+            return Ok(Outcome::Stopped { step });
+        }
+    }
+    Ok(Outcome::Completed)
+}
+
+/// Hands over the policy if it is to be evaluated, or if it is the last.
+fn hand_over_policy(agent: &Agent, schedule: Schedule, outlets: &Outlets<'_>) -> Result<(), TrainError> {
+    let (step, begin) = (agent.step(), Instant::now());
+    let evaluate = schedule.is_evaluated(step);
+    if evaluate || step == schedule.steps {
+        debug!(step, "snapshot");
+        let policy = agent.policy().map_err(|source| TrainError::at(step, source))?;
+        outlets.metrics.saving_seconds.inc_by(begin.elapsed().as_secs_f64());
+        outlets.outbox.snapshot(TrainedPolicy { step, policy, evaluate }, outlets.stop, outlets.beat);
+    }
+    Ok(())
+}
+
+/// Hands over the whole state. Gives the time that it took to copy it, in which nothing was trained.
+fn hand_over_state(agent: &Agent, outlets: &Outlets<'_>) -> Result<Duration, TrainError> {
+    let (step, begin) = (agent.step(), Instant::now());
+    let state = agent.save().map_err(|source| TrainError::at(step, source))?;
+    let took = begin.elapsed();
+    outlets.metrics.saving_seconds.inc_by(took.as_secs_f64());
+    outlets.outbox.checkpoint(Checkpoint { step, state });
+    Ok(took)
+}
+
+fn check_finite(step: u64, metrics: &[Metric], values: &[f32]) -> Result<(), TrainError> {
+    match metrics.iter().zip(values).find(|(_, value)| !value.is_finite()) {
+        Some((metric, value)) => Err(TrainError::Diverged { step, what: format!("{} is {value}", metric.name) }),
+        None => Ok(()),
+    }
+}
+
+/// Sums in f64.
+struct RowMean {
+    metrics: &'static [Metric],
+    sums: Vec<f64>,
+    count: u64,
+}
+
+impl RowMean {
+    fn new(metrics: &'static [Metric]) -> Self {
+        Self { metrics, sums: vec![0.0; metrics.len()], count: 0 }
+    }
+
+    fn add(&mut self, values: &[f32]) {
+        self.count += 1;
+        self.sums.iter_mut().zip(values).for_each(|(sum, value)| *sum += f64::from(*value));
+    }
+
+    fn take(&mut self, step: u64, seconds: f64) -> Row {
+        let metrics = self.metrics;
+        let Self { sums, count, .. } = std::mem::replace(self, Self::new(metrics));
+        let values = sums.iter().map(|sum| (sum / count.max(1) as f64) as f32).collect();
+        Row { step, seconds, metrics, values }
+    }
+}

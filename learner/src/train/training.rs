@@ -1,0 +1,85 @@
+//! The work of the thread `training`: makes the agent, goes on from a checkpoint, trains.
+
+use std::sync::Arc;
+use std::sync::atomic::AtomicBool;
+use std::time::Duration;
+
+use anyhow::Context;
+use quad_dataset::{BatchSampler, Transitions};
+use quad_service::{Beat, hinted};
+
+use super::agent::Agent;
+use super::metrics::TrainingMetrics;
+use super::outbox::Outbox;
+use super::steps::{Outlets, Plan, TrainError, train};
+use crate::algorithms::Setting;
+use crate::config::{Device, Experiment};
+use crate::run::Checkpoint;
+
+const DIVERGED: &str = "the same configuration would diverge again: try a smaller agent.critic_learning_rate or \
+                        agent.actor_learning_rate, a smaller agent.gradient_clip, or look for outliers with \
+                        `learner datasets inspect`; begin anew with --fresh";
+
+/// Everything that the thread takes along.
+pub(crate) struct Training {
+    pub experiment: Experiment,
+    pub device: Device,
+    pub transitions: Transitions,
+    /// Where an earlier life of the run has left off.
+    pub checkpoint: Option<Checkpoint>,
+    /// Least time between two checkpoints.
+    pub checkpoint_every: Duration,
+    /// Seconds of training in earlier lives.
+    pub seconds_before: f64,
+    pub metrics: TrainingMetrics,
+    pub outbox: Outbox,
+    /// Set to end training after its current step.
+    pub stop: Arc<AtomicBool>,
+}
+
+impl Training {
+    /// The thread's work. How training ended comes last in the outbox, unless it failed.
+    pub fn run(self, beat: &Beat) -> anyhow::Result<()> {
+        let mut agent = self.agent()?;
+        let experiment = &self.experiment;
+        let batch_size = experiment.batch_size as usize;
+        let mut sampler = BatchSampler::new(self.transitions.len(), batch_size, experiment.seed, agent.step());
+        let outlets = Outlets { metrics: &self.metrics, outbox: &self.outbox, stop: &self.stop, beat };
+        let plan = Plan {
+            schedule: experiment.schedule(),
+            checkpoint_every: self.checkpoint_every,
+            seconds_before: self.seconds_before,
+        };
+        let outcome = train(&mut agent, &self.transitions, &mut sampler, plan, &outlets).map_err(|error| {
+            let diverged = matches!(error, TrainError::Diverged { .. });
+            self.metrics.diverged.set(diverged.into());
+            if diverged { hinted(error, DIVERGED) } else { error.into() }
+        })?;
+        self.outbox.ended(outcome);
+        Ok(())
+    }
+
+    /// At the step of the checkpoint, or at step 0.
+    fn agent(&self) -> anyhow::Result<Agent> {
+        let experiment = &self.experiment;
+        let setting = Setting {
+            observation_dim: self.transitions.observation_dim(),
+            action_dim: self.transitions.action_dim(),
+            batch_size: experiment.batch_size as usize,
+            total_steps: experiment.steps,
+            seed: experiment.seed,
+            precision: experiment.precision,
+            device: self.device.open()?,
+        };
+        let algorithm = experiment.hyperparameters()?.start(&setting)?;
+        let mut agent = Agent::new(experiment.definition()?, algorithm, setting.device);
+        if let Some(Checkpoint { step, state }) = &self.checkpoint {
+            let advice = "begin anew with --fresh, or go on with the version of the learner that wrote it";
+            agent
+                .load(state)
+                .map_err(|error| hinted(error, advice))
+                .with_context(|| format!("cannot go on from the checkpoint of step {step}"))?;
+        }
+        Ok(agent)
+    }
+}

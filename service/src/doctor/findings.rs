@@ -1,0 +1,64 @@
+//! The results of checks, for people and for programs.
+
+use std::fmt;
+
+use serde::Serialize;
+
+/// The results of all checks, in their order. Displayed as a line each, with hints below.
+#[derive(Debug, Default, Serialize)]
+pub struct Findings(Vec<Finding>);
+
+#[derive(Debug, Serialize)]
+struct Finding {
+    /// `ok`, `warn` or `fail`.
+    verdict: &'static str,
+    check: String,
+    what: String,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    hint: Option<String>,
+}
+
+impl Findings {
+    /// Adds that `check` found what it should.
+    pub fn ok(&mut self, check: &str, what: impl Into<String>) {
+        self.0.push(Finding { verdict: "ok", check: check.to_owned(), what: what.into(), hint: None });
+    }
+
+    /// Adds that `check` found something that works, but may fail later or be slow.
+    pub fn warn(&mut self, check: &str, what: impl Into<String>, hint: impl Into<String>) {
+        let hint = Some(hint.into());
+        self.0.push(Finding { verdict: "warn", check: check.to_owned(), what: what.into(), hint });
+    }
+
+    /// Adds that `check` found something that does not work.
+    pub fn fail(&mut self, check: &str, what: impl Into<String>, hint: impl Into<String>) {
+        let hint = Some(hint.into());
+        self.0.push(Finding { verdict: "fail", check: check.to_owned(), what: what.into(), hint });
+    }
+
+    /// As an indented JSON array.
+    ///
+    /// # Errors
+    /// None that is known; serialising is allowed to fail.
+    pub fn json(&self) -> serde_json::Result<String> {
+        serde_json::to_string_pretty(self)
+    }
+
+    /// # Errors
+    /// Some check failed.
+    pub fn verdict(&self) -> anyhow::Result<()> {
+        let failed = self.0.iter().filter(|finding| finding.verdict == "fail").count();
+        anyhow::ensure!(failed == 0, "{failed} of {} checks failed", self.0.len());
+        Ok(())
+    }
+}
+
+impl fmt::Display for Findings {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let lines = self.0.iter().map(|Finding { verdict, check, what, hint }| {
+            let hint = hint.as_ref().map(|hint| format!("\n      hint: {hint}")).unwrap_or_default();
+            format!("{:4}  {check:11}  {what}{hint}", verdict.replace("fail", "FAIL"))
+        });
+        f.write_str(&lines.collect::<Vec<_>>().join("\n"))
+    }
+}

@@ -1,0 +1,146 @@
+//! A learner under test: its endpoints, its metrics, and what is in the folder of its run.
+
+use std::collections::BTreeMap;
+use std::fs;
+use std::path::{Path, PathBuf};
+use std::process::Command;
+use std::time::Duration;
+
+use quad_protocol::Hash;
+use serde_json::Value;
+
+use crate::process::{Process, binary};
+use crate::setting::Setting;
+use crate::{PATIENCE, eventually, http};
+
+/// A learner and the folder of its run.
+pub struct Learner {
+    /// The process.
+    pub process: Process,
+    /// Its run folder.
+    pub run_dir: PathBuf,
+}
+
+impl Learner {
+    /// The endpoint that evaluators connect to, once it listens.
+    pub fn endpoint(&self) -> String {
+        self.endpoints()["zenoh"][0].as_str().expect("an endpoint is text").to_owned()
+    }
+
+    /// Address of its metrics page.
+    pub fn metrics(&self) -> String {
+        self.endpoints()["metrics"].as_str().expect("an address is text").to_owned()
+    }
+
+    fn endpoints(&self) -> Value {
+        let path = self.run_dir.join("endpoints.json");
+        eventually("the learner wrote endpoints.json", PATIENCE, || serde_json::from_slice(&fs::read(&path).ok()?).ok())
+    }
+
+    /// Sum of the samples of `quad_learner_<name>` whose labels contain `label`; nothing if it does not answer.
+    pub fn metric(&self, name: &str, label: &str) -> Option<f64> {
+        Some(http::sum(&http::metrics(&self.metrics())?, &format!("quad_learner_{name}"), label))
+    }
+
+    /// Waits until that sum is as it should be.
+    pub fn wait_for_metric(&self, name: &str, label: &str, wanted: impl Fn(f64) -> bool) -> f64 {
+        eventually(name, PATIENCE, || self.metric(name, label).filter(|value| wanted(*value)))
+    }
+
+    /// Waits until there are more scores than that.
+    pub fn wait_for_scores(&self, count: usize) {
+        eventually("there are scores", PATIENCE, || (self.scores().len() > count).then_some(()));
+    }
+
+    /// Waits for its end, which must be a success, after which everything must have been scored once.
+    pub fn assert_completes(&mut self, setting: &Setting, patience: Duration) {
+        self.process.assert_succeeds(patience);
+        self.assert_complete(setting);
+    }
+
+    /// The lines of scores.jsonl so far.
+    pub fn scores(&self) -> Vec<Score> {
+        let text = fs::read_to_string(self.run_dir.join("scores.jsonl")).unwrap_or_default();
+        let complete = text.rfind('\n').map_or("", |end| &text[..end]);
+        complete.lines().map(|line| Score(serde_json::from_str(line).expect("a line is a JSON object"))).collect()
+    }
+
+    /// The same, after no episode was found to be scored twice.
+    pub fn assert_scores_are_distinct(&self) -> Vec<Score> {
+        let scores = self.scores();
+        let mut keys: Vec<_> = scores.iter().map(Score::key).collect();
+        keys.sort_unstable();
+        keys.dedup();
+        assert_eq!(keys.len(), scores.len(), "a (step, seed) has two scores");
+        scores
+    }
+
+    /// Fails unless every episode of every evaluation has exactly one score, measured with the snapshot on disk.
+    pub fn assert_complete(&self, setting: &Setting) {
+        let scores = self.assert_scores_are_distinct();
+        for step in setting.evaluated_steps() {
+            let of_step: Vec<_> = scores.iter().filter(|score| score.key().0 == step).collect();
+            assert_eq!(of_step.len(), setting.episodes as usize, "scores of step {step}");
+            let tensors = fs::read(self.snapshot(step)).expect("an evaluated snapshot is kept");
+            let hash = Hash::of(&tensors).to_string();
+            for score in of_step {
+                assert_eq!(score.text("weights"), hash, "weights of step {step}");
+            }
+        }
+        assert_eq!(scores.len(), setting.evaluated_steps().len() * setting.episodes as usize, "scores in all");
+    }
+
+    /// Fails unless snapshots, scores and the last checkpoint are those of another run, bit for bit; gives what
+    /// `learner verify` says.
+    pub fn assert_same_as(&self, other: &Learner) -> String {
+        let mut verify = Command::new(binary("learner"));
+        let output = verify.arg("verify").arg(&self.run_dir).arg("--same-as").arg(&other.run_dir).output();
+        let output = output.expect("the learner was found before");
+        let found = String::from_utf8_lossy(&output.stdout).into_owned();
+        assert!(output.status.success(), "{found}");
+        let last = |learner: &Learner| learner.files("checkpoints").pop_last().expect("there is a checkpoint");
+        assert!(last(self) == last(other), "the last checkpoints differ");
+        found
+    }
+
+    /// The whole files of a folder in the run's, name by name; none if it is not there.
+    pub fn files(&self, folder: &str) -> BTreeMap<String, Vec<u8>> {
+        let entries = fs::read_dir(self.run_dir.join(folder)).into_iter().flatten().flatten();
+        let files = entries.filter_map(|entry| Some((name_of(&entry.path())?, fs::read(entry.path()).ok()?)));
+        files.filter(|(name, _)| !name.ends_with(".partial")).collect()
+    }
+
+    /// The snapshot that the learner saved after a gradient step.
+    pub fn snapshot(&self, step: u64) -> PathBuf {
+        self.run_dir.join(format!("snapshots/step_{step:09}.safetensors"))
+    }
+}
+
+fn name_of(path: &Path) -> Option<String> {
+    Some(path.file_name()?.to_str()?.to_owned())
+}
+
+/// A line of scores.jsonl.
+pub struct Score(Value);
+
+impl Score {
+    /// Gradient step and episode seed: what has to be scored exactly once.
+    pub fn key(&self) -> (u64, u64) {
+        (self.integer("step"), self.integer("seed"))
+    }
+
+    /// A field that is a whole number.
+    pub fn integer(&self, field: &str) -> u64 {
+        self.0[field].as_u64().unwrap_or_else(|| panic!("{field} is no whole number in {}", self.0))
+    }
+
+    /// A field that is a number.
+    pub fn number(&self, field: &str) -> f64 {
+        self.0[field].as_f64().unwrap_or_else(|| panic!("{field} is no number in {}", self.0))
+    }
+
+    /// A field that is text.
+    pub fn text(&self, field: &str) -> &str {
+        self.0[field].as_str().unwrap_or_else(|| panic!("{field} is no text in {}", self.0))
+    }
+}

@@ -1,0 +1,65 @@
+//! A disk that hangs holds up neither the training nor the end.
+
+use std::fs;
+use std::path::{Path, PathBuf};
+use std::process::Command;
+use std::thread::sleep;
+use std::time::{Duration, Instant};
+
+use quad_tests::PATIENCE;
+use quad_tests::learner::Learner;
+use quad_tests::system::Scratch;
+
+use crate::disk::{LISTEN, SETTING};
+
+/// Makes the disk of a learner that has ended hang at its next snapshot; gives the step of that.
+fn hang(learner: &Learner) -> u64 {
+    let kept = fs::read_dir(learner.run_dir.join("snapshots")).unwrap().count() as u64;
+    let next = (kept + 1) * SETTING.eval_interval;
+    assert!(next < SETTING.steps, "the training was over too soon");
+    make_pipe(&pipe(learner, next));
+    next
+}
+
+/// A program that opens a pipe to write into it waits for one that reads from it.
+fn make_pipe(path: &Path) {
+    assert!(Command::new("mkfifo").arg(path).status().unwrap().success());
+}
+
+fn pipe(learner: &Learner, step: u64) -> PathBuf {
+    learner.snapshot(step).with_extension("safetensors.partial")
+}
+
+#[test]
+fn a_disk_that_hangs_holds_up_neither_training_nor_the_end() {
+    let scratch = Scratch::new();
+    let mut learner = scratch.learner_with("run", SETTING, &LISTEN);
+    learner.process.wait_for_log("snapshot handed to evaluation", PATIENCE);
+    learner.process.terminate(PATIENCE);
+
+    let next = hang(&learner);
+    // One signal ends it within 10 s, two end it at once.
+    for (signals, least, most) in [(1, 5, 10), (2, 0, 4)] {
+        let mut learner = scratch.learner_with("run", SETTING, &LISTEN);
+        learner.process.wait_for_log("goes on after step", PATIENCE);
+        learner.wait_for_metric("gradient_steps_total", "", |steps| steps == SETTING.steps as f64);
+        sleep(Duration::from_millis(200));
+        assert!(!learner.snapshot(next).exists(), "the disk did not hang");
+        let begin = Instant::now();
+        for _ in 0..signals {
+            learner.process.signal("TERM");
+            learner.process.wait_for_log("received SIGTERM", PATIENCE);
+            // Sooner, the next one would count as the same.
+            sleep(Duration::from_millis(600));
+        }
+        let status = learner.process.wait(PATIENCE);
+        let seconds = begin.elapsed().as_secs();
+        assert!((least..most).contains(&seconds), "it took {seconds} s to leave after {signals} signals");
+        assert_eq!(status.code(), Some(130), "{status}");
+    }
+
+    fs::remove_file(pipe(&learner, next)).unwrap();
+    let mut learner = scratch.learner_with("run", SETTING, &LISTEN);
+    let _evaluator = scratch.evaluator("one", &learner.endpoint());
+    learner.assert_completes(&SETTING, PATIENCE);
+}

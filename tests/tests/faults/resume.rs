@@ -1,0 +1,120 @@
+//! A learner goes on from what its run's folder holds, whatever has become of that.
+
+use std::fs;
+use std::time::Duration;
+
+use quad_protocol::Hash;
+use quad_tests::PATIENCE;
+use quad_tests::learner::Learner;
+use quad_tests::setting::{ENDLESS, SHORT, Setting};
+use quad_tests::system::Scratch;
+
+/// A few seconds of training with evaluations all along.
+const LONG: Setting = Setting { steps: 3000, eval_interval: 300, episodes: 4, candidates: 2, hidden: 64, seed: 5 };
+
+#[test]
+fn a_stopped_learner_goes_on_from_its_very_step() {
+    let scratch = Scratch::new();
+    let learner = |arguments: &[&str]| {
+        scratch.learner_with("run", ENDLESS, &[&["--listen", "tcp/127.0.0.1:0"], arguments].concat())
+    };
+    let step_of = |learner: &Learner| -> u64 {
+        let line = learner.process.wait_for_log("goes on after step", PATIENCE);
+        let step = line.split("goes on after step ").nth(1).unwrap().split(';').next().unwrap();
+        step.parse().unwrap()
+    };
+    let mut first = learner(&[]);
+    first.process.wait_for_log("snapshot handed to evaluation", PATIENCE);
+    let (duration, status) = first.process.terminate(PATIENCE);
+    assert_eq!(status.code(), Some(1));
+    assert!(duration < Duration::from_secs(10), "it took {duration:?} to leave");
+    assert!(first.process.log().contains("the same command goes on from there"), "{}", first.process.log());
+
+    let mut second = learner(&[]);
+    let step = step_of(&second);
+    assert!(step >= ENDLESS.eval_interval, "{step}");
+    // A damaged checkpoint falls back to the one before, here to the very beginning.
+    second.process.kill();
+    let (name, mut bytes) = second.files("checkpoints").pop_last().unwrap();
+    bytes.truncate(bytes.len() / 2);
+    fs::write(second.run_dir.join("checkpoints").join(name), bytes).unwrap();
+    let mut third = learner(&[]);
+    assert!(step_of(&third) < step);
+    assert!(third.process.log().contains("is damaged"), "{}", third.process.log());
+    third.process.terminate(PATIENCE);
+}
+
+#[test]
+fn a_folder_is_of_one_configuration_and_of_one_learner_at_a_time() {
+    let scratch = Scratch::new();
+    let learner = |seed: &str, fresh: &[&str]| {
+        scratch.learner_with("run", ENDLESS, &[&["--listen", "tcp/127.0.0.1:0", "--seed", seed], fresh].concat())
+    };
+    let mut first = learner("1", &[]);
+    first.process.wait_for_log("snapshot handed to evaluation", PATIENCE);
+    first.process.kill();
+    let mut other = learner("6", &[]);
+    assert_eq!(other.process.wait(PATIENCE).code(), Some(1));
+    let log = other.process.log();
+    assert!(log.contains("seed: 1 there, 6 here") && log.contains("--fresh"), "{log}");
+
+    // Begun anew, the old one is kept.
+    let fresh = learner("6", &["--fresh"]);
+    fresh.process.wait_for_log("snapshot handed to evaluation", PATIENCE);
+    assert!(scratch.path().join("run.old1/config.toml").exists());
+    assert!(!fresh.process.log().contains("goes on after step"));
+    let mut twin = learner("6", &[]);
+    assert_eq!(twin.process.wait(PATIENCE).code(), Some(1));
+    assert!(twin.process.log().contains("another learner is at work"), "{}", twin.process.log());
+}
+
+/// As if the scores were of another machine's bits. Training has to come by the step again to find out.
+#[test]
+fn weights_that_come_out_otherwise_for_a_scored_step_end_the_run() {
+    let scratch = Scratch::new();
+    let mut learner = scratch.learner("run", LONG);
+    let _evaluator = scratch.evaluator("one", &learner.endpoint());
+    learner.wait_for_scores(0);
+    learner.process.kill();
+    fs::remove_dir_all(learner.run_dir.join("checkpoints")).ok();
+    let first = learner.scores().remove(0);
+    let snapshot = learner.snapshot(first.key().0);
+    let mut bytes = fs::read(&snapshot).unwrap();
+    *bytes.last_mut().unwrap() ^= 1;
+    fs::write(&snapshot, &bytes).unwrap();
+    let log = learner.run_dir.join("scores.jsonl");
+    let weights = Hash::of(&bytes).to_string();
+    fs::write(&log, fs::read_to_string(&log).unwrap().replace(first.text("weights"), &weights)).unwrap();
+    let mut learner = scratch.learner("run", LONG);
+    assert_eq!(learner.process.wait(PATIENCE).code(), Some(1));
+    let said = learner.process.log();
+    assert!(said.contains(&format!("but {weights} were scored before")), "{said}");
+    assert!(said.contains("hint: another kind of processor"), "{said}");
+    assert!(fs::read(&snapshot).unwrap() == bytes, "what was scored is overwritten");
+}
+
+#[test]
+fn a_damaged_snapshot_is_an_error_only_if_it_lacks_scores() {
+    let scratch = Scratch::new();
+    let mut learner = scratch.learner("run", SHORT);
+    let endpoint = learner.endpoint();
+    let _evaluator = scratch.evaluator("one", &endpoint);
+    learner.process.assert_succeeds(PATIENCE);
+    let step = SHORT.eval_interval;
+    let mut bytes = fs::read(learner.snapshot(step)).unwrap();
+    *bytes.last_mut().unwrap() ^= 1;
+    fs::write(learner.snapshot(step), bytes).unwrap();
+    let mut learner = scratch.learner_with("run", SHORT, &["--listen", &endpoint]);
+    learner.process.assert_succeeds(PATIENCE);
+    assert!(learner.process.log().contains("its file is damaged"), "{}", learner.process.log());
+
+    let log = learner.run_dir.join("scores.jsonl");
+    let lines = fs::read_to_string(&log).unwrap();
+    let lost = lines.lines().find(|line| line.contains(&format!("\"step\":{step},"))).unwrap();
+    fs::write(&log, lines.replace(&format!("{lost}\n"), "")).unwrap();
+    let mut learner = scratch.learner_with("run", SHORT, &["--listen", &endpoint]);
+    assert_eq!(learner.process.wait(PATIENCE).code(), Some(1));
+    for said in [&format!("without the snapshot of step {step}")[..], "but 1 episodes have no score", "hint: "] {
+        assert!(learner.process.log().contains(said), "{}", learner.process.log());
+    }
+}

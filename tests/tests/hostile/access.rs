@@ -1,0 +1,148 @@
+//! Which programs may come in: those with a certificate, at the router as it is shipped and at a learner that listens itself.
+
+use std::fs;
+use std::path::{Path, PathBuf};
+use std::sync::{LazyLock, Mutex};
+
+use quad_tests::certificates::{Certificates, connect};
+use quad_tests::router::protected_router;
+use quad_tests::setting::{ENDLESS, SHORT};
+use quad_tests::system::Scratch;
+use quad_tests::{PATIENCE, eventually};
+use tempfile::NamedTempFile;
+use tokio::time::timeout;
+use zenoh::sample::SampleKind;
+
+/// What the router's certificate is for.
+pub const HOST: &str = "127.0.0.1";
+
+/// Where Zenoh logs in this process, which the routers are in.
+fn log() -> &'static Path {
+    static LOG: LazyLock<NamedTempFile> = LazyLock::new(|| {
+        let file = NamedTempFile::new().unwrap();
+        let filter = "zenoh=warn,zenoh::net::routing::interceptor=trace";
+        let log = tracing_subscriber::fmt().with_env_filter(filter).with_ansi(false);
+        log.with_writer(Mutex::new(file.reopen().unwrap())).init();
+        file
+    });
+    LOG.path()
+}
+
+pub fn wait_for_log(text: &str) {
+    let what = format!("{text:?} in the router's log");
+    eventually(&what, PATIENCE, || fs::read_to_string(log()).unwrap().contains(text).then_some(()));
+}
+
+/// `None` if the test is to be skipped.
+pub fn make_certificates() -> Option<Certificates> {
+    log();
+    Certificates::make()
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn a_run_completes_through_the_shipped_router() {
+    let Some(certificates) = make_certificates() else { return };
+    let (_router, endpoint) = protected_router(HOST, &certificates.of("router")).await;
+    let scratch = Scratch::new();
+    let connect =
+        |role| ["--connect".to_owned(), endpoint.clone(), "--certificates".to_owned(), certificates.argument(role)];
+    let arguments = connect("evaluator");
+    let _evaluator = scratch.evaluator_with("trusted", &arguments.each_ref().map(String::as_str));
+    let arguments = connect("learner");
+    let mut learner = scratch.learner_with("run", SHORT, &arguments.each_ref().map(String::as_str));
+    learner.assert_completes(&SHORT, PATIENCE);
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn a_router_whose_certificate_is_for_another_host_is_not_believed() {
+    let Some(certificates) = make_certificates() else { return };
+    let (_router, endpoint) = protected_router("127.0.0.2", &certificates.of("router")).await;
+    let (scratch, folder) = (Scratch::new(), certificates.argument("evaluator"));
+    let launcher = ["env", "RUST_LOG=info,zenoh=debug"].map(str::to_owned);
+    let arguments = ["--connect", &endpoint, "--certificates", &folder];
+    let evaluator = scratch.evaluator_through(&launcher, "careful", &arguments);
+    evaluator.process.wait_for_log("certificate not valid for name", PATIENCE);
+    assert!(!evaluator.process.log().contains("Successfully connected"), "{}", evaluator.process.log());
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn a_learner_that_listens_itself_asks_who_comes() {
+    let Some(certificates) = make_certificates() else { return };
+    let (scratch, folder) = (Scratch::new(), certificates.argument("learner"));
+    let learner = scratch.learner_with("run", ENDLESS, &["--listen", "tls/127.0.0.1:0", "--certificates", &folder]);
+    let (endpoint, authority) = (learner.endpoint(), certificates.of("learner"));
+    assert!(endpoint.starts_with("tls/127.0.0.1:"), "{endpoint}");
+
+    for (name, reason) in [(None, "peer sent no certificates"), (Some("expired"), "certificate expired")] {
+        let folder = name.map(|name| certificates.of(name));
+        assert!(connect(&endpoint, &authority, folder.as_deref()).await.is_err(), "{name:?} came in");
+        learner.process.wait_for_log(reason, PATIENCE);
+    }
+
+    let folder = certificates.argument("evaluator");
+    let _evaluator = scratch.evaluator_with("trusted", &["--connect", &endpoint, "--certificates", &folder]);
+    learner.wait_for_scores(0);
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn the_router_refuses_and_logs_those_without_a_valid_certificate() {
+    let Some(certificates) = make_certificates() else { return };
+    let elsewhere = make_certificates().unwrap();
+    let (_router, endpoint) = protected_router(HOST, &certificates.of("router")).await;
+    let (authority, evaluator) = (certificates.of("router"), certificates.of("evaluator"));
+    // In all but the certificate they are what is let in.
+    connect(&endpoint, &authority, Some(&evaluator)).await.expect("an evaluator is let in");
+    let foreign = elsewhere.of("evaluator");
+    let expired = certificates.of("expired");
+    for (folder, reason) in [
+        (None, "peer sent no certificates"),
+        (Some(&foreign), "invalid peer certificate: UnknownIssuer"),
+        (Some(&expired), "invalid peer certificate: certificate expired"),
+    ] {
+        let session = connect(&endpoint, &authority, folder.map(PathBuf::as_path)).await;
+        assert!(session.is_err(), "{folder:?} came in");
+        wait_for_log(reason);
+    }
+
+    // The other way round: a router that is not of the evaluator's authority, or only an evaluator, is not talked to.
+    assert!(connect(&endpoint, &foreign, Some(&foreign)).await.is_err(), "a foreign router was trusted");
+    let (_impostor, endpoint) = protected_router(HOST, &evaluator).await;
+    assert!(connect(&endpoint, &authority, Some(&evaluator)).await.is_err(), "an evaluator passed for a router");
+
+    // And it says so, instead of waiting in silence.
+    let (scratch, folder) = (Scratch::new(), elsewhere.argument("evaluator"));
+    let stray = scratch.evaluator_with("stray", &["--connect", &endpoint, "--certificates", &folder]);
+    stray.process.wait_for_log("refuses the other's certificate", PATIENCE);
+    assert!(!stray.process.log().contains("connected"));
+}
+
+/// With an evaluator at `endpoint` whose certificate expires soon, and which gets a new one.
+async fn expires_and_is_renewed(certificates: &Certificates, scratch: &Scratch, name: &str, endpoint: &str) {
+    let monitor = connect(endpoint, &certificates.of("router"), Some(&certificates.of("monitor"))).await.unwrap();
+    let token = format!("quad/run/live/evaluator/{name}");
+    let tokens = monitor.liveliness().declare_subscriber(token).history(true).await.unwrap();
+    let next = async || timeout(PATIENCE, tokens.recv_async()).await.expect("it comes or goes").unwrap().kind();
+    certificates.short(name, 10);
+    let folder = certificates.argument(name);
+    let evaluator = scratch.evaluator_with(name, &["--connect", endpoint, "--certificates", &folder]);
+    assert_eq!(next().await, SampleKind::Put);
+    assert_eq!(next().await, SampleKind::Delete, "it stays after its certificate has expired");
+
+    certificates.renew(name);
+    assert_eq!(next().await, SampleKind::Put);
+    assert!(evaluator.process.log().contains("make a new one soon"));
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn an_expired_certificate_ends_a_connection_and_a_renewed_one_brings_it_back() {
+    let Some(certificates) = make_certificates() else { return };
+    let (scratch, folder) = (Scratch::new(), certificates.argument("learner"));
+    let (_router, endpoint) = protected_router(HOST, &certificates.of("router")).await;
+    let arguments = ["--connect", &endpoint, "--listen", "tls/127.0.0.1:0", "--certificates", &folder];
+    let learner = scratch.learner_with("run", ENDLESS, &arguments);
+    let own = learner.endpoint();
+    tokio::join!(
+        expires_and_is_renewed(&certificates, &scratch, "at-the-router", &endpoint),
+        expires_and_is_renewed(&certificates, &scratch, "at-the-learner", &own),
+    );
+}

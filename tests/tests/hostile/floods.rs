@@ -1,0 +1,159 @@
+//! Floods: one client sends as much as its connection takes. The learner's memory is bounded, and evaluators are served
+//! meanwhile.
+
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering::Relaxed};
+use std::time::Duration;
+
+use quad_protocol::{Name, encode, keys};
+use quad_service::{Endpoints, open_session};
+use quad_tests::made_up::{self, name};
+use quad_tests::setting::{SHORT, Setting};
+use quad_tests::system::Scratch;
+use quad_tests::{PATIENCE, eventually};
+use zenoh::Session;
+
+/// Most that a learner's memory may grow by, MiB.
+const MOST_GROWTH: u64 = 150;
+/// Most tokens of one client at a time.
+const MOST_TOKENS: usize = 1000;
+
+#[derive(Clone, Copy, Debug)]
+enum Flood {
+    Progress,
+    Claims,
+    /// Whose return is not a number.
+    Reports,
+    /// Of another version of the protocol, and of noise.
+    Garbage,
+    /// Messages that are larger than any of their kind, in each part of a query.
+    Large,
+    /// Evaluators that come, ask for work and leave.
+    Evaluators,
+    /// Of weights.
+    Downloads,
+}
+
+const FLOODS: [Flood; 7] =
+    [Flood::Progress, Flood::Claims, Flood::Reports, Flood::Garbage, Flood::Large, Flood::Evaluators, Flood::Downloads];
+
+/// A client that sends without a pause.
+struct Client {
+    session: Session,
+    run: Name,
+    tokens: Vec<zenoh::liveliness::LivelinessToken>,
+}
+
+impl Client {
+    async fn ask(&self, key: &str, question: Vec<u8>) {
+        self.session.get(key).payload(question).timeout(Duration::from_secs(1)).callback(drop).await.unwrap();
+    }
+
+    async fn ask_much(&self, key: &str) {
+        let (much, claim) = ("x".repeat(100_000), claim("flood"));
+        let ask = |key: String| self.session.get(key).timeout(Duration::from_secs(1)).callback(drop);
+        ask(format!("{key}?{much}")).payload(claim.clone()).await.unwrap();
+        ask(key.to_owned()).payload(claim.clone()).attachment(&much).await.unwrap();
+        ask(key.to_owned()).payload(claim).encoding(format!("text/plain;{much}")).await.unwrap();
+        ask(key.to_owned()).payload(vec![0; 1_000_000]).await.unwrap();
+    }
+
+    /// Sends the next message or two.
+    async fn send(&mut self, flood: Flood, number: u64) {
+        let run = self.run.clone();
+        let told = keys::progress(&run, &name("flood"));
+        match flood {
+            Flood::Progress => {
+                let progress = encode(&made_up::progress(&run, "flood", number)).unwrap();
+                self.session.put(&told, progress).await.unwrap();
+                self.session.delete(&told).await.unwrap();
+            }
+            Flood::Claims => self.ask(&keys::jobs(&run), claim(&format!("flood-{number}"))).await,
+            Flood::Reports => {
+                let report = encode(&made_up::report(&run, SHORT.eval_interval, number)).unwrap();
+                self.ask(&keys::scores(&run), report).await;
+            }
+            Flood::Garbage => {
+                let mut newer = claim("flood");
+                newer[4] ^= 0xff;
+                self.session.put(&told, number.to_le_bytes().repeat(100)).await.unwrap();
+                self.ask(&keys::jobs(&run), newer).await;
+            }
+            Flood::Large => self.ask_much(&keys::jobs(&run)).await,
+            Flood::Evaluators => {
+                let evaluator = format!("flood-{number}");
+                let token = keys::live_evaluator(&run, &name(&evaluator));
+                self.tokens.push(self.session.liveliness().declare_token(token).await.unwrap());
+                self.ask(&keys::jobs(&run), claim(&evaluator)).await;
+                if self.tokens.len() > MOST_TOKENS {
+                    self.tokens.clear();
+                }
+            }
+            Flood::Downloads => self.ask(&keys::weights_at(&run, SHORT.eval_interval), Vec::new()).await,
+        }
+    }
+}
+
+fn claim(evaluator: &str) -> Vec<u8> {
+    encode(&made_up::claim(evaluator, 1, "moon")).unwrap()
+}
+
+/// Begins to send, until told to stop.
+async fn start(flood: Flood, endpoint: &str, stop: Arc<AtomicBool>) -> tokio::task::JoinHandle<()> {
+    let endpoints = Endpoints { connect: vec![endpoint.to_owned()], ..Endpoints::default() };
+    let session = open_session(&endpoints).await.unwrap();
+    let mut client = Client { session, run: name("run"), tokens: Vec::new() };
+    tokio::spawn(async move {
+        let mut number = 0;
+        while !stop.load(Relaxed) {
+            number += 1;
+            client.send(flood, number).await;
+            tokio::task::yield_now().await;
+        }
+    })
+}
+
+/// Lets a learner that listens bear each flood for so long.
+async fn bear(each: Duration) {
+    let scratch = Scratch::new();
+    // With more to evaluate than can be done meanwhile.
+    let setting = Setting { episodes: 4000, steps: 40, ..SHORT };
+    let mut learner = scratch.learner("run", setting);
+    let endpoint = learner.endpoint();
+    learner.process.wait_for_log("training is done", PATIENCE);
+    let evaluator = scratch.evaluator("steady", &endpoint);
+    learner.wait_for_scores(0);
+    let quiet = learner.process.peak_memory().unwrap();
+    for flood in FLOODS {
+        let stop = Arc::new(AtomicBool::new(false));
+        let flooding = start(flood, &endpoint, stop.clone()).await;
+        let scores = learner.scores().len();
+        tokio::time::sleep(each).await;
+        eventually(&format!("there are scores in spite of {flood:?}"), PATIENCE, || {
+            (learner.scores().len() > scores).then_some(())
+        });
+        stop.store(true, Relaxed);
+        flooding.await.unwrap();
+        let growth = learner.process.peak_memory().unwrap().saturating_sub(quiet) >> 20;
+        eprintln!("{flood:?}: memory has grown by {growth} MiB at most, {} scores", learner.scores().len() - scores);
+        assert!(growth < MOST_GROWTH, "{flood:?} took {growth} MiB");
+    }
+    assert!(learner.metric("rejected_messages_total", "").unwrap() > 100.0);
+    learner.assert_scores_are_distinct();
+    assert!(!learner.process.log().contains("panicked") && !evaluator.process.log().contains("panicked"));
+    let lines = learner.process.log().lines().count();
+    assert!(lines < 1000, "{lines} lines in the log");
+    let (took, _) = learner.process.terminate(PATIENCE);
+    assert!(took < Duration::from_secs(10), "it took {took:?} to leave");
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn a_second_of_each_flood_takes_bounded_memory_and_the_work_goes_on() {
+    bear(Duration::from_secs(1)).await;
+}
+
+#[tokio::test(flavor = "multi_thread")]
+#[ignore = "three minutes"]
+async fn twenty_seconds_of_each_flood_take_bounded_memory_and_the_work_goes_on() {
+    bear(Duration::from_secs(20)).await;
+}

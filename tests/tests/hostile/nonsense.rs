@@ -1,0 +1,129 @@
+//! Bytes from the wire are not trusted: what cannot be understood is counted, and the work goes on.
+
+use std::sync::atomic::{AtomicUsize, Ordering};
+use std::time::Duration;
+
+use quad_protocol::{Hash, Job, JobReply, JobRequest, Name, Snapshot, decode, encode, keys};
+use quad_tests::made_up::{self, name};
+use quad_tests::router::router;
+use quad_tests::setting::ENDLESS;
+use quad_tests::system::{Scratch, free_endpoint};
+use quad_tests::{PATIENCE, eventually, http};
+use zenoh::Session;
+
+/// Payloads that no receiver may take for a message, derived from a real one.
+fn garbage(real: &[u8]) -> Vec<Vec<u8>> {
+    let (mut flipped, mut newer) = (real.to_vec(), real.to_vec());
+    *flipped.last_mut().unwrap() ^= 1;
+    newer[4] ^= 0xff;
+    let noise = (0..1000u32).map(|i| (i.wrapping_mul(2_654_435_761) >> 24) as u8).collect();
+    vec![
+        Vec::new(),
+        b"QUAD".to_vec(),
+        noise,
+        vec![0xff; 100_000],
+        real[..real.len() / 2].to_vec(),
+        [real, b"more"].concat(),
+        flipped,
+        newer,
+    ]
+}
+
+/// A job of a run that does not exist.
+fn ghost_job(run: &Name, candidates: u32, environment: &str) -> Vec<u8> {
+    encode(&JobReply::Job(Job {
+        id: 1,
+        run: run.clone(),
+        incarnation: 1,
+        step: 1,
+        weights: Hash::of(b"no tensors"),
+        environment: environment.to_owned(),
+        instance: 1,
+        seeds: vec![1, 2],
+        candidates,
+        progress_milliseconds: 300,
+    }))
+    .unwrap()
+}
+
+/// A run whose learner answers claims with nonsense of every kind, one after another.
+async fn haunt(session: &Session) -> impl Sized {
+    let ghost = name("ghost");
+    let answers = [
+        b"QUAD nonsense".to_vec(),
+        ghost_job(&ghost, 1, "hopper"), // its weights are no safetensors
+        ghost_job(&ghost, u32::MAX, "hopper"),
+        ghost_job(&ghost, 1, "moon"),
+        ghost_job(&name("another"), 1, "hopper"),
+    ];
+    let snapshot = encode(&made_up::snapshot(&ghost, 1, 1, b"no tensors")).unwrap();
+    let asked = AtomicUsize::new(0);
+    let jobs = keys::jobs(&ghost);
+    let queryable = session.declare_queryable("quad/ghost/**").callback(move |query| {
+        let message = query.payload().map(|payload| payload.to_bytes().into_owned()).unwrap_or_default();
+        if matches!(decode(&message), Ok(JobRequest::HandBack { .. })) {
+            return;
+        }
+        let answer = match query.key_expr().as_str() == jobs {
+            true => answers[asked.fetch_add(1, Ordering::Relaxed) % answers.len()].clone(),
+            false => snapshot.clone(),
+        };
+        let key = query.key_expr().clone();
+        zenoh::Wait::wait(query.reply(key, answer)).unwrap();
+    });
+    let queryable = queryable.await.unwrap();
+    let token = session.liveliness().declare_token(keys::live_learner(&ghost, 1)).await.unwrap();
+    let nameless = session.liveliness().declare_token("quad/not a name/live/learner/1").await.unwrap();
+    (queryable, token, nameless)
+}
+
+/// Sends each payload on every key of a run.
+async fn send_everywhere(session: &Session, payloads: impl Iterator<Item = Vec<u8>>) {
+    for payload in payloads {
+        for key in ["weights", "weights/1", "weights/x", "jobs", "scores", "progress/x", "live/learner", "x"] {
+            let key = format!("quad/run/{key}");
+            session.put(&key, payload.clone()).await.unwrap();
+            session.get(&key).payload(payload.clone()).timeout(Duration::from_secs(1)).await.unwrap();
+        }
+        // The evaluator keeps only the newest weights: without a pause it would see only the last nonsense.
+        tokio::time::sleep(Duration::from_millis(20)).await;
+    }
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn nonsense_on_every_key_is_counted_and_survived() {
+    let scratch = Scratch::new();
+    let endpoint = free_endpoint();
+    let session = router(&endpoint).await;
+    let mut learner = scratch.learner_with("run", ENDLESS, &["--connect", &endpoint]);
+    let mut evaluator = scratch.evaluator("brave", &endpoint);
+    let first = eventually("there are scores", PATIENCE, || Some(learner.scores().first()?.key().0));
+
+    let run = name("run");
+    let replies = session.get(keys::weights_at(&run, first)).await.unwrap();
+    let snapshot = replies.recv_async().await.unwrap().into_result().unwrap().payload().to_bytes().into_owned();
+    decode::<Snapshot>(&snapshot).unwrap();
+    let request = made_up::claim("client", 1, "hopper");
+    let payloads = garbage(&snapshot).into_iter().chain(garbage(&encode(&request).unwrap()));
+    let _ghost = haunt(&session).await;
+    send_everywhere(&session, payloads).await;
+
+    let evaluator_page = evaluator.metrics();
+    for reason in ["hash", "tensors", "job_size", "schema", "other_run"] {
+        eventually(&format!("the evaluator counts {reason}"), PATIENCE, || {
+            let page = http::metrics(&evaluator_page)?;
+            let label = format!("reason=\"{reason}\"");
+            (http::sum(&page, "quad_evaluator_rejected_messages_total", &label) > 0.0).then_some(())
+        });
+    }
+    assert!(learner.metric("rejected_messages_total", "").unwrap() > 10.0);
+
+    let count = learner.scores().len();
+    learner.wait_for_scores(count + 2 * ENDLESS.episodes as usize);
+    assert!(learner.process.is_running() && evaluator.process.is_running());
+    let said = evaluator.process.log().matches("ignored what was published as weights").count();
+    assert_eq!(said, 1, "bad weights are logged once");
+    for (name, log) in [("learner", learner.process.log()), ("evaluator", evaluator.process.log())] {
+        assert!(!log.contains("panicked"), "a thread of the {name} panicked:\n{log}");
+    }
+}

@@ -1,0 +1,160 @@
+//! What each role may do: at the router as it is shipped, and at a learner that listens itself.
+
+use std::time::{Duration, Instant};
+
+use quad_tests::certificates::connect;
+use quad_tests::router::protected_router;
+use quad_tests::setting::ENDLESS;
+use quad_tests::system::Scratch;
+use quad_tests::{PATIENCE, eventually};
+use tokio::time::{sleep, timeout};
+use zenoh::Session;
+use zenoh::handlers::FifoChannelHandler;
+use zenoh::pubsub::Subscriber;
+use zenoh::query::{Query, Queryable};
+use zenoh::sample::Sample;
+
+use crate::access::{HOST, make_certificates, wait_for_log};
+
+/// For what must not happen.
+const LULL: Duration = Duration::from_millis(500);
+
+/// Sessions with the certificates of those roles at the shipped router, which stays as long as the first part.
+async fn at_the_router<const N: usize>(roles: [&str; N]) -> Option<(impl Sized, [Session; N])> {
+    let certificates = make_certificates()?;
+    let (router, endpoint) = protected_router(HOST, &certificates.of("router")).await;
+    let mut sessions = Vec::new();
+    for role in roles {
+        sessions.push(connect(&endpoint, &certificates.of("router"), Some(&certificates.of(role))).await.unwrap());
+    }
+    Some(((router, certificates), sessions.try_into().unwrap()))
+}
+
+/// The keys that arrive until `last` does.
+async fn until(samples: &Subscriber<FifoChannelHandler<Sample>>, last: &str) -> Vec<String> {
+    let mut keys = Vec::new();
+    while keys.last().map(String::as_str) != Some(last) {
+        let sample = timeout(PATIENCE, samples.recv_async()).await;
+        let sample = sample.unwrap_or_else(|_| panic!("{last} does not arrive, only {keys:?}"));
+        keys.push(sample.unwrap().key_expr().to_string());
+    }
+    keys
+}
+
+/// Answers every question.
+async fn answer(session: &Session, key: &str) -> Queryable<()> {
+    let callback = |query: Query| {
+        zenoh::Wait::wait(query.reply(query.key_expr().clone(), "an answer")).ok();
+    };
+    session.declare_queryable(key).callback(callback).await.unwrap()
+}
+
+/// How many answers there are.
+async fn answers(session: &Session, key: &str) -> usize {
+    let replies = session.get(key).timeout(LULL).await.unwrap();
+    let mut count = 0;
+    while let Ok(reply) = replies.recv_async().await {
+        count += usize::from(reply.result().is_ok());
+    }
+    count
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn only_learners_publish_weights_and_only_evaluators_tell_progress() {
+    let roles = ["learner", "evaluator", "monitor", "monitor", "evaluator"];
+    let Some((_router, [learner, evaluator, monitor, listener, receiver])) = at_the_router(roles).await else { return };
+    let heard = listener.declare_subscriber("quad/run/**").await.unwrap();
+    let weights = receiver.declare_subscriber("quad/run/weights").await.unwrap();
+    let spied = receiver.declare_subscriber("quad/run/progress/*").await.unwrap();
+    sleep(LULL).await;
+    // A session hears itself whatever it may do, so listener and receiver put nothing.
+    for key in ["progress/e", "jobs", "scores", "weights/1", "live/learner", "*", "**", "weights"] {
+        for session in [&monitor, &evaluator, &learner] {
+            session.put(format!("quad/run/{key}"), "words").await.unwrap();
+        }
+    }
+    evaluator.put("quad/run/progress/e", vec![0; 5000]).await.unwrap();
+    // A router may limit how many are passed on in a second.
+    sleep(LULL).await;
+    evaluator.put("quad/run/progress/last", "words").await.unwrap();
+    let mut keys = until(&heard, "quad/run/progress/last").await;
+    while !keys.iter().any(|key| key == "quad/run/weights") {
+        keys.extend(until(&heard, "quad/run/weights").await);
+    }
+    keys.sort();
+    assert_eq!(keys, ["progress/e", "progress/last", "weights"].map(|key| format!("quad/run/{key}")));
+    assert_eq!(until(&weights, "quad/run/weights").await.len(), 1);
+    assert!(weights.try_recv().unwrap().is_none() && spied.try_recv().unwrap().is_none());
+    wait_for_log("is unauthorized to Put (ingress) on quad/run/weights");
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn only_learners_answer_and_only_evaluators_ask_for_jobs() {
+    let roles = ["learner", "evaluator", "monitor", "evaluator"];
+    let Some((_router, [learner, evaluator, monitor, other])) = at_the_router(roles).await else { return };
+    for impostor in [&evaluator, &monitor] {
+        let _held = (answer(impostor, "quad/run/**").await, answer(impostor, "quad/run/jobs").await);
+        sleep(LULL).await;
+        assert_eq!(answers(&other, "quad/run/jobs").await, 0, "{impostor:?}");
+    }
+    let mut held = Vec::new();
+    for key in ["jobs", "scores", "weights/*"] {
+        held.push(answer(&learner, &format!("quad/run/{key}")).await);
+    }
+    for (key, for_evaluators, for_monitors) in [("jobs", 1, 0), ("scores", 1, 0), ("weights/7", 1, 1)] {
+        let (key, deadline) = (format!("quad/run/{key}"), Instant::now() + PATIENCE);
+        while answers(&evaluator, &key).await != for_evaluators {
+            assert!(Instant::now() < deadline, "{key} is not answered");
+        }
+        assert_eq!(answers(&monitor, &key).await, for_monitors, "{key}");
+    }
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn only_learners_and_evaluators_say_that_they_are_there() {
+    let roles = ["learner", "evaluator", "monitor", "monitor"];
+    let Some((_router, [learner, evaluator, monitor, listener])) = at_the_router(roles).await else { return };
+    let mut held = Vec::new();
+    for (session, key) in [
+        (&evaluator, "quad/forged/live/learner/1"),
+        (&monitor, "quad/forged/live/learner/1"),
+        (&learner, "quad/run/live/learner/1"),
+        (&evaluator, "quad/run/live/evaluator/e"),
+        (&monitor, "quad/run/live/evaluator/m"),
+    ] {
+        held.push(session.liveliness().declare_token(key).await.unwrap());
+    }
+    sleep(LULL).await;
+    let tokens = listener.liveliness().get("quad/**").timeout(LULL).await.unwrap();
+    let mut there = Vec::new();
+    while let Ok(reply) = tokens.recv_async().await {
+        there.push(reply.result().unwrap().key_expr().to_string());
+    }
+    there.sort();
+    assert_eq!(there, ["quad/run/live/evaluator/e", "quad/run/live/learner/1"]);
+}
+
+/// Not even another learner may speak in its place.
+#[tokio::test(flavor = "multi_thread")]
+async fn at_a_learner_that_listens_only_evaluators_progress_passes() {
+    let Some(certificates) = make_certificates() else { return };
+    let (scratch, folder) = (Scratch::new(), certificates.argument("learner"));
+    let learner = scratch.learner_with("run", ENDLESS, &["--listen", "tls/127.0.0.1:0", "--certificates", &folder]);
+    let (endpoint, authority) = (learner.endpoint(), certificates.of("learner"));
+    let connect = async |role| connect(&endpoint, &authority, Some(&certificates.of(role))).await.unwrap();
+    let (witness, asker) = (connect("monitor").await, connect("evaluator").await);
+    let (evaluator, second) = (connect("evaluator").await, connect("learner").await);
+    let heard = witness.declare_subscriber("quad/forged/**").await.unwrap();
+    for session in [&second, &evaluator] {
+        session.put("quad/forged/weights", "mine").await.unwrap();
+        let _held = answer(session, "quad/forged/jobs").await;
+        sleep(LULL).await;
+        assert_eq!(answers(&asker, "quad/forged/jobs").await, 0);
+    }
+    eventually("the witness hears of progress, and of nothing else", PATIENCE, || {
+        zenoh::Wait::wait(evaluator.put("quad/forged/progress/e", "half")).unwrap();
+        let sample = heard.recv_timeout(LULL).unwrap()?;
+        assert_eq!(sample.key_expr().as_str(), "quad/forged/progress/e");
+        Some(())
+    });
+}

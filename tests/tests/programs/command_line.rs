@@ -1,0 +1,111 @@
+//! What scripts rely on: exit codes, hints, help.
+
+use std::process::{Command, Output};
+use std::time::Duration;
+
+use quad_tests::process::binary;
+use quad_tests::setting::SHORT;
+use quad_tests::system::Scratch;
+
+fn run(program: &str, arguments: &[&str]) -> Output {
+    Command::new(binary(program)).args(arguments).output().unwrap()
+}
+
+/// `learner train` with those arguments must end with that exit code, after it said those words.
+fn refused(arguments: &[&str], code: i32, words: &[&str]) {
+    let output = run("learner", &[&["train"], arguments].concat());
+    let text = String::from_utf8_lossy(&output.stderr);
+    assert_eq!(output.status.code(), Some(code), "{arguments:?}: {text}");
+    assert!(words.iter().all(|word| text.contains(word)), "{arguments:?}: {text}");
+}
+
+#[test]
+fn a_wrong_command_line_exits_with_2() {
+    for (program, arguments) in [
+        ("learner", &[][..]),
+        ("learner", &["train"]),
+        ("learner", &["train", "--preset", "hopper-demo", "--dataset", "x", "--samples", "0"]),
+        ("learner", &["train", "--preset", "hopper-demo", "--dataset", "x", "--set", "agent.tau"]),
+        ("learner", &["presets", "no-such-preset"]),
+        ("evaluator", &[]),
+        ("evaluator", &["serve", "--name", "not a name"]),
+        ("evaluator", &["serve", "--metrics", "everywhere"]),
+        ("evaluator", &["serve", "--connect", "127.0.0.1:7447"]),
+        ("evaluator", &["collect", "--env", "hopper"]),
+        ("evaluator", &["score"]),
+        ("evaluator", &["score", "x", "--candidates", "1,0"]),
+    ] {
+        let output = run(program, arguments);
+        let text = String::from_utf8_lossy(&output.stderr);
+        assert_eq!(output.status.code(), Some(2), "{program} {arguments:?}: {text}");
+    }
+}
+
+#[test]
+fn an_algorithm_that_lacks_a_hyper_parameter_says_what_it_has() {
+    for (preset, flags, words) in [
+        ("hopper-demo", ["--guidance", "sac"], ["sac", "`dac`"]),
+        ("hopper-demo-iql", ["--guidance", "dac"], ["agent.guidance", "`learner presets NAME`"]),
+        ("hopper-demo-iql", ["--candidates", "10"], ["candidates", "must be 1"]),
+    ] {
+        refused(&[&["--preset", preset, "--dataset", "x"][..], &flags].concat(), 1, &words);
+    }
+}
+
+#[test]
+fn a_wrong_name_is_answered_with_the_nearest() {
+    let folder = tempfile::tempdir().unwrap();
+    let own = folder.path().join("own.toml");
+    std::fs::write(&own, "base = \"hopper-demo\"\nbatchsize = 3\n").unwrap();
+    for (arguments, code, words) in [
+        (&["--preset", "walker2d-medium-reply-v2"][..], 2, &["walker2d-medium-replay-v2"][..]),
+        (&["--preset", "hopper-demo", "--set", "agent.tua=0.5"], 1, &["agent.tua", "hint:", "agent.tau"]),
+        (&["--preset", "hopper-demo", "--set", "tau=0.5"], 1, &["name tau", "hint:", "agent.tau"]),
+        (&["--preset", own.to_str().unwrap()], 1, &["batchsize", "hint:", "batch_size"]),
+    ] {
+        refused(&[&["--dataset", "x"], arguments].concat(), code, words);
+    }
+}
+
+#[test]
+fn what_is_missing_is_said() {
+    refused(&["--preset", "paper"], 1, &["hint:", "paper names no environment", "`learner presets`"]);
+    refused(&["--preset", "hopper-demo"], 1, &["hint:", "hopper-demo names no dataset", "--dataset FILE"]);
+    let missing = ["--preset", "hopper-demo", "--dataset", "/tmp/missing.hdf5", "--run-dir", "/tmp/missing-run"];
+    refused(&missing, 1, &["hint:", "/tmp/missing.hdf5"]);
+}
+
+#[test]
+fn presets_are_listed_and_printed() {
+    let print = |arguments: &[&str]| {
+        let output = run("learner", &[&["presets"], arguments].concat());
+        assert_eq!(output.status.code(), Some(0), "{arguments:?}");
+        String::from_utf8(output.stdout).unwrap()
+    };
+    assert!(print(&[]).contains("\nantmaze-large-play-v0 "));
+    let folder = tempfile::tempdir().unwrap();
+    let own = folder.path().join("own.toml");
+    let text = print(&["walker2d-medium-replay-v2"]);
+    assert!(text.contains("\ntau = 100.0\n"), "{text}");
+    std::fs::write(&own, &text).unwrap();
+    assert_eq!(print(&[own.to_str().unwrap()]), text, "what is printed is a preset of one's own");
+}
+
+#[test]
+fn a_learner_without_evaluations_waits_for_no_evaluator() {
+    let scratch = Scratch::new();
+    let mut learner = scratch.learner_with("alone", SHORT, &["--eval-interval", "0"]);
+    learner.process.assert_succeeds(Duration::from_secs(30));
+    assert!(learner.scores().is_empty());
+    assert!(learner.snapshot(SHORT.steps).exists(), "the last snapshot is kept");
+
+    // What lies beside it is named and passed over, and is an error by itself.
+    let other = scratch.path().join("other");
+    let [folder, other] = [&learner.run_dir, &other].map(|path| path.to_str().unwrap());
+    for (folders, code) in [(&[other, folder][..], 0), (&[other], 1)] {
+        let output = run("learner", &[&["report"], folders].concat());
+        let (text, said) = (String::from_utf8(output.stdout).unwrap(), String::from_utf8(output.stderr).unwrap());
+        assert_eq!(output.status.code(), Some(code), "{folders:?}: {said}");
+        assert!(said.contains(other) && text.contains("alone") == (code == 0), "{folders:?}: {said}{text}");
+    }
+}

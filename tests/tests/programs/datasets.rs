@@ -1,0 +1,100 @@
+//! Datasets by name, as they are seen on a command line. How a file is fetched is tested beside the code that does it.
+
+use std::fs;
+use std::path::Path;
+use std::process::{Command, Output};
+
+use quad_tests::http::FileServer;
+use quad_tests::process::binary;
+use quad_tests::setting::SHORT;
+use quad_tests::system::Scratch;
+
+/// Runs a learner whose cache folder is `cache`. Nothing but this machine can be reached: port 9, which is closed,
+/// is the proxy for everything else.
+fn learner(cache: &Path, mirror: &str, arguments: &[&str]) -> Output {
+    let mut command = Command::new(binary("learner"));
+    command.env("D4RL_DATASET_DIR", cache).env("QUAD_DATASETS_URL", mirror).args(arguments);
+    command.env("ALL_PROXY", "http://127.0.0.1:9").env("NO_PROXY", "127.0.0.1").output().unwrap()
+}
+
+fn stdout(output: &Output) -> String {
+    String::from_utf8_lossy(&output.stdout).into_owned()
+}
+
+/// What a command said that had to fail.
+fn failure(output: &Output) -> String {
+    let text = String::from_utf8_lossy(&output.stderr).into_owned();
+    assert_eq!(output.status.code(), Some(1), "{text}");
+    assert!(text.contains("error: ") && text.contains("\nhint: "), "{text}");
+    text
+}
+
+#[test]
+fn a_run_by_name_fetches_its_dataset_once_and_records_its_checksum() {
+    let scratch = Scratch::new();
+    let cache = scratch.path().join("cache");
+    // A dataset of whose file only the name is known, so that any HDF5 file will do.
+    let content = fs::read(scratch.dataset()).unwrap();
+    let server = FileServer::start("hopper_random-v2.hdf5", content);
+    let preset = scratch.preset("tiny", SHORT);
+    let file = cache.join("hopper_random-v2.hdf5");
+    for run in ["first", "second"] {
+        let run_dir = scratch.path().join(run);
+        let paths = ["--preset", preset.to_str().unwrap(), "--run-dir", run_dir.to_str().unwrap()];
+        let rest = ["--dataset", "hopper-random-v2", "--eval-interval", "0"];
+        let output = learner(&cache, &server.url, &[&["train"], &paths[..], &rest].concat());
+        assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
+        let config = fs::read_to_string(run_dir.join("config.toml")).unwrap();
+        let sha256 = stdout(&Command::new("sha256sum").arg(&file).output().unwrap());
+        for line in [
+            "dataset = \"hopper-random-v2\"".to_owned(),
+            format!("path = {:?}", file.to_str().unwrap()),
+            format!("sha256 = {:?}", sha256.split_whitespace().next().unwrap()),
+        ] {
+            assert!(config.lines().any(|found| found == line), "no {line} in:\n{config}");
+        }
+        assert_eq!(server.requests(), 1, "the second run finds it in the cache");
+    }
+    let fetched = learner(&cache, &server.url, &["datasets", "fetch", "hopper-random-v2"]);
+    assert_eq!(stdout(&fetched).trim_end(), file.to_str().unwrap());
+    assert_eq!(server.requests(), 1);
+}
+
+#[test]
+fn the_list_says_what_there_is_and_what_is_here() {
+    let folder = tempfile::tempdir().unwrap();
+    fs::write(folder.path().join("hopper_random-v2.hdf5"), "").unwrap();
+    fs::write(folder.path().join("hopper_medium-v2.hdf5"), "half of it").unwrap();
+    let output = learner(folder.path(), "", &["datasets", "list"]);
+    assert!(output.status.success());
+    let text = stdout(&output);
+    for (name, state) in [
+        ("hopper-random-v2 ", "  yes"),
+        ("hopper-medium-v2 ", "  another file of 10 bytes"),
+        ("antmaze-large-diverse-v0 ", "  no"),
+    ] {
+        assert!(text.lines().any(|line| line.starts_with(name) && line.ends_with(state)), "{name}:\n{text}");
+    }
+    assert!(text.ends_with(&format!("cache folder: {}\n", folder.path().display())), "{text}");
+}
+
+#[test]
+fn what_makes_no_sense_is_refused_before_anything_is_fetched() {
+    let folder = tempfile::tempdir().unwrap();
+    let server = FileServer::start("", Vec::new());
+    let train =
+        |preset, dataset| learner(folder.path(), &server.url, &["train", "--preset", preset, "--dataset", dataset]);
+    let fetch = |cache: &Path, dataset| learner(cache, &server.url, &["datasets", "fetch", dataset]);
+    for (output, words) in [
+        (train("hopper-demo", "hopper-medium-reply-v2"), "hopper-medium-replay-v2"),
+        (train("hopper-demo", "walker2d-medium-v2"), "is a dataset of walker2d, but the policy is for hopper"),
+        (train("hopper-demo", "data/halfcheetah_medium-v2.hdf5"), "halfcheetah-medium-v2 is a dataset of halfcheetah"),
+        (train("hopper-demo", "minari:none/has-this-v0"), "minari download none/has-this-v0"),
+        (fetch(folder.path(), "hoper-medium-v2"), "hopper-medium-v2"),
+        (fetch(Path::new("/proc/version/cache"), "hopper-random-v2"), "/proc/version/cache"),
+    ] {
+        let text = failure(&output);
+        assert!(text.contains(words), "{text}");
+    }
+    assert_eq!(server.requests(), 0);
+}

@@ -1,0 +1,107 @@
+//! `evaluator score` measures what a run measured, and says clearly what it cannot score.
+
+use std::fs;
+use std::path::Path;
+use std::process::{Command, Output};
+
+use quad_tests::PATIENCE;
+use quad_tests::learner::{Learner, Score};
+use quad_tests::process::binary;
+use quad_tests::setting::Setting;
+use quad_tests::system::Scratch;
+use serde_json::Value;
+
+const SETTING: Setting = Setting { steps: 40, eval_interval: 20, episodes: 7, candidates: 3, hidden: 16, seed: 5 };
+
+/// A finished run, evaluated in the arithmetic of that name.
+fn run(scratch: &Scratch, name: &str, precision: &str) -> Learner {
+    let mut learner = scratch.learner(name, SETTING);
+    let connect = ["--connect", &learner.endpoint(), "--metrics", "127.0.0.1:0", "--precision", precision];
+    let _evaluator = scratch.evaluator_with(&format!("evaluator-of-{name}"), &connect);
+    learner.process.assert_succeeds(PATIENCE);
+    learner
+}
+
+fn score(threads: &str, snapshots: &[&Path], flags: &[&str]) -> Output {
+    let mut command = Command::new(binary("evaluator"));
+    command.env("RAYON_NUM_THREADS", threads).arg("score").args(snapshots).args(flags).output().unwrap()
+}
+
+fn json(output: &Output) -> Vec<Value> {
+    assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
+    serde_json::from_slice(&output.stdout).unwrap()
+}
+
+/// Seed, length, and the bits of return and score of each episode.
+fn episodes(scored: &Value) -> Vec<(u64, u64, u64, u64)> {
+    let bits = |number: &Value| number.as_f64().unwrap().to_bits();
+    let whole = |number: &Value| number.as_u64().unwrap();
+    let episodes = scored["episodes"].as_array().unwrap().iter();
+    episodes.map(|of| (whole(&of["seed"]), whole(&of["length"]), bits(&of["return"]), bits(&of["score"]))).collect()
+}
+
+#[test]
+fn a_snapshot_gets_the_scores_that_its_run_has() {
+    let scratch = Scratch::new();
+    for precision in ["f32", "bf16"] {
+        let learner = run(&scratch, precision, precision);
+        let steps = SETTING.evaluated_steps();
+        let snapshots: Vec<_> = steps.iter().map(|&step| learner.snapshot(step)).collect();
+        let snapshots: Vec<&Path> = snapshots.iter().map(AsRef::as_ref).collect();
+        let scored = json(&score("2", &snapshots, &["--precision", precision, "--json"]));
+        assert_eq!(scored.len(), steps.len());
+        for ((scored, &step), snapshot) in scored.iter().zip(&steps).zip(snapshots) {
+            let of_run: Vec<_> = learner.scores().into_iter().filter(|score| score.key().0 == step).collect();
+            let same = |field: &str, value: &str| assert_eq!(scored[field], value, "{field}");
+            same("snapshot", snapshot.to_str().unwrap());
+            same("weights", of_run[0].text("weights"));
+            same("precision", of_run[0].text("precision"));
+            assert_eq!(scored["step"], step);
+            let bits = |score: &Score, field| score.number(field).to_bits();
+            let mut of_run: Vec<_> = of_run
+                .iter()
+                .map(|score| (score.key().1, score.integer("length"), bits(score, "return"), bits(score, "score")))
+                .collect();
+            let mut again = episodes(scored);
+            of_run.sort_unstable();
+            again.sort_unstable();
+            assert_eq!(again, of_run, "step {step} in {precision}");
+        }
+    }
+}
+
+#[test]
+fn what_cannot_be_scored_is_said_in_a_sentence() {
+    let scratch = Scratch::new();
+    let mut learner = scratch.learner_with("unscored", SETTING, &["--eval-interval", "0"]);
+    learner.process.assert_succeeds(PATIENCE);
+    let snapshot = fs::read(learner.snapshot(SETTING.steps)).unwrap();
+    let write = |name: &str, bytes: &[u8]| {
+        let path = scratch.path().join(name);
+        fs::write(&path, bytes).unwrap();
+        path
+    };
+    // Of the same length, so the rest of the file stays what it is.
+    let with = |from: &str, to: &str| {
+        let at = snapshot.windows(from.len()).position(|window| window == from.as_bytes()).unwrap();
+        [&snapshot[..at], to.as_bytes(), &snapshot[at + to.len()..]].concat()
+    };
+    let whole = write("whole.safetensors", &snapshot);
+    let moon = write("moon.safetensors", &with("hopper", "onmoon"));
+    let cut = write("cut.safetensors", &snapshot[..snapshot.len() / 2]);
+    let missing = scratch.path().join("missing.safetensors");
+    for (path, flags, words) in [
+        (&cut, &[][..], "is not a saved policy"),
+        (&missing, &[], "cannot read"),
+        (&moon, &[], "unknown environment `onmoon`"),
+        (&whole, &["--env", "walker2d"], "walker2d"),
+    ] {
+        let output = score("1", &[path], flags);
+        let text = String::from_utf8_lossy(&output.stderr);
+        assert_eq!(output.status.code(), Some(1), "{path:?}: {text}");
+        let told = text.contains(words) && text.contains(path.to_str().unwrap()) && text.contains("hint:");
+        assert!(told && output.stdout.is_empty(), "{path:?}: {text}");
+    }
+    let scored = json(&score("1", &[&moon], &["--env", "hopper", "--episodes", "2", "--json"]));
+    assert_eq!(episodes(&scored[0]).len(), 2);
+}

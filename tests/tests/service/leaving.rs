@@ -1,0 +1,92 @@
+//! Programs that are told to leave do so in order, whatever they wait for just then.
+
+use std::io::{PipeReader, Write};
+use std::os::fd::OwnedFd;
+use std::process::{Child, Command, Stdio};
+use std::time::{Duration, Instant};
+
+use quad_protocol::keys;
+use quad_tests::made_up::name;
+use quad_tests::process::binary;
+use quad_tests::router::{router, router_without_scores};
+use quad_tests::setting::{ENDLESS, Setting};
+use quad_tests::system::{Scratch, free_endpoint};
+use quad_tests::{PATIENCE, eventually};
+
+/// A program that is told to leave must have left within this time (docs/reliability.md).
+const LONGEST_LEAVE: Duration = Duration::from_secs(10);
+
+/// A full pipe that is never read; and what keeps it open.
+fn full_pipe() -> (OwnedFd, PipeReader) {
+    let (reader, writer) = std::io::pipe().unwrap();
+    let mut filler = writer.try_clone().unwrap();
+    // Blocks as soon as it is full, until the reader is dropped.
+    std::thread::spawn(move || while filler.write(&[b'.'; 1000]).is_ok() {});
+    (writer.into(), reader)
+}
+
+fn leaves(mut child: Child) -> Option<i32> {
+    let begin = Instant::now();
+    let signal = format!("kill -TERM {}", child.id());
+    assert!(Command::new("sh").args(["-c", &signal]).status().unwrap().success());
+    let status = eventually("it has left", PATIENCE, || child.try_wait().unwrap());
+    assert!(begin.elapsed() < LONGEST_LEAVE, "it took {:?}", begin.elapsed());
+    status.code()
+}
+
+#[test]
+fn a_stderr_that_is_never_read_holds_up_neither_the_work_nor_the_end() {
+    let scratch = Scratch::new();
+    let preset = scratch.preset("run", ENDLESS);
+    let (unread, _reader) = full_pipe();
+    let start = |command: &mut Command| {
+        command.stdout(Stdio::null()).stderr(unread.try_clone().unwrap()).stdin(Stdio::null()).spawn().unwrap()
+    };
+    let endpoint = free_endpoint();
+    let run_dir = scratch.path().join("run");
+    let mut learner = Command::new(binary("learner"));
+    learner.arg("train").arg("--preset").arg(preset).arg("--dataset").arg(scratch.dataset());
+    learner.arg("--run-dir").arg(&run_dir).args(["--metrics", "127.0.0.1:0", "--listen", &endpoint]);
+    let learner = start(&mut learner);
+    let evaluator = start(Command::new(binary("evaluator")).args(["serve", "--name", "mute", "--connect", &endpoint]));
+    let scored = || std::fs::read_to_string(run_dir.join("scores.jsonl")).is_ok_and(|lines| lines.lines().count() > 20);
+    eventually("there are scores", PATIENCE, || scored().then_some(()));
+    assert_eq!((leaves(evaluator), leaves(learner)), (Some(0), Some(1)));
+    let checkpoints = std::fs::read_dir(run_dir.join("checkpoints")).unwrap().count();
+    assert!(checkpoints > 0, "it has left without a checkpoint");
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn a_learner_that_waits_for_another_to_be_gone_leaves_in_order() {
+    let scratch = Scratch::new();
+    let endpoint = free_endpoint();
+    let session = router(&endpoint).await;
+    let _other = session.liveliness().declare_token(keys::live_learner(&name("run"), 1)).await.unwrap();
+    let mut learner = scratch.learner_with("run", ENDLESS, &["--connect", &endpoint]);
+    learner.process.wait_for_log("waiting to see if it is gone", PATIENCE);
+    let (took, status) = learner.process.terminate(PATIENCE);
+    assert_eq!(status.code(), Some(1), "{}", learner.process.log());
+    assert!(took < Duration::from_secs(5), "it took {took:?}");
+    assert!(learner.process.log().contains("the same command goes on from there"), "{}", learner.process.log());
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn an_evaluator_that_leaves_in_the_middle_of_a_job_hands_it_back() {
+    let scratch = Scratch::new();
+    // It need not be finished, so it is as long as jobs can be.
+    let setting = Setting { eval_interval: 10, episodes: 40, candidates: 1000, hidden: 256, ..ENDLESS };
+    let learner = scratch.learner("run", setting);
+    let behind = free_endpoint();
+    let _router = router_without_scores(&behind, Some(&learner.endpoint())).await;
+    let mut evaluator = scratch.evaluator("leaver", &behind);
+    evaluator.process.wait_for_log("evaluating", PATIENCE);
+    let (duration, status) = evaluator.process.terminate(PATIENCE);
+    assert_eq!(status.code(), Some(0), "the evaluator ended with {status}");
+    assert!(duration < LONGEST_LEAVE, "it took {duration:?} to leave");
+    let jobs = |outcome| learner.metric("jobs_total", &format!("outcome=\"{outcome}\""));
+    let [handed_back, expired] = eventually("the job is taken back", PATIENCE, || {
+        let ended = [jobs("handed_back")?, jobs("expired")?];
+        (ended.iter().sum::<f64>() > 0.0).then_some(ended)
+    });
+    assert_eq!((handed_back, expired), (1.0, 0.0));
+}

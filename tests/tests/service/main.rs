@@ -1,0 +1,10 @@
+//! How learners and evaluators work together: which runs an evaluator serves, what it does while it waits, how both leave,
+//! and that many evaluators can work for one learner.
+//!
+//! Of the long tests, which are ignored, CONTRIBUTING.md has a table.
+#![allow(clippy::unwrap_used, clippy::expect_used, clippy::print_stderr)]
+
+mod crowds;
+mod leaving;
+mod names;
+mod runs;
