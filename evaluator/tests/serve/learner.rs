@@ -12,6 +12,7 @@ use quad_protocol::{
 use quad_service::{Endpoints, open_session, reachable_at};
 use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;
+use zenoh::liveliness::LivelinessToken;
 use zenoh::query::Query;
 use zenoh::{Session, Wait};
 
@@ -21,14 +22,15 @@ const INCARNATION: u64 = 7;
 /// What an evaluator has said.
 #[derive(Clone, Debug, PartialEq)]
 pub enum Heard {
-    Claim,
+    /// With its number.
+    Claim(u64),
     Weights,
     Progress,
     Scores(ScoreReport),
     HandedBack(Option<String>),
 }
 
-/// What becomes of scores.
+/// What becomes of scores, and of claims.
 #[derive(Clone, Copy)]
 pub enum Answer {
     Recorded,
@@ -36,6 +38,8 @@ pub enum Answer {
     Nothing,
     /// The learner reads nothing more, as long as this is the answer.
     Hang,
+    /// No claim is answered.
+    NoClaim,
 }
 
 /// A learner that has one job.
@@ -119,8 +123,12 @@ impl Learner {
                     Answer::Recorded => {
                         reply(&query, &ScoreReply::Recorded { incarnation: INCARNATION, new, duplicates: 0 });
                     }
-                    Answer::DiskFull => query.reply_err("No space left on device").wait().unwrap(),
-                    Answer::Nothing => {}
+                    Answer::DiskFull => {
+                        // What a learner says that is not followed does not count, though it comes first.
+                        reply(&query, &ScoreReply::Refused { incarnation: 99, reason: "not mine".to_owned() });
+                        query.reply_err("No space left on device").wait().unwrap();
+                    }
+                    Answer::Nothing | Answer::NoClaim => {}
                     Answer::Hang => {
                         drop(heard);
                         while matches!(*answer.lock().unwrap(), Answer::Hang) {
@@ -128,14 +136,22 @@ impl Learner {
                         }
                     }
                 }
-            } else if let JobRequest::HandBack { failed, .. } = decode(&message).unwrap() {
-                heard.push(Heard::HandedBack(failed));
-                *job.lock().unwrap() = None;
-                reply(&query, &JobReply::HandedBack { incarnation: INCARNATION, accepted: true });
             } else {
-                heard.push(Heard::Claim);
-                let job = job.lock().unwrap().clone().map(JobReply::Job);
-                reply(&query, &job.unwrap_or(JobReply::Wait { incarnation: INCARNATION, milliseconds: 100 }));
+                match decode(&message).unwrap() {
+                    JobRequest::HandBack { failed, .. } => {
+                        heard.push(Heard::HandedBack(failed));
+                        *job.lock().unwrap() = None;
+                        reply(&query, &JobReply::HandedBack { incarnation: INCARNATION, accepted: true });
+                    }
+                    JobRequest::Claim { attempt, .. } => {
+                        heard.push(Heard::Claim(attempt));
+                        let job = job.lock().unwrap().clone().map(JobReply::Job);
+                        let wait = JobReply::Wait { incarnation: INCARNATION, milliseconds: 100 };
+                        if !matches!(*answer.lock().unwrap(), Answer::NoClaim) {
+                            reply(&query, &job.unwrap_or(wait));
+                        }
+                    }
+                }
             }
         };
         let (told, progress) = (learner.heard.clone(), keys::all_progress(&name("run")));
@@ -155,12 +171,21 @@ impl Learner {
 
     /// Starts an evaluator and announces the learner; with it, one that is dead and was started before.
     pub async fn evaluator(&self) -> (Evaluator, impl Sized + use<>) {
+        let (evaluator, token) = self.only_evaluator().await;
+        (evaluator, (token, self.announce(INCARNATION - 1).await))
+    }
+
+    /// Starts an evaluator and announces the learner alone.
+    pub async fn only_evaluator(&self) -> (Evaluator, impl Sized + use<>) {
         let mut command = Command::new(env!("CARGO_BIN_EXE_evaluator"));
         command.args(["serve", "--name", "one", "--precision", "f32", "--connect", &self.endpoint]);
-        let child = command.spawn().unwrap();
-        let token =
-            |incarnation| self.session.liveliness().declare_token(keys::live_learner(&name("run"), incarnation));
-        (Evaluator(child), [token(INCARNATION - 1).await.unwrap(), token(INCARNATION).await.unwrap()])
+        let evaluator = Evaluator(command.spawn().unwrap());
+        (evaluator, self.announce(INCARNATION).await)
+    }
+
+    async fn announce(&self, incarnation: u64) -> LivelinessToken {
+        let key = keys::live_learner(&name("run"), incarnation);
+        self.session.liveliness().declare_token(key).await.unwrap()
     }
 
     pub async fn wait_for<T>(&self, what: impl Fn(&[Heard]) -> Option<T>) -> T {

@@ -57,6 +57,20 @@ async fn scores_are_of_exactly_the_weights_and_seeds_that_the_job_names() {
 }
 
 #[tokio::test(flavor = "multi_thread")]
+async fn a_claim_without_an_answer_is_the_same_claim_again() {
+    let learner = Learner::start(snapshot(tensors())).await;
+    learner.answer(Answer::NoClaim);
+    let (_evaluator, _token) = learner.only_evaluator().await;
+    let claims = |heard: &[Heard]| -> Vec<u64> {
+        heard.iter().filter_map(|heard| if let Heard::Claim(number) = heard { Some(*number) } else { None }).collect()
+    };
+    let first = learner.wait_for(|heard| Some(claims(heard)).filter(|claims| claims.len() >= 3)).await;
+    assert!(first.iter().all(|number| *number == first[0]), "{first:?}");
+    learner.answer(Answer::Recorded);
+    learner.wait_for(|heard| claims(heard).iter().any(|number| *number != first[0]).then_some(())).await;
+}
+
+#[tokio::test(flavor = "multi_thread")]
 async fn scores_are_sent_again_until_the_learner_has_saved_them() {
     let learner = Learner::start(snapshot(tensors())).await;
     learner.answer(Answer::DiskFull);
@@ -64,7 +78,7 @@ async fn scores_are_sent_again_until_the_learner_has_saved_them() {
     let (_evaluator, _tokens) = learner.evaluator().await;
     let report = learner.wait_for_scores(3).await;
     learner.answer(Answer::Recorded);
-    learner.wait_for(|heard| (heard.last() == Some(&Heard::Claim)).then_some(())).await;
+    learner.wait_for(|heard| matches!(heard.last(), Some(Heard::Claim(_))).then_some(())).await;
     let heard = learner.heard.lock().unwrap();
     assert!(reports(&heard).len() > 3 && reports(&heard).iter().all(|again| *again == report));
     let is_score = |heard: &Heard| matches!(heard, Heard::Scores(_));
