@@ -96,6 +96,24 @@ fn reply<M: Message>(query: &Query, message: &M) {
     query.reply(query.key_expr().clone(), encode(message).unwrap()).wait().unwrap();
 }
 
+fn answer_scores(query: &Query, answer: &Mutex<Answer>, new: u32) {
+    let now = *answer.lock().unwrap();
+    match now {
+        Answer::Recorded => reply(query, &ScoreReply::Recorded { incarnation: INCARNATION, new, duplicates: 0 }),
+        Answer::DiskFull => {
+            // What a learner says that is not followed does not count, though it comes first.
+            reply(query, &ScoreReply::Refused { incarnation: 99, reason: "not mine".to_owned() });
+            query.reply_err("No space left on device").wait().unwrap();
+        }
+        Answer::Nothing | Answer::NoClaim => {}
+        Answer::Hang => {
+            while matches!(*answer.lock().unwrap(), Answer::Hang) {
+                std::thread::sleep(Duration::from_millis(20));
+            }
+        }
+    }
+}
+
 impl Learner {
     pub async fn start(published: Snapshot) -> Learner {
         let listen = Endpoints { listen: vec!["tcp/127.0.0.1:0".to_owned()], ..Endpoints::default() };
@@ -118,24 +136,8 @@ impl Learner {
                 let new = report.episodes.len() as u32;
                 heard.push(Heard::Scores(report));
                 *job.lock().unwrap() = None;
-                let now = *answer.lock().unwrap();
-                match now {
-                    Answer::Recorded => {
-                        reply(&query, &ScoreReply::Recorded { incarnation: INCARNATION, new, duplicates: 0 });
-                    }
-                    Answer::DiskFull => {
-                        // What a learner says that is not followed does not count, though it comes first.
-                        reply(&query, &ScoreReply::Refused { incarnation: 99, reason: "not mine".to_owned() });
-                        query.reply_err("No space left on device").wait().unwrap();
-                    }
-                    Answer::Nothing | Answer::NoClaim => {}
-                    Answer::Hang => {
-                        drop(heard);
-                        while matches!(*answer.lock().unwrap(), Answer::Hang) {
-                            std::thread::sleep(Duration::from_millis(20));
-                        }
-                    }
-                }
+                drop(heard);
+                answer_scores(&query, &answer, new);
             } else {
                 match decode(&message).unwrap() {
                     JobRequest::HandBack { failed, .. } => {
