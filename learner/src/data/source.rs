@@ -149,14 +149,6 @@ mod tests {
     }
 
     #[test]
-    fn what_is_not_there_is_named() {
-        for source in ["minari:no/such-v0", "nowhere/x.hdf5"] {
-            let error = format!("{:#}", Source::parse(source).unwrap().obtain().unwrap_err());
-            assert!(error.contains(source), "{error}");
-        }
-    }
-
-    #[test]
     fn the_checksum_of_a_folder_is_that_of_its_data() {
         let folder = tempfile::tempdir().unwrap();
         std::fs::write(folder.path().join("main_data.hdf5"), "abc").unwrap();

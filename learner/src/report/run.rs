@@ -11,7 +11,7 @@ use serde::Serialize;
 use super::spread::Spread;
 use super::table::{Style, Table};
 use crate::algorithms::Hyperparameters;
-use crate::config::{ConfigError, RunConfig};
+use crate::config::RunConfig;
 use crate::run_dir::{RunDir, RunDirError, ScoreLine};
 
 /// Gradient steps at the end of a run over which the paper's appendix B takes the mean.
@@ -91,10 +91,10 @@ impl RunReport {
     /// There is no run in it, or a file is not what a learner writes.
     pub fn read(path: &Path) -> Result<Self, RunDirError> {
         let (dir, config) = RunDir::open(path)?;
-        let unusable = |error: ConfigError| RunDirError::Content {
+        let unusable = |error: anyhow::Error| RunDirError::Content {
             path: path.join("config.toml"),
             line: None,
-            reason: error.to_string(),
+            reason: format!("{error:#}"),
         };
         let agent = config.experiment.hyperparameters().map_err(unusable)?;
         Ok(Self::new(path, config, &*agent, &dir.read_scores()?))
