@@ -13,7 +13,7 @@ use quad_learner::algorithms::{Setting, named};
 use quad_learner::config::resolve;
 use quad_learner::metrics::Metrics;
 use quad_learner::run_dir::Checkpoint;
-use quad_learner::schedule::Schedule;
+use quad_learner::config::Schedule;
 use quad_learner::train::{self, Outcome, Outlets, Plan, TrainError, train};
 use quad_policy::Precision;
 use quad_protocol::Name;

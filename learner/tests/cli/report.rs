@@ -220,7 +220,12 @@ fn what_is_not_the_papers_protocol_is_called_so() {
 fn the_number_of_goals_stands_beside_the_score_where_a_run_has_one() {
     let reported = report(&paper("antmaze-umaze-v0", 100_000, |_| 50.0));
     assert_eq!(reported.group()["goals"], json!(4));
-    reported.says(&["4, 4 goals", "4 seeds with a goal each", "4 goals stand behind the ±", "50 to 100 seeds"]);
+    reported.says(&[
+        "4, 4 goals",
+        "4 seeds with a goal each",
+        "one goal a run: 4 behind this ±",
+        "asks for 50 to 100 seeds",
+    ]);
     let reported = report(&paper(HOPPER, 100_000, |_| 50.0));
     assert!(reported.group()["goals"].is_null() && !reported.text.contains("goal"), "{}", reported.text);
 }
