@@ -126,6 +126,7 @@ fn a_run_that_is_not_complete_is_marked_over_seeds() {
     let words = "2 of 6 evaluations are complete, the last of them after 2000 of 6000 steps";
     assert!(marked.as_str().unwrap().ends_with(words), "{marked}");
     reported.has_row(&["Not complete: in ", words]);
+    reported.has_row(&["hopper-demo", "6000 steps (not complete)"]);
 }
 
 #[test]
