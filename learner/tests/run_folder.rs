@@ -1,8 +1,6 @@
 //! A run folder as the learner writes it.
 #![allow(clippy::unwrap_used, clippy::expect_used)]
 
-use std::path::Path;
-
 use quad_learner::config::{DatasetInfo, RunConfig, RunInfo, resolve};
 use quad_learner::run_dir::{RunDir, RunDirError, ScoreLine};
 use toml::Table;

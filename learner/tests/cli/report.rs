@@ -204,7 +204,7 @@ fn what_is_not_the_papers_protocol_is_called_so() {
         "20 of 100 evaluations are complete, the last of them after 400000 of 2000000 steps",
         "1 of 4 seeds",
     ];
-    assert_eq!(departures(&[stopped.clone()]), expected);
+    assert_eq!(departures(std::slice::from_ref(&stopped)), expected);
     // The named file in another place, known by its checksum.
     let sha256 = "e121c5f7c9857a307baa9edc6a2c3b48e85fedb9ac316ecddd0f48ca7ef4e39b";
     assert_eq!(departures(&[stopped.set(&[("dataset.sha256", sha256.into())])]), expected[1..]);
