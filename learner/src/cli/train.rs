@@ -22,9 +22,9 @@ Examples:
 
   # Go on after a crash or Ctrl-C: the same command again.
 
-Ctrl-C or SIGTERM stops early with a checkpoint, and the exit code is 1; a second one ends at once. The same command goes on
-from the run folder's newest checkpoint. On the same machine a run that was interrupted ends with the same weights, bit for
-bit, as one that was not.";
+At Ctrl-C or SIGTERM the learner saves a checkpoint and ends with exit code 1; at a second one it ends at once. The same
+command goes on from the run folder's newest checkpoint. On the same machine a run that was interrupted ends with the same
+weights, bit for bit, as one that was not.";
 
 /// Arguments of `learner train`.
 #[derive(Debug, Args)]
@@ -60,7 +60,7 @@ pub struct TrainArgs {
     /// Serve /metrics and /healthz here; port 0 takes a free one (see DIR/endpoints.json)
     #[arg(long, value_name = "ADDR:PORT", default_value = "127.0.0.1:0")]
     pub metrics: SocketAddr,
-    /// Train on the CPU, or on the first Nvidia GPU, with a learner that was built by deploy/cuda.sh
+    /// Train on the CPU, or on the first Nvidia GPU, which needs a learner that deploy/cuda.sh has built
     #[arg(long, value_name = "cpu|cuda", value_enum, hide_possible_values = true, default_value_t)]
     pub device: Device,
     /// Any other value of the preset, in TOML's notation: agent.tau=0.5, environment=my-robot; repeatable

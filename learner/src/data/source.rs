@@ -109,7 +109,7 @@ mod tests {
     #[test]
     fn a_word_is_a_name_a_path_or_neither() {
         let named = Source::parse("walker2d-medium-replay-v2").unwrap();
-        assert_eq!(named.entry().unwrap().file, "walker2d_medium-replay-v2.hdf5");
+        assert_eq!(named.entry().unwrap().file, "walker2d_medium_replay-v2.hdf5");
         assert_eq!(Source::parse("minari:a/b-v0").unwrap(), Source::Minari("a/b-v0".to_owned()));
         for path in ["data/missing.hdf5", "missing.npz", "./hopper-medium-v2", "/tmp"] {
             assert_eq!(Source::parse(path).unwrap(), Source::Path(path.into()));
@@ -145,14 +145,6 @@ mod tests {
         ] {
             let checked = Source::parse(source).unwrap().check_environment(environment);
             assert_eq!(checked.is_ok(), fits, "{source} for {environment}: {checked:?}");
-        }
-    }
-
-    #[test]
-    fn what_is_not_there_is_named() {
-        for source in ["minari:no/such-v0", "nowhere/x.hdf5"] {
-            let error = format!("{:#}", Source::parse(source).unwrap().obtain().unwrap_err());
-            assert!(error.contains(source), "{error}");
         }
     }
 
