@@ -250,12 +250,12 @@ impl RunClient {
         let mut answered = false;
         while self.has_scores() {
             let Err(error) = self.deliver(LEAVE / 2).await else { return };
-            info!(run = %self.run, "scores are not acknowledged: {error:#}");
             // A learner that answers has the scores, and may still save them: if it could not yet, it says why. If the job went
             // back now, other evaluators would measure it again.
             let unusable = matches!(error.downcast_ref(), Some(AskError::Unusable { .. }));
             answered |= unusable;
             if !unusable || Instant::now() + AGAIN > until {
+                warn!(run = %self.run, "the learner has not acknowledged the scores: {error:#}");
                 break;
             }
             tokio::time::sleep(AGAIN).await;

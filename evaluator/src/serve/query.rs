@@ -116,6 +116,8 @@ fn read<A: Message>(
 
 #[cfg(test)]
 mod tests {
+    use std::sync::Arc;
+    use std::sync::atomic::{AtomicBool, Ordering::Relaxed};
     use std::time::Instant;
 
     use quad_protocol::JobReply;
@@ -144,20 +146,29 @@ mod tests {
         let listen = Endpoints { listen: vec!["tcp/127.0.0.1:0".to_owned()], ..Endpoints::default() };
         let learner = open_session(&listen).await.unwrap();
         // As long as this callback has not returned, the learner's session reads nothing.
-        let stalled = |_| std::thread::sleep(Duration::from_secs(10));
-        let _stalled = learner.declare_subscriber("flood").callback(stalled).await.unwrap();
+        let stalls = Arc::new(AtomicBool::new(true));
+        let callback = {
+            let stalls = stalls.clone();
+            move |_| {
+                while stalls.load(Relaxed) {
+                    std::thread::sleep(Duration::from_millis(10));
+                }
+            }
+        };
+        let _flooded = learner.declare_subscriber("flood").callback(callback).await.unwrap();
         let _jobs = learner.declare_queryable("quad/run/jobs").callback(|_| ()).await.unwrap();
         let connect = Endpoints { connect: reachable_at(&learner, &listen).await.unwrap(), ..Endpoints::default() };
         let evaluator = open_session(&connect).await.unwrap();
         tokio::time::sleep(Duration::from_secs(1)).await;
-        for _ in 0..20 {
+        for _ in 0..2000 {
             // More than the connection's buffers hold.
-            evaluator.put("flood", vec![0; 1 << 20]).await.unwrap();
+            evaluator.put("flood", vec![0; 20_000]).await.unwrap();
         }
         let metrics = Metrics::new().unwrap();
         let (key, timeout) = ("quad/run/jobs".to_owned(), Duration::from_secs(1));
         let asked = ask(&evaluator, key, Vec::new(), timeout, &metrics, |_: &JobReply| Ok(()));
         let pause = longest_pause(asked).await;
+        stalls.store(false, Relaxed);
         assert!(pause < Duration::from_millis(500), "the task stood still for {pause:?}");
     }
 }

@@ -34,6 +34,8 @@ pub enum Answer {
     Recorded,
     DiskFull,
     Nothing,
+    /// The learner reads nothing more, as long as this is the answer.
+    Hang,
 }
 
 /// A learner that has one job.
@@ -91,12 +93,12 @@ fn reply<M: Message>(query: &Query, message: &M) {
 }
 
 impl Learner {
-    pub async fn start(snapshot: Snapshot) -> Learner {
+    pub async fn start(published: Snapshot) -> Learner {
         let listen = Endpoints { listen: vec!["tcp/127.0.0.1:0".to_owned()], ..Endpoints::default() };
         let session = open_session(&listen).await.unwrap();
         let endpoint = reachable_at(&session, &listen).await.unwrap().remove(0);
         let (heard, answer) = (Arc::new(Mutex::new(Vec::new())), Arc::new(Mutex::new(Answer::Recorded)));
-        let learner = Learner { session, endpoint, heard, answer, job: Arc::default(), snapshot };
+        let learner = Learner { session, endpoint, heard, answer, job: Arc::default(), snapshot: published };
         let (heard, job, answer, weights) =
             (learner.heard.clone(), learner.job.clone(), learner.answer.clone(), learner.snapshot.clone());
         let callback = move |query: Query| {
@@ -112,12 +114,19 @@ impl Learner {
                 let new = report.episodes.len() as u32;
                 heard.push(Heard::Scores(report));
                 *job.lock().unwrap() = None;
-                match *answer.lock().unwrap() {
+                let now = *answer.lock().unwrap();
+                match now {
                     Answer::Recorded => {
                         reply(&query, &ScoreReply::Recorded { incarnation: INCARNATION, new, duplicates: 0 });
                     }
                     Answer::DiskFull => query.reply_err("No space left on device").wait().unwrap(),
                     Answer::Nothing => {}
+                    Answer::Hang => {
+                        drop(heard);
+                        while matches!(*answer.lock().unwrap(), Answer::Hang) {
+                            std::thread::sleep(Duration::from_millis(20));
+                        }
+                    }
                 }
             } else if let JobRequest::HandBack { failed, .. } = decode(&message).unwrap() {
                 heard.push(Heard::HandedBack(failed));
