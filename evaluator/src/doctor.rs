@@ -11,7 +11,7 @@ use quad_service::doctor::{self, Findings};
 use quad_service::{Endpoints, Role, default_endpoint, parse_endpoint};
 use zenoh::Session;
 
-use crate::rollout::Rollout;
+use crate::sim::Rollout;
 use crate::serve::DEFAULT_PORT;
 
 /// How long learners are waited for.

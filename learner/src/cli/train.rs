@@ -9,8 +9,7 @@ use quad_service::parse_endpoint;
 use toml::{Table, Value};
 
 use super::parse_preset;
-use crate::config::device::Device;
-use crate::presets;
+use crate::config::{Device, presets};
 
 pub(super) const EXAMPLES: &str = "\
 Examples:
@@ -41,12 +40,9 @@ pub struct TrainArgs {
     /// [default: runs/PRESET-VARIANT-seedSEED]
     #[arg(long, value_name = "DIR")]
     pub run_dir: Option<PathBuf>,
-    /// Seconds between two checkpoints, so many of which a crash may cost; longer where saving would take 1 % of the time
+    /// Seconds between two checkpoints, which is what a crash may cost; more where saving would take 1 % of the time
     #[arg(long, value_name = "N", default_value_t = 30, value_parser = value_parser!(u64).range(..=31_536_000))]
     pub checkpoint_seconds: u64,
-    /// Share of the episodes, 0 to 1, that another evaluator scores a second time: a score that differs in a bit is reported
-    #[arg(long, value_name = "SHARE", default_value_t = 0.0, value_parser = parse_share)]
-    pub audit: f64,
     /// Begin anew: a run that is in the folder already is kept under another name
     #[arg(long)]
     pub fresh: bool,
@@ -79,66 +75,60 @@ pub struct TrainArgs {
 #[command(next_help_heading = "Instead of the preset's value")]
 struct OverrideArgs {
     /// Gradient steps
-    #[arg(long, value_name = "N", value_parser = clap::value_parser!(i64).range(1..))]
+    #[arg(long, value_name = "N", value_parser = value_parser!(i64).range(1..))]
     steps: Option<i64>,
     /// Gradient steps between two evaluations; 0 trains without any evaluation
-    #[arg(long, value_name = "N", value_parser = clap::value_parser!(i64).range(0..))]
+    #[arg(long, value_name = "N", value_parser = value_parser!(i64).range(0..))]
     eval_interval: Option<i64>,
     /// Episodes per evaluation
-    #[arg(long, value_name = "N", value_parser = clap::value_parser!(i64).range(1..))]
+    #[arg(long, value_name = "N", value_parser = value_parser!(i64).range(1..))]
     episodes: Option<i64>,
     /// Seed of initial weights, batches, noise and the evaluations' episodes
-    #[arg(long, value_name = "N", value_parser = clap::value_parser!(i64).range(0..))]
+    #[arg(long, value_name = "N", value_parser = value_parser!(i64).range(0..))]
     seed: Option<i64>,
     /// What pulls the policy away from the data: quad (Q-gradients weighted by the critics' agreement),
     /// dac (Q-gradients as they are) or none (behaviour cloning)
     #[arg(long, value_name = "quad|dac|none")]
     guidance: Option<String>,
     /// Actions sampled per next state for the critics' target
-    #[arg(long, value_name = "N", value_parser = clap::value_parser!(i64).range(1..))]
+    #[arg(long, value_name = "N", value_parser = value_parser!(i64).range(1..))]
     samples: Option<i64>,
     /// Actions that an evaluated policy samples per state; the critics choose the best
-    #[arg(long, value_name = "N", value_parser = clap::value_parser!(i64).range(1..))]
+    #[arg(long, value_name = "N", value_parser = value_parser!(i64).range(1..))]
     candidates: Option<i64>,
-    /// Arithmetic of what no gradient is taken of, f32 or bf16: the latter is faster on CPUs with AMX or AMD's AVX512-BF16, and rounds
+    /// Precision of forward passes without gradient, f32 or bf16, which rounds and is faster on CPUs with AMX or AVX512-BF16
     #[arg(long, value_name = "NAME")]
     precision: Option<Precision>,
 }
 
 impl TrainArgs {
-    /// What the command line changes in the preset, where a flag of its own goes before `--set`.
+    /// What the command line changes in the preset. Where it says a value twice, a flag of its own wins over `--set`.
     pub fn changes(&self) -> Table {
-        let OverrideArgs { steps, eval_interval, episodes, seed, samples, candidates, .. } = self.overrides;
-        let numbers = [
-            ("steps", steps),
-            ("eval_interval", eval_interval),
-            ("episodes", episodes),
-            ("seed", seed),
-            ("candidates", candidates),
-        ];
-        let numbers = numbers.map(|(key, value)| (key, value.map(Value::from)));
-        let precision = self.overrides.precision.map(|precision| precision.name().into());
-        let words = [("dataset", self.dataset.clone().map(Value::from)), ("precision", precision)];
-        let guidance = self.overrides.guidance.clone().map(Value::from);
-        let agent = table([("guidance", guidance), ("samples", samples.map(Value::from))]);
-
+        let flags = &self.overrides;
+        let number = |value: Option<i64>| value.map(Value::from);
         let mut changes = Table::new();
-        let flags =
-            table(numbers.into_iter().chain(words).chain([("agent", (!agent.is_empty()).then(|| agent.into()))]));
-        for layer in self.set.iter().cloned().chain([flags]) {
-            presets::merge(&mut changes, layer);
+        for change in &self.set {
+            presets::merge(&mut changes, change.clone());
+        }
+        for (key, value) in [
+            ("dataset", self.dataset.clone().map(Value::from)),
+            ("steps", number(flags.steps)),
+            ("eval_interval", number(flags.eval_interval)),
+            ("episodes", number(flags.episodes)),
+            ("seed", number(flags.seed)),
+            ("candidates", number(flags.candidates)),
+            ("precision", flags.precision.map(|precision| precision.name().into())),
+        ] {
+            changes.extend(value.map(|value| (key.to_owned(), value)));
+        }
+        for (key, value) in [("guidance", flags.guidance.clone().map(Value::from)), ("samples", number(flags.samples))]
+        {
+            let Some(value) = value else { continue };
+            let agent = Table::from_iter([(key.to_owned(), value)]);
+            presets::merge(&mut changes, Table::from_iter([("agent".to_owned(), agent.into())]));
         }
         changes
     }
-}
-
-fn table(entries: impl IntoIterator<Item = (&'static str, Option<Value>)>) -> Table {
-    entries.into_iter().filter_map(|(key, value)| Some((key.to_owned(), value?))).collect()
-}
-
-fn parse_share(text: &str) -> Result<f64, String> {
-    let share = text.parse().ok().filter(|share| (0.0..=1.0).contains(share));
-    share.ok_or_else(|| "it must be a number from 0 to 1".to_owned())
 }
 
 #[cfg(test)]

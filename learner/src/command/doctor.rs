@@ -5,7 +5,7 @@ use quad_service::doctor::{self, Findings};
 use quad_service::{Endpoints, Role};
 
 use crate::cli::DoctorArgs;
-use crate::datasets;
+use crate::data;
 
 /// Where a learner listens by default.
 const PORT: u16 = 7447;
@@ -21,7 +21,7 @@ pub fn examine(args: &DoctorArgs) -> anyhow::Result<Findings> {
     findings.ok("precision", format!("this CPU is fastest in {fastest}"));
     hdf5(&mut findings);
     doctor::folder(&mut findings, "run folder", &args.run_dir, "another folder is chosen by --run-dir");
-    match datasets::cache::folder() {
+    match data::cache::folder() {
         Ok(folder) => doctor::folder(&mut findings, "datasets", &folder, "D4RL_DATASET_DIR chooses another folder"),
         Err(error) => findings.warn("datasets", format!("{error:#}"), "name a folder in D4RL_DATASET_DIR"),
     }

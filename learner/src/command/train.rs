@@ -14,13 +14,10 @@ use quad_service::{
 use tokio::sync::mpsc;
 use tracing::{debug, info, warn};
 
-use super::{print, resolve};
-use crate::cli::TrainArgs;
-use crate::config::{DatasetInfo, Experiment, RunConfig, RunInfo};
-use crate::datasets::{LocalDataset, Source};
-use crate::plot;
-use crate::presets;
-use crate::report::RunReport;
+use crate::cli::{TrainArgs, print};
+use crate::config::{DatasetInfo, Experiment, RunConfig, RunInfo, presets, resolve};
+use crate::data::{LocalDataset, Source};
+use crate::report::{RunReport, learning_curves};
 use crate::run::{self, Begun, Log, Past, RunDir};
 use crate::service::{Display, Ending, Life, MainLoop, Metrics, Run, STUCK, Threads, open_network};
 
@@ -158,10 +155,10 @@ fn endpoints(args: &TrainArgs, eval_interval: u64) -> anyhow::Result<Endpoints> 
     };
     let endpoints = Endpoints { listen, connect: Vec::from_iter(args.connect.clone()), certificates };
     endpoints.check().hint_of(SessionError::hint)?;
-    if let Some(endpoint) = endpoints.open_to_anybody() {
+    if let Some(endpoint) = endpoints.open_to_all() {
         warn!(
-            "whoever reaches {endpoint} may read weights and send scores; in a network that you do not trust, use \
-             --certificates DIR, and load deploy/zenoh/firewall.nft (docs/security.md)"
+            "every machine that reaches {endpoint} may read weights and send scores: in a network that you do not trust, use \
+             --certificates DIR (docs/security.md)"
         );
     }
     Ok(endpoints)
@@ -219,7 +216,7 @@ fn summarise(run_dir: &RunDir) -> anyhow::Result<RunReport> {
     if !report.evaluations.is_empty() {
         run_dir.write_json("report.json", &report)?;
         let picture = run_dir.learning_curve();
-        plot::learning_curves(&picture, std::slice::from_ref(&report))?;
+        learning_curves(&picture, std::slice::from_ref(&report))?;
         text = format!("\n{}\nlearning curve: {}\n", report.table(), picture.display());
     }
     print(&format!("{text}run folder: {}", run_dir.path().display()))?;
@@ -250,7 +247,7 @@ fn run_config(
     Ok(RunConfig {
         run: RunInfo {
             name: name.to_string(),
-            incarnation: now()?,
+            started: now()?,
             preset: presets::label(&args.preset),
             version: env!("CARGO_PKG_VERSION").to_owned(),
             device: args.device,

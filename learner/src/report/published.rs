@@ -5,8 +5,6 @@ use std::sync::LazyLock;
 
 use serde::{Deserialize, Serialize};
 
-use super::Spread;
-
 /// Training seeds behind a figure of the paper (section 5.1).
 pub const SEEDS: usize = 4;
 
@@ -15,10 +13,19 @@ pub const SEEDS: usize = 4;
 pub struct Published {
     /// The method, as the paper calls it.
     pub method: &'static str,
-    /// Its D4RL-normalised score; the deviation is over seeds.
-    pub score: Spread,
+    /// Its D4RL-normalised score.
+    pub score: Printed,
     /// Where it stands.
     pub source: &'static str,
+}
+
+/// A figure as it is printed.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize)]
+pub struct Printed {
+    /// The mean over seeds.
+    pub mean: f64,
+    /// What stands behind its ±, if it has one. The paper does not say which convention that follows.
+    pub std: Option<f64>,
 }
 
 #[derive(Deserialize)]
@@ -45,7 +52,7 @@ pub fn scores(preset: &str) -> Vec<Published> {
     let scores = TABLES.scores.get(preset);
     let published = |method: &'static Method| {
         let figures = scores?.get(&method.name)?;
-        let score = Spread { mean: *figures.first()?, std: figures.get(1).copied() };
+        let score = Printed { mean: *figures.first()?, std: figures.get(1).copied() };
         Some(Published { method: &method.name, score, source: &method.source })
     };
     TABLES.method.iter().filter_map(published).collect()

@@ -8,11 +8,14 @@ use std::path::{Path, PathBuf};
 use quad_dataset::environment;
 use serde::Serialize;
 
-use super::table::{Style, Table, spread};
-use super::{FINAL_STEPS, Spread};
+use super::spread::Spread;
+use super::table::{Style, Table};
 use crate::algorithms::Hyperparameters;
-use crate::config::RunConfig;
+use crate::config::{ConfigError, RunConfig};
 use crate::run::{RunDir, RunDirError, ScoreLine};
+
+/// Gradient steps at the end of a run over which the paper's appendix B takes the mean.
+const FINAL_STEPS: u64 = 50_000;
 
 /// One snapshot's episodes.
 #[derive(Clone, Debug, PartialEq, Serialize)]
@@ -61,7 +64,7 @@ pub struct RunReport {
     pub steps: u64,
     /// Whether scores are D4RL-normalised; without reference returns they are returns.
     pub normalised: bool,
-    /// Arithmetic that the policies were scored in; several, if evaluators differed.
+    /// Precision that the policies were scored in; several, if evaluators differed.
     pub scored_in: String,
     /// Mean score of the dataset's trajectories, of the same kind.
     pub dataset_score: f64,
@@ -76,6 +79,8 @@ pub struct RunReport {
     /// The same of those in the last 50,000 steps of the run; absent if it has no more steps than that.
     pub mean_last_50000_steps: Option<f64>,
     #[serde(skip)]
+    pub(super) precisions: BTreeSet<String>,
+    #[serde(skip)]
     pub(super) config: RunConfig,
 }
 
@@ -86,7 +91,7 @@ impl RunReport {
     /// There is no run in it, or a file is not what a learner writes.
     pub fn read(path: &Path) -> Result<Self, RunDirError> {
         let (dir, config) = RunDir::open(path)?;
-        let unusable = |error: crate::config::ConfigError| RunDirError::Content {
+        let unusable = |error: ConfigError| RunDirError::Content {
             path: path.join("config.toml"),
             line: None,
             reason: error.to_string(),
@@ -101,16 +106,16 @@ impl RunReport {
         for line in lines {
             by_step.entry(line.step).or_default().insert(line.seed, line);
         }
+        let scored = |step| by_step.get(&step).map_or(0, BTreeMap::len);
+        let missing = |step| Missing { step, episodes: (experiment.episodes as usize).saturating_sub(scored(step)) };
+        let missing = experiment.schedule().evaluated_steps().map(missing);
+        let missing = missing.filter(|missing| missing.episodes > 0).collect();
         let evaluations: Vec<_> = by_step
             .into_iter()
             .filter_map(|(step, episodes)| {
                 evaluation(step, &Vec::from_iter(episodes.into_values()), experiment.episodes)
             })
             .collect();
-        let scored = |step| evaluations.iter().find(|e| e.step == step).map_or(0, |e| e.episodes);
-        let missing = |step| Missing { step, episodes: (experiment.episodes as usize).saturating_sub(scored(step)) };
-        let missing =
-            experiment.schedule().evaluated_steps().map(missing).filter(|missing| missing.episodes > 0).collect();
         let complete: Vec<_> = evaluations.iter().filter(|e| e.complete).map(|e| (e.step, e.score.mean)).collect();
         let mean = |evaluations: &[(u64, f64)]| {
             let scores: Vec<_> = evaluations.iter().map(|(_, score)| *score).collect();
@@ -119,6 +124,7 @@ impl RunReport {
         let last = |count: usize| mean(&complete[complete.len().checked_sub(count)?..]);
         let final_steps = experiment.steps.checked_sub(FINAL_STEPS).filter(|start| *start > 0);
         let in_final_steps = |start| mean(&complete[complete.partition_point(|(step, _)| *step <= start)..]);
+        let precisions: BTreeSet<String> = lines.iter().map(precision).collect();
         Self {
             dir: path.to_owned(),
             run: config.run.name.clone(),
@@ -129,15 +135,41 @@ impl RunReport {
             seed: experiment.seed,
             steps: experiment.steps,
             normalised: environment::find(&experiment.environment).is_ok(),
-            scored_in: precisions(lines),
+            scored_in: joined(&precisions),
             dataset_score: config.dataset.mean_score.unwrap_or(config.dataset.mean_return),
             mean_last_3: last(3),
             mean_last_5: last(5),
             mean_last_50000_steps: final_steps.and_then(in_final_steps),
             evaluations,
             missing,
+            precisions,
             config,
         }
+    }
+
+    /// Whether every episode of every evaluation has its score.
+    pub fn is_complete(&self) -> bool {
+        self.missing.is_empty()
+    }
+
+    /// How many of the planned evaluations have all their scores.
+    pub fn evaluations_complete(&self) -> usize {
+        self.evaluations_planned() - self.missing.len()
+    }
+
+    fn evaluations_planned(&self) -> usize {
+        self.config.experiment.schedule().evaluated_steps().count()
+    }
+
+    /// How far it has come, in words.
+    pub fn how_complete(&self) -> String {
+        let last = self.evaluations.iter().rfind(|evaluation| evaluation.complete).map_or(0, |e| e.step);
+        format!(
+            "{} of {} evaluations are complete, the last of them after {last} of {} steps",
+            self.evaluations_complete(),
+            self.evaluations_planned(),
+            self.steps
+        )
     }
 
     /// What its scores are: normalised scores, or returns.
@@ -147,44 +179,40 @@ impl RunReport {
 
     /// The evaluations as a table for people.
     pub fn table(&self) -> String {
+        let mut header = vec!["step", "episodes", self.measure(), "length"];
+        // Without reference returns the score is the return.
+        if self.normalised {
+            header.insert(3, "return");
+        }
+        let mut table = Table::new(&Vec::from_iter(header.into_iter().map(|name| (name, Right))));
+        for e in &self.evaluations {
+            let episodes = e.episodes.to_string() + if e.complete { "" } else { " (part)" };
+            let mut row = vec![e.step.to_string(), episodes, e.score.text(), format!("{:.1}", e.mean_length)];
+            if self.normalised {
+                row.insert(3, format!("{:.1}", e.mean_return));
+            }
+            table.push(row);
+        }
         let mut text = format!(
             "{}: preset {}, {}, {} candidates, {} steps, seed {}, scored in {}\n\n",
             self.run, self.preset, self.agent, self.candidates, self.steps, self.seed, self.scored_in
-        );
-        let episodes = |e: &EvaluationReport| match e.complete {
-            true => e.episodes.to_string(),
-            false => format!("{} (part)", e.episodes),
-        };
-        let mut table = Table::new(["step", "episodes", self.measure(), "length"].map(|name| (name, Right)));
-        let mut with_returns = Table::new(["step", "episodes", "score", "return", "length"].map(|name| (name, Right)));
-        for e in &self.evaluations {
-            let (step, score, length) = (e.step.to_string(), spread(e.score, 2), format!("{:.1}", e.mean_length));
-            table.push([step.clone(), episodes(e), score.clone(), length.clone()]);
-            with_returns.push([step, episodes(e), score, format!("{:.1}", e.mean_return), length]);
-        }
-        text.push_str(&if self.normalised { with_returns.render(Style::Text) } else { table.render(Style::Text) });
+        ) + &table.render(Style::Text);
         if self.evaluations.is_empty() {
             text.push_str("(no evaluation has a score yet)\n");
         }
-        if let (Some(first), Some(last)) = (self.missing.first(), self.missing.last()) {
+        // Writing to a string cannot fail.
+        if !self.is_complete() {
             let episodes: usize = self.missing.iter().map(|missing| missing.episodes).sum();
-            let steps = if first == last {
-                format!("step {}", first.step)
-            } else {
-                format!("steps {} to {}", first.step, last.step)
-            };
-            writeln!(text, "{episodes} episodes of {steps} have no score").ok();
+            writeln!(text, "{episodes} episodes have no score: {}", self.how_complete()).ok();
         }
         text.push('\n');
-        let figures = [
+        for (name, mean) in [
             ("last 3 evaluations:", self.mean_last_3),
             ("last 5 evaluations:", self.mean_last_5),
             ("last 50000 steps:", self.mean_last_50000_steps),
             ("dataset:", Some(self.dataset_score)),
-        ];
-        for (name, mean) in figures {
+        ] {
             if let Some(mean) = mean {
-                // Writing to a string cannot fail.
                 writeln!(text, "mean {} of the {name:19} {mean:.2}", self.measure()).ok();
             }
         }
@@ -206,15 +234,16 @@ fn evaluation(step: u64, episodes: &[&ScoreLine], expected: u32) -> Option<Evalu
     })
 }
 
-/// The precisions that scored, each once, whatever instructions they were computed by.
-fn precisions(lines: &[ScoreLine]) -> String {
-    let said = |line: &ScoreLine| match line.precision.split('-').next() {
+/// The precision of a score, whatever instructions it was computed by.
+fn precision(line: &ScoreLine) -> String {
+    match line.precision.split('-').next() {
         None | Some("") => "unknown".to_owned(),
         Some(precision) => precision.to_owned(),
-    };
-    let precisions: BTreeSet<String> = lines.iter().map(said).collect();
-    match precisions.is_empty() {
-        true => "-".to_owned(),
-        false => Vec::from_iter(precisions).join(" and "),
     }
+}
+
+/// `bf16 and f32`; a dash of none.
+pub(super) fn joined<'a>(precisions: impl IntoIterator<Item = &'a String>) -> String {
+    let precisions: BTreeSet<&str> = precisions.into_iter().map(String::as_str).collect();
+    if precisions.is_empty() { "-".to_owned() } else { Vec::from_iter(precisions).join(" and ") }
 }

@@ -2,17 +2,18 @@
 
 use std::collections::BTreeSet;
 
-use quad_dataset::catalogue::{self, Checksum};
+use quad_dataset::{Goal, environment};
 use serde::Serialize;
 
-use super::Spread;
+use super::departures::departures;
 use super::published::{self, Published};
-use super::run::RunReport;
-use crate::config::device::Device;
-use crate::config::{self, Experiment};
-use crate::settings::{self, Settings, differences};
+use super::run::{RunReport, joined};
+use super::spread::Spread;
+use crate::config::Device;
+use crate::config::settings::{self, Settings, differences};
 
-/// Runs that differ in their seed alone: in preset, data, device, precision and every hyper-parameter they agree.
+/// Runs that differ in their seed alone: in preset, data, device and every hyper-parameter they agree. The precision in which
+/// evaluators scored them may differ; it is named.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct GroupReport {
     /// The preset.
@@ -23,22 +24,26 @@ pub struct GroupReport {
     pub agent: String,
     /// Actions sampled per state in an evaluation.
     pub candidates: u32,
-    /// Gradient steps.
+    /// Gradient steps that were asked for.
     pub steps: u64,
     /// Where they trained.
     pub device: Device,
     /// Whether scores are D4RL-normalised; without reference returns they are returns.
     pub normalised: bool,
-    /// Arithmetic that the policies were scored in.
+    /// Precision that the policies were scored in; several, if evaluators differed.
     pub scored_in: String,
     /// The seeds, one for each run that is counted.
     pub seeds: Vec<u64>,
+    /// Different goals behind the scores, in an environment that draws one for a whole run.
+    pub goals: Option<usize>,
     /// `mean_last_3` over the runs; absent if one of them has none.
     pub mean_last_3: Option<Spread>,
     /// The same of `mean_last_5`.
     pub mean_last_5: Option<Spread>,
     /// The same of `mean_last_50000_steps`.
     pub mean_last_50000_steps: Option<Spread>,
+    /// Runs that are counted although evaluations of them are missing, each with how many there are.
+    pub unfinished: Vec<String>,
     /// Runs that are not counted, each with the reason.
     pub left_out: Vec<String>,
     /// The settings in which other runs of the preset differ from these.
@@ -49,11 +54,23 @@ pub struct GroupReport {
     pub published: Vec<Published>,
 }
 
+impl GroupReport {
+    /// What stands behind the scores, in words.
+    pub fn behind(&self) -> String {
+        let seeds = self.seeds.len();
+        let plural = if seeds == 1 { "" } else { "s" };
+        let goals = self.goals.map(|_| " with a goal each").unwrap_or_default();
+        let (steps, device, scored_in) = (self.steps, self.device.name(), &self.scored_in);
+        format!("{seeds} seed{plural}{goals}, {steps} steps on {device}, scored in {scored_in}")
+    }
+}
+
 /// Sorts runs into groups, in the order in which they are given.
-pub(super) fn groups(runs: &[RunReport]) -> Vec<GroupReport> {
+pub fn groups(runs: &[RunReport]) -> Vec<GroupReport> {
     let mut groups: Vec<(Settings, Vec<&RunReport>)> = Vec::new();
     for run in runs {
-        let settings = settings(run);
+        let mut settings = settings::of_run(&run.config);
+        settings.remove("seed");
         match groups.iter_mut().find(|(known, members)| members[0].preset == run.preset && *known == settings) {
             Some((_, members)) => members.push(run),
             None => groups.push((settings, vec![run])),
@@ -87,7 +104,11 @@ fn group(runs: &[&RunReport], differs: Vec<String>) -> GroupReport {
         Spread::of(&values?)
     };
     let first = runs[0];
+    let scored_in = joined(counted.iter().flat_map(|run| &run.precisions));
     let published = published::scores(&first.preset);
+    let environment = environment::find(&first.config.experiment.environment).ok();
+    let has_one_goal = environment.is_some_and(|environment| environment.goal == Some(Goal::EachInstance));
+    let unfinished = counted.iter().filter(|run| !run.is_complete());
     GroupReport {
         preset: first.preset.clone(),
         variant: first.variant.clone(),
@@ -96,62 +117,16 @@ fn group(runs: &[&RunReport], differs: Vec<String>) -> GroupReport {
         steps: first.steps,
         device: first.config.run.device,
         normalised: first.normalised,
-        scored_in: first.scored_in.clone(),
         seeds: counted.iter().map(|run| run.seed).collect(),
+        goals: has_one_goal.then_some(counted.len()),
         mean_last_3: over(|run| run.mean_last_3),
         mean_last_5: over(|run| run.mean_last_5),
         mean_last_50000_steps: over(|run| run.mean_last_50000_steps),
+        unfinished: unfinished.map(|run| format!("in {} {}", run.dir.display(), run.how_complete())).collect(),
         left_out,
         differs,
-        departures: if published.is_empty() { Vec::new() } else { departures(first, &counted) },
+        departures: if published.is_empty() { Vec::new() } else { departures(&counted, &scored_in) },
+        scored_in,
         published,
     }
-}
-
-/// Everything that runs must share to be averaged over their seeds.
-fn settings(run: &RunReport) -> Settings {
-    let mut settings = settings::of_run(&run.config);
-    settings.remove("seed");
-    settings.insert("scored in".to_owned(), run.scored_in.clone());
-    settings
-}
-
-fn experiment(experiment: &Experiment) -> Settings {
-    let mut settings = settings::of_experiment(experiment);
-    settings.remove("seed");
-    settings
-}
-
-/// Whether a run learnt from the dataset of that name, whatever it was called on the command line.
-fn is_trained_on(run: &RunReport, dataset: Option<&str>) -> bool {
-    let known = dataset.and_then(catalogue::find).filter(|known| known.sha256 != Checksum::default());
-    let same_file =
-        run.config.dataset.sha256.as_ref().zip(known).is_some_and(|(sha256, known)| known.sha256.matches(sha256));
-    same_file || run.config.experiment.dataset.as_deref() == dataset
-}
-
-/// In which ways runs of one of the paper's presets are not what the paper ran.
-fn departures(run: &RunReport, counted: &[&RunReport]) -> Vec<String> {
-    let Ok(paper) = config::resolve(&run.preset, &toml::Table::new()) else { return Vec::new() };
-    let mut departures = Vec::new();
-    let ours = &run.config.experiment;
-    if !is_trained_on(run, paper.dataset.as_deref()) {
-        let name = |dataset: &Option<String>| dataset.clone().unwrap_or_else(|| "not named".to_owned());
-        departures.push(format!("dataset is {}, not {}", name(&ours.dataset), name(&paper.dataset)));
-    }
-    let (ours, paper) = (experiment(ours), experiment(&paper));
-    let keys: BTreeSet<&String> = differences(&ours, &paper).collect();
-    for key in keys {
-        let value = |settings: &Settings| settings.get(key).cloned().unwrap_or_else(|| "absent".to_owned());
-        departures.push(format!("{key} is {}, not {}", value(&ours), value(&paper)));
-    }
-    let planned = run.steps.checked_div(run.config.experiment.eval_interval).unwrap_or(0);
-    let complete = |run: &&RunReport| run.evaluations.iter().filter(|e| e.complete).count() as u64;
-    if let Some(fewest) = counted.iter().map(complete).min().filter(|fewest| *fewest < planned) {
-        departures.push(format!("{fewest} of {planned} evaluations are complete"));
-    }
-    if counted.len() < published::SEEDS {
-        departures.push(format!("{} of {} seeds", counted.len(), published::SEEDS));
-    }
-    departures
 }

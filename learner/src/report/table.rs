@@ -3,8 +3,6 @@
 use std::fmt::Alignment::{self, Left, Right};
 use std::fmt::Write;
 
-use super::Spread;
-
 /// How a report is written.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Style {
@@ -15,26 +13,28 @@ pub enum Style {
 }
 
 /// A table: how each column is aligned, and rows of cells, of which the first is the header.
-pub(super) struct Table<const COLUMNS: usize> {
-    columns: [Alignment; COLUMNS],
-    rows: Vec<[String; COLUMNS]>,
+pub struct Table {
+    columns: Vec<Alignment>,
+    rows: Vec<Vec<String>>,
 }
 
-impl<const COLUMNS: usize> Table<COLUMNS> {
-    pub(super) fn new(header: [(&str, Alignment); COLUMNS]) -> Self {
-        Self { columns: header.map(|(_, alignment)| alignment), rows: vec![header.map(|(name, _)| name.to_owned())] }
+impl Table {
+    pub fn new(header: &[(&str, Alignment)]) -> Self {
+        let columns = header.iter().map(|(_, alignment)| *alignment).collect();
+        Self { columns, rows: vec![header.iter().map(|(name, _)| (*name).to_owned()).collect()] }
     }
 
-    pub(super) fn push(&mut self, row: [String; COLUMNS]) {
-        self.rows.push(row);
+    /// A row has a cell for each column.
+    pub fn push(&mut self, row: impl Into<Vec<String>>) {
+        self.rows.push(row.into());
     }
 
-    pub(super) fn render(&self, style: Style) -> String {
+    pub fn render(&self, style: Style) -> String {
         let width = |column: usize| self.rows.iter().map(|row| row[column].chars().count()).max().unwrap_or(0);
-        let widths: [usize; COLUMNS] = std::array::from_fn(width);
+        let widths: Vec<usize> = (0..self.columns.len()).map(width).collect();
         let mut text = String::new();
         for (index, row) in self.rows.iter().enumerate() {
-            let cells = row.iter().zip(widths).zip(self.columns).map(|((cell, width), alignment)| match alignment {
+            let cells = row.iter().zip(&widths).zip(&self.columns).map(|((cell, width), alignment)| match alignment {
                 Left => format!("{cell:<width$}"),
                 _ => format!("{cell:>width$}"),
             });
@@ -45,25 +45,12 @@ impl<const COLUMNS: usize> Table<COLUMNS> {
                 Style::Markdown => writeln!(text, "| {} |", cells.join(" | ")).ok(),
             };
             if index == 0 && style == Style::Markdown {
-                let rule = self.columns.map(|alignment| if alignment == Right { "---:" } else { "---" });
-                writeln!(text, "| {} |", rule.join(" | ")).ok();
+                let rule = self.columns.iter().map(|alignment| if *alignment == Right { "---:" } else { "---" });
+                writeln!(text, "| {} |", Vec::from_iter(rule).join(" | ")).ok();
             }
         }
         text
     }
-}
-
-/// `mean ± std` with so many digits after the point; a single value has no deviation.
-pub(super) fn spread(Spread { mean, std }: Spread, digits: usize) -> String {
-    match std {
-        Some(std) => format!("{mean:.digits$} ± {std:.digits$}"),
-        None => format!("{mean:.digits$}"),
-    }
-}
-
-/// The same of what may be missing.
-pub(super) fn cell(value: Option<Spread>) -> String {
-    value.map_or_else(|| "-".to_owned(), |value| spread(value, 2))
 }
 
 #[cfg(test)]
@@ -72,7 +59,7 @@ mod tests {
 
     #[test]
     fn columns_are_aligned_by_characters() {
-        let mut table = Table::new([("a", Left), ("b", Right)]);
+        let mut table = Table::new(&[("a", Left), ("b", Right)]);
         table.push(["long".to_owned(), "1".to_owned()]);
         table.push(["x".to_owned(), "1 ± 2".to_owned()]);
         assert_eq!(table.render(Style::Text), "a         b\nlong      1\nx     1 ± 2\n");

@@ -16,6 +16,7 @@ mod log;
 mod resume;
 #[cfg(test)]
 pub(crate) mod tests;
+pub(crate) mod verify;
 
 pub(crate) use checkpoints::Checkpoint;
 pub use error::RunDirError;

@@ -13,9 +13,8 @@ use super::error::RunDirError;
 use super::folder::RunDir;
 use super::lines::ScoreLine;
 use super::log::Log;
-use crate::config::{Experiment, RunConfig};
+use crate::config::{Experiment, RunConfig, settings};
 use crate::evaluation::Earlier;
-use crate::settings;
 
 /// The folder of a run that has begun, locked.
 pub(crate) struct Begun {

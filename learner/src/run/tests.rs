@@ -3,8 +3,7 @@
 use toml::Table;
 
 use super::{RunDir, RunDirError, ScoreLine};
-use crate::config::device::Device;
-use crate::config::{DatasetInfo, RunConfig, RunInfo, resolve};
+use crate::config::{DatasetInfo, Device, RunConfig, RunInfo, resolve};
 
 /// The configuration of a run.
 pub(crate) fn config(name: &str, seed: u64) -> RunConfig {
@@ -13,7 +12,7 @@ pub(crate) fn config(name: &str, seed: u64) -> RunConfig {
     RunConfig {
         run: RunInfo {
             name: name.into(),
-            incarnation: 1,
+            started: 1,
             preset: "hopper-demo".into(),
             version: "0.1.0".into(),
             device: Device::Cpu,

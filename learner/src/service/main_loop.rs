@@ -215,7 +215,7 @@ fn tell(event: Event, display: &mut Display) {
         ),
         Event::Evaluated { step, scores } => {
             let values: Vec<_> = scores.iter().map(|score| score.score).collect();
-            let Some(Spread { mean, std }) = Spread::of(&values) else { return };
+            let Some(Spread { mean, std, .. }) = Spread::of(&values) else { return };
             display.scored(step, mean);
             let std = std.map(|std| format!(" ± {std:.2}")).unwrap_or_default();
             format!("step {step}: score {mean:.2}{std} over {} episodes", values.len())

@@ -5,9 +5,10 @@
 //! thread `snapshots` takes it. The room `service` starts it.
 //!
 //! In reading order: `training` (the thread's work), `steps` (the loop), `agent` (an algorithm at work, saved and loaded),
-//! `pool` (rayon's threads kept awake), `outbox`, `metrics`.
+//! `device` (where it computes), `pool` (rayon's threads kept awake), `outbox`, `metrics`.
 
 pub mod agent;
+mod device;
 mod metrics;
 mod outbox;
 mod pool;

@@ -14,8 +14,8 @@ use super::agent::Agent;
 use super::metrics::TrainingMetrics;
 use super::outbox::{Outbox, TrainedPolicy};
 use crate::algorithms::{AlgorithmError, Metric};
+use crate::config::Schedule;
 use crate::run::Checkpoint;
-use crate::schedule::Schedule;
 
 /// Gradient steps that a line of `metrics.jsonl` averages over.
 const STEPS_PER_ROW: u64 = 100;

@@ -13,9 +13,8 @@ use super::outbox::{Outbox, Work};
 use super::steps::{self, Outcome, Outlets, Plan, TrainError, train};
 use super::{Registrar, TrainingMetrics};
 use crate::algorithms::{Setting, named};
-use crate::config::resolve;
+use crate::config::{Schedule, resolve};
 use crate::run::Checkpoint;
-use crate::schedule::Schedule;
 
 /// What a run has handed over.
 struct Result {

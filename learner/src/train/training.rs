@@ -13,8 +13,7 @@ use super::metrics::TrainingMetrics;
 use super::outbox::Outbox;
 use super::steps::{Outlets, Plan, TrainError, train};
 use crate::algorithms::Setting;
-use crate::config::Experiment;
-use crate::config::device::Device;
+use crate::config::{Device, Experiment};
 use crate::run::Checkpoint;
 
 const DIVERGED: &str = "the same configuration would diverge again: try a smaller agent.critic_learning_rate or \

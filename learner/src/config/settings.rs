@@ -4,8 +4,9 @@ use std::collections::BTreeMap;
 
 use serde::Serialize;
 
-use crate::config::{Experiment, RunConfig};
-use crate::presets;
+use super::experiment::Experiment;
+use super::presets;
+use super::run_config::RunConfig;
 
 /// Values by dotted key.
 pub type Settings = BTreeMap<String, String>;

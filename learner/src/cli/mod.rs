@@ -2,19 +2,20 @@
 
 mod train;
 
+use std::io::{ErrorKind, Write};
 use std::path::PathBuf;
 
 use clap::{Args, Parser, Subcommand};
 use quad_dataset::{EnvironmentSpec, environment};
 use quad_service::parse_endpoint;
 
-use crate::presets;
+use crate::config::presets;
 
 pub use train::TrainArgs;
 
 const FETCH_NOTE: &str = "\
-The file goes where D4RL keeps it: $D4RL_DATASET_DIR, or ~/.d4rl/datasets. $QUAD_DATASETS_URL, the address of a folder, is
-tried first. What a broken connection leaves is continued the next time.";
+The file goes where D4RL keeps it: $D4RL_DATASET_DIR, or ~/.d4rl/datasets. The learner tries $QUAD_DATASETS_URL, the address of
+a folder, first. It continues what a broken connection left, also the next time.";
 
 const DOCTOR_NOTE: &str = "\
 A line per check: ok, warn or FAIL, and a hint where there is something to do. The exit code is 1 if anything failed.";
@@ -134,11 +135,15 @@ fn parse_preset(text: &str) -> Result<String, String> {
     if presets::is_path(text) || presets::names().any(|name| name == text) {
         return Ok(text.to_owned());
     }
-    let nearest = match presets::nearest(text, presets::names())[..] {
-        [] => String::new(),
-        ref nearest => format!("did you mean {}? ", nearest.join(", ")),
-    };
-    Err(format!("{nearest}`learner presets` lists them all; a file of your own must end in .toml"))
+    Err(presets::unknown_hint(text))
+}
+
+/// Prints a result to stdout, where logs do not go. The reader may stop at any time, like `head` does.
+pub(crate) fn print(text: &str) -> anyhow::Result<()> {
+    match writeln!(std::io::stdout(), "{}", text.trim_end()) {
+        Err(error) if error.kind() == ErrorKind::BrokenPipe => Ok(()),
+        result => Ok(result?),
+    }
 }
 
 #[cfg(test)]
@@ -160,7 +165,7 @@ mod tests {
     #[test]
     fn wrong_command_lines_exit_with_2() {
         let wrong: [&[&str]; 10] = [
-            &["--audit", "5"],
+            &["--audit", "0.5"],
             &["--steps", "0"],
             &["--candidates", "0"],
             &["--seed", "9223372036854775808"],

@@ -7,9 +7,9 @@ use quad_dataset::{DatasetError, NamedDataset, catalogue, environment};
 use quad_service::Hint;
 
 use super::cache;
-use super::fetch::{FetchError, Fetcher};
+use super::fetch::{Fetcher, LocalDataset};
 use super::verify::sha256;
-use crate::presets::nearest;
+use crate::config::did_you_mean;
 
 /// A lab's own mirror: the address of a folder that is tried before the catalogue's.
 const MIRROR: &str = "QUAD_DATASETS_URL";
@@ -27,15 +27,6 @@ pub enum Source {
     Path(PathBuf),
 }
 
-/// A dataset on this machine.
-#[derive(Clone, Debug, PartialEq)]
-pub struct LocalDataset {
-    /// The file, or the folder if it is Minari's.
-    pub path: PathBuf,
-    /// SHA-256 of the file, or of the folder's `main_data.hdf5`.
-    pub sha256: String,
-}
-
 impl Source {
     /// Understands what was typed. A name of the catalogue comes before a file of that name; `./NAME` is the file.
     pub fn parse(text: &str) -> anyhow::Result<Self> {
@@ -44,10 +35,19 @@ impl Source {
         }
         let path = Path::new(text);
         let is_path = path.exists() || text.contains('/') || path.extension().is_some();
-        match named(text) {
+        match Self::named(text) {
             Err(_) if is_path => Ok(Self::Path(path.to_owned())),
-            dataset => dataset.map(Self::Named),
+            named => named,
         }
+    }
+
+    /// The catalogue's dataset of that name.
+    pub fn named(name: &str) -> anyhow::Result<Self> {
+        const LIST: &str = "`learner datasets list` prints all names; to train on a file, give its path";
+        let known = catalogue::all().iter().map(|dataset| dataset.name.as_str());
+        let nearest = did_you_mean(name, known).map(|nearest| nearest + " ").unwrap_or_default();
+        let found = catalogue::find(name).map(Self::Named);
+        found.ok_or_else(|| anyhow!("unknown dataset `{name}`")).hint(nearest + LIST)
     }
 
     /// The entry of the catalogue, for a path by the file's name.
@@ -79,9 +79,7 @@ impl Source {
         match self {
             Self::Named(dataset) => {
                 let mirror = std::env::var(MIRROR).ok().filter(|mirror| !mirror.is_empty());
-                let fetched = Fetcher::new(mirror).fetch(dataset, &cache::folder()?);
-                let (path, sha256) = fetched.hint_of(FetchError::hint)?;
-                Ok(LocalDataset { path, sha256 })
+                Fetcher::new(mirror).fetch(dataset, &cache::folder()?)
             }
             Self::Minari(id) => {
                 let path = quad_dataset::minari_folder(id);
@@ -97,18 +95,6 @@ impl Source {
     }
 }
 
-/// The catalogue's dataset of that name.
-pub fn named(name: &str) -> anyhow::Result<&'static NamedDataset> {
-    let unknown = || {
-        let known = catalogue::all().iter().map(|dataset| dataset.name.as_str());
-        let offer = nearest(name, known).join(", ");
-        anyhow!("unknown dataset `{name}`{}", if offer.is_empty() { offer } else { format!("; perhaps {offer}") })
-    };
-    catalogue::find(name)
-        .ok_or_else(unknown)
-        .hint("`learner datasets list` prints all names; to train on a file, give its path")
-}
-
 fn local(path: PathBuf) -> anyhow::Result<LocalDataset> {
     let data = quad_dataset::data_file(&path).hint_of(DatasetError::hint)?;
     let sha256 = sha256(&data).with_context(|| format!("cannot read {}", data.display()))?;
@@ -118,27 +104,15 @@ fn local(path: PathBuf) -> anyhow::Result<LocalDataset> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::config::resolve;
-    use crate::presets;
+    use crate::config::{presets, resolve};
 
     #[test]
     fn a_word_is_a_name_a_path_or_neither() {
         let named = Source::parse("walker2d-medium-replay-v2").unwrap();
-        assert_eq!(named.entry().unwrap().file, "walker2d_medium_replay-v2.hdf5");
-        assert_eq!(
-            Source::parse("minari:mujoco/hopper/medium-v0").unwrap(),
-            Source::Minari("mujoco/hopper/medium-v0".to_owned())
-        );
+        assert_eq!(named.entry().unwrap().file, "walker2d_medium-replay-v2.hdf5");
+        assert_eq!(Source::parse("minari:a/b-v0").unwrap(), Source::Minari("a/b-v0".to_owned()));
         for path in ["data/missing.hdf5", "missing.npz", "./hopper-medium-v2", "/tmp"] {
             assert_eq!(Source::parse(path).unwrap(), Source::Path(path.into()));
-        }
-        for (word, offered) in [
-            ("walker2d-medium-repaly-v2", "walker2d-medium-replay-v2, "),
-            ("hopper-medium", "hopper-medium-v2"),
-            ("antmaze-umaze", "antmaze-umaze-v0"),
-        ] {
-            let error = Source::parse(word).unwrap_err().to_string();
-            assert!(error.contains(word) && error.contains(offered), "{error}");
         }
         let error = Source::parse("quadruped").unwrap_err().to_string();
         assert_eq!(error, "unknown dataset `quadruped`");
@@ -147,15 +121,13 @@ mod tests {
     #[test]
     fn the_presets_datasets_are_known_and_of_their_environments() {
         let resolved = presets::names().filter_map(|name| resolve(name, &toml::Table::new()).ok());
-        let mut named = 0;
-        for experiment in resolved {
-            let Some(dataset) = &experiment.dataset else { continue };
-            let source = Source::parse(dataset).unwrap();
-            assert!(matches!(source, Source::Named(_)), "{dataset}");
+        let named: Vec<_> = resolved.filter(|experiment| experiment.dataset.is_some()).collect();
+        assert_eq!(named.len(), 15, "the rows of the paper's table");
+        for experiment in named {
+            let source = Source::parse(&experiment.dataset.unwrap()).unwrap();
+            assert!(matches!(source, Source::Named(_)), "{source:?}");
             source.check_environment(&experiment.environment).unwrap();
-            named += 1;
         }
-        assert!(named >= 15, "the rows of the paper's table have datasets");
     }
 
     #[test]
@@ -165,7 +137,6 @@ mod tests {
             ("hopper-medium-v2", "walker2d", false),
             ("hopper-medium-v2", "my-robot", false),
             // The goal of v0 and v2 is another one, not the maze.
-            ("antmaze-umaze-v0", "antmaze-umaze", true),
             ("antmaze-umaze-v2", "antmaze-umaze-v0", true),
             ("antmaze-medium-play-v0", "antmaze-umaze", false),
             // By the name of the file alone.
@@ -178,13 +149,11 @@ mod tests {
     }
 
     #[test]
-    fn what_is_not_there_says_how_to_get_it() {
-        let minari = Source::parse("minari:nobody/has-this-v0").unwrap().obtain();
-        let error = format!("{:#}", minari.unwrap_err());
-        assert!(error.contains("minari:nobody/has-this-v0"), "{error}");
-        let path = Source::parse("nowhere/x.hdf5").unwrap().obtain();
-        let error = format!("{:#}", path.unwrap_err());
-        assert!(error.contains("nowhere/x.hdf5"), "{error}");
+    fn what_is_not_there_is_named() {
+        for source in ["minari:no/such-v0", "nowhere/x.hdf5"] {
+            let error = format!("{:#}", Source::parse(source).unwrap().obtain().unwrap_err());
+            assert!(error.contains(source), "{error}");
+        }
     }
 
     #[test]

@@ -6,11 +6,17 @@ use std::path::Path;
 
 use quad_protocol::{Hash, episode_seeds};
 
-use crate::run::{RunDir, RunDirError, ScoreLine};
-use crate::settings;
+use super::error::RunDirError;
+use super::folder::RunDir;
+use super::lines::ScoreLine;
+use crate::config::settings;
 
 /// Findings of one kind that are listed one by one; the rest is counted.
 const LISTED: usize = 5;
+
+/// Evaluators compute in f32 or bf16, by the fastest instructions of their CPU, and each of these rounds in its own way.
+const OTHER_ARITHMETIC: &str =
+    "not comparable, because the evaluators computed in another precision or by other instructions";
 
 /// What was found in a folder.
 #[derive(Debug, Default, PartialEq)]
@@ -119,7 +125,8 @@ pub fn compare(path: &Path, other: &Path) -> Result<Findings, RunDirError> {
         if line.weights != same.weights {
             found.add("weights that differ", name);
         } else if line.precision != same.precision {
-            found.add("not to be compared, because they were computed by other instructions", name);
+            let (here, there) = (&line.precision, &same.precision);
+            found.add(OTHER_ARITHMETIC, format!("{name} ({here} here, {there} there)"));
         } else if bits(line) != bits(same) {
             found.add("scores that differ", name);
         } else {
@@ -127,4 +134,83 @@ pub fn compare(path: &Path, other: &Path) -> Result<Findings, RunDirError> {
         }
     }
     Ok(found)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::config::RunConfig;
+
+    /// A run that is as it should be, but for what is done to its lines: evaluations of steps 10 and 15, three episodes each.
+    fn write(path: &Path, change: impl FnOnce(&mut Vec<ScoreLine>)) {
+        let mut config = RunConfig::example("hopper-demo", 4);
+        let experiment = &mut config.experiment;
+        (experiment.steps, experiment.eval_interval, experiment.episodes) = (15, 10, 3);
+        let (run, mut log) = RunDir::create(path, &config).unwrap();
+        let mut lines = Vec::new();
+        for step in [10, 15] {
+            let tensors = [step as u8; 100];
+            run.write_snapshot(step, &tensors).unwrap();
+            lines.extend(episode_seeds(4, step, 3).into_iter().map(|seed| ScoreLine {
+                step,
+                seed,
+                episode_return: seed as f64,
+                length: 5,
+                score: 1.0,
+                weights: Hash::of(&tensors).to_string(),
+                precision: "f32-avx512".into(),
+                evaluator: "e".into(),
+            }));
+        }
+        change(&mut lines);
+        log.append(&lines).unwrap();
+    }
+
+    #[test]
+    fn each_broken_promise_is_found() {
+        type Change = fn(&mut Vec<ScoreLine>);
+        let changes: [(&str, Change); 6] = [
+            ("", |_| ()),
+            ("without a score", |lines| drop(lines.pop())),
+            ("scored twice", |lines| lines.push(lines[0].clone())),
+            ("no episode of this run", |lines| lines.push(ScoreLine { seed: 1, ..lines[0].clone() })),
+            ("scored with other weights than are on disk", |lines| lines[2].weights = lines[3].weights.clone()),
+            ("scored, but the snapshot is gone", |lines| lines.push(ScoreLine { step: 12, ..lines[0].clone() })),
+        ];
+        for (expected, change) in changes {
+            let folder = tempfile::tempdir().unwrap();
+            let path = folder.path().join("a");
+            write(&path, change);
+            let found = verify(&path).unwrap();
+            assert_eq!(found.all_held(), expected.is_empty(), "{found}");
+            assert!(expected.is_empty() || found.wrong.contains_key(expected), "{expected}: {found}");
+            assert_eq!(found.expected, 6);
+        }
+    }
+
+    #[test]
+    fn two_runs_are_compared_bit_for_bit() {
+        let folder = tempfile::tempdir().unwrap();
+        let [ours, theirs] = ["a", "b"].map(|name| folder.path().join(name));
+        write(&ours, |_| ());
+        type Change = fn(&mut Vec<ScoreLine>);
+        let changes: [(Change, usize, &[&str]); 6] = [
+            (|_| (), 6, &[]),
+            (|lines| lines[0].episode_return = lines[0].episode_return.next_up(), 5, &["scores that differ"]),
+            (|lines| lines.truncate(2), 2, &["not scored there"]),
+            (|lines| lines[5].weights = "00".into(), 5, &["weights that differ"]),
+            (|lines| lines.clear(), 0, &["not scored there"]),
+            (|lines| lines[0].precision = "bf16-amx".into(), 5, &[OTHER_ARITHMETIC]),
+        ];
+        for (change, same, wrong) in changes {
+            std::fs::remove_dir_all(&theirs).ok();
+            write(&theirs, change);
+            let found = compare(&ours, &theirs).unwrap();
+            assert!(found.found == same && found.wrong.keys().eq(wrong), "{wrong:?}: {found}");
+            // What only the other one has does not matter.
+            assert!(wrong != ["not scored there"] || compare(&theirs, &ours).unwrap().all_held());
+        }
+        let found = compare(&ours, &theirs).unwrap().to_string();
+        assert!(found.contains("f32-avx512 here, bf16-amx there"), "{found}");
+    }
 }

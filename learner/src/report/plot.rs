@@ -3,9 +3,10 @@
 use std::path::Path;
 
 use anyhow::anyhow;
+use plotters::coord::types::RangedCoordf64;
 use plotters::prelude::*;
 
-use crate::report::RunReport;
+use super::run::{EvaluationReport, RunReport};
 
 const SIZE: (u32, u32) = (900, 540);
 const DATASET: RGBColor = RGBColor(110, 110, 110);
@@ -30,7 +31,10 @@ pub fn learning_curves(path: &Path, runs: &[RunReport]) -> anyhow::Result<()> {
     Ok(())
 }
 
-fn draw(path: &Path, runs: &[RunReport]) -> Result<(), Box<dyn std::error::Error>> {
+type Chart<'a, 'b> = ChartContext<'a, SVGBackend<'b>, Cartesian2d<RangedCoordf64, RangedCoordf64>>;
+type Drawn = Result<(), Box<dyn std::error::Error>>;
+
+fn draw(path: &Path, runs: &[RunReport]) -> Drawn {
     let root = SVGBackend::new(path, SIZE).into_drawing_area();
     root.fill(&WHITE)?;
     let (last_step, range) = limits(runs);
@@ -56,32 +60,9 @@ fn draw(path: &Path, runs: &[RunReport]) -> Result<(), Box<dyn std::error::Error
         .x_label_formatter(&|step| format!("{step:.0}"))
         .light_line_style(WHITE)
         .draw()?;
-
-    let mut references: Vec<f64> = runs.iter().map(|run| run.dataset_score).collect();
-    references.sort_by(f64::total_cmp);
-    references.dedup();
-    for score in references {
-        let line = DashedLineSeries::new([(0.0, score), (last_step, score)], 6, 4, DATASET.stroke_width(2));
-        let legend = |(x, y)| PathElement::new([(x, y), (x + 20, y)], DATASET.stroke_width(2));
-        chart.draw_series(line)?.label(format!("dataset mean {score:.1}")).legend(legend);
-    }
-    for (index, run) in runs.iter().enumerate() {
-        let colour = COLOURS[index % COLOURS.len()];
-        let points: Vec<_> = run.evaluations.iter().map(|e| (e.step as f64, e.score.mean)).collect();
-        if runs.len() == 1 {
-            let edge = |sign: f64| {
-                move |e: &crate::report::run::EvaluationReport| {
-                    (e.step as f64, e.score.mean + sign * e.score.std.unwrap_or(0.0))
-                }
-            };
-            let upper = run.evaluations.iter().map(edge(1.0));
-            let band: Vec<_> = upper.chain(run.evaluations.iter().rev().map(edge(-1.0))).collect();
-            chart.draw_series([Polygon::new(band, colour.mix(0.15))])?;
-        }
-        let label = format!("{} ({}, {} candidates)", run.run, run.variant, run.candidates);
-        let legend = move |(x, y)| PathElement::new([(x, y), (x + 20, y)], colour.stroke_width(2));
-        chart.draw_series(LineSeries::new(points.clone(), colour.stroke_width(2)))?.label(label).legend(legend);
-        chart.draw_series(points.into_iter().map(|point| Circle::new(point, 3, colour.filled())))?;
+    draw_references(&mut chart, runs, last_step)?;
+    for (run, colour) in runs.iter().zip(COLOURS.iter().cycle()) {
+        draw_run(&mut chart, run, *colour, runs.len() == 1)?;
     }
     chart
         .configure_series_labels()
@@ -90,6 +71,34 @@ fn draw(path: &Path, runs: &[RunReport]) -> Result<(), Box<dyn std::error::Error
         .border_style(DATASET.mix(0.4))
         .draw()?;
     root.present()?;
+    Ok(())
+}
+
+fn draw_references(chart: &mut Chart, runs: &[RunReport], last_step: f64) -> Drawn {
+    let mut references: Vec<f64> = runs.iter().map(|run| run.dataset_score).collect();
+    references.sort_by(f64::total_cmp);
+    references.dedup();
+    for score in references {
+        let line = DashedLineSeries::new([(0.0, score), (last_step, score)], 6, 4, DATASET.stroke_width(2));
+        let legend = |(x, y)| PathElement::new([(x, y), (x + 20, y)], DATASET.stroke_width(2));
+        chart.draw_series(line)?.label(format!("dataset mean {score:.1}")).legend(legend);
+    }
+    Ok(())
+}
+
+fn draw_run(chart: &mut Chart, run: &RunReport, colour: RGBColor, has_band: bool) -> Drawn {
+    if has_band {
+        let edge =
+            |sign: f64| move |e: &EvaluationReport| (e.step as f64, e.score.mean + sign * e.score.std.unwrap_or(0.0));
+        let upper = run.evaluations.iter().map(edge(1.0));
+        let band: Vec<_> = upper.chain(run.evaluations.iter().rev().map(edge(-1.0))).collect();
+        chart.draw_series([Polygon::new(band, colour.mix(0.15))])?;
+    }
+    let points: Vec<_> = run.evaluations.iter().map(|e| (e.step as f64, e.score.mean)).collect();
+    let label = format!("{} ({}, {} candidates)", run.run, run.variant, run.candidates);
+    let legend = move |(x, y)| PathElement::new([(x, y), (x + 20, y)], colour.stroke_width(2));
+    chart.draw_series(LineSeries::new(points.clone(), colour.stroke_width(2)))?.label(label).legend(legend);
+    chart.draw_series(points.into_iter().map(|point| Circle::new(point, 3, colour.filled())))?;
     Ok(())
 }
 

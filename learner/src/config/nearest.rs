@@ -1,0 +1,27 @@
+//! What a user probably meant by a misspelt name.
+
+/// `did you mean a, b?` with up to three of the known names, the most similar first; nothing if none is similar. A name is
+/// similar if few letters differ, or if the word is part of it.
+pub(crate) fn did_you_mean<'a>(word: &str, known: impl IntoIterator<Item = &'a str>) -> Option<String> {
+    let likeness = |name| (strsim::normalized_damerau_levenshtein(word, name), name);
+    let mut similar: Vec<(f64, &str)> = known.into_iter().map(likeness).collect();
+    similar.retain(|(likeness, name)| *likeness > 0.6 || name.contains(word));
+    similar.sort_by(|a, b| b.0.total_cmp(&a.0));
+    let names: Vec<&str> = similar.into_iter().take(3).map(|(_, name)| name).collect();
+    (!names.is_empty()).then(|| format!("did you mean {}?", names.join(", ")))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::did_you_mean;
+
+    #[test]
+    fn a_misspelt_name_is_answered_with_the_nearest() {
+        let known = ["hopper-demo", "walker2d-demo", "walker2d-medium-v2", "walker2d-medium-replay-v2"];
+        let answer = |word| did_you_mean(word, known);
+        assert_eq!(answer("hoper-demo").unwrap(), "did you mean hopper-demo?");
+        assert!(answer("walker2d-medium-reply-v2").unwrap().starts_with("did you mean walker2d-medium-replay-v2"));
+        assert!(answer("walker").unwrap().contains("walker2d-demo"));
+        assert_eq!(answer("zzz"), None);
+    }
+}

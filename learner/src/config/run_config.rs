@@ -1,0 +1,114 @@
+//! What a run's folder says of itself in `config.toml`.
+
+use std::path::PathBuf;
+
+use serde::{Deserialize, Serialize};
+
+use super::device::Device;
+use super::experiment::Experiment;
+
+/// The file's contents.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct RunConfig {
+    /// Which run this is.
+    pub run: RunInfo,
+    /// What it learns from.
+    pub dataset: DatasetInfo,
+    /// How it learns.
+    pub experiment: Experiment,
+}
+
+/// Which run this is.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct RunInfo {
+    /// Name of the run: its folder's name, and its place in Zenoh's key space.
+    pub name: String,
+    /// When the run was first started, in milliseconds since 1970. In the file it is called `incarnation`, as it always was;
+    /// it is not the number of a learner's start on the wire, which has that name, too.
+    #[serde(rename = "incarnation")]
+    pub started: u64,
+    /// Preset that was asked for.
+    pub preset: String,
+    /// Version of the learner.
+    pub version: String,
+    /// Where it trains; runs from before there was a choice do not say.
+    #[serde(default)]
+    pub device: Device,
+}
+
+/// What the run learns from.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct DatasetInfo {
+    /// The file.
+    pub path: PathBuf,
+    /// SHA-256 of the file in hexadecimal, of a folder of Minari's that of its `main_data.hdf5`; older runs do not say.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub sha256: Option<String>,
+    /// Transitions that are learnt from.
+    pub transitions: u64,
+    /// Trajectories in the file.
+    pub episodes: u64,
+    /// Smallest return of a trajectory, unscaled.
+    pub min_return: f64,
+    /// The mean of their returns.
+    pub mean_return: f64,
+    /// The largest of them.
+    pub max_return: f64,
+    /// Mean D4RL-normalised score of the trajectories, where the environment has reference returns.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub mean_score: Option<f64>,
+}
+
+impl DatasetInfo {
+    /// How much it holds and how good it is, in one line.
+    pub fn summary(&self) -> String {
+        let Self { transitions, episodes, mean_return, mean_score, .. } = self;
+        let score = mean_score.map(|score| format!(", mean score {score:.2}")).unwrap_or_default();
+        format!("{transitions} transitions of {episodes} episodes, mean return {mean_return:.2}{score}")
+    }
+}
+
+#[cfg(test)]
+impl RunConfig {
+    /// A run of a preset, for tests.
+    pub(crate) fn example(preset: &str, seed: u64) -> Self {
+        let experiment = super::experiment::resolve(preset, &toml::Table::new()).unwrap();
+        Self {
+            run: RunInfo {
+                name: "a".into(),
+                started: 1,
+                preset: preset.into(),
+                version: "0.1.0".into(),
+                device: Device::Cpu,
+            },
+            dataset: DatasetInfo {
+                path: "data.hdf5".into(),
+                sha256: None,
+                transitions: 100,
+                episodes: 3,
+                min_return: 10.0,
+                mean_return: 20.0,
+                max_return: 30.0,
+                mean_score: Some(10.7),
+            },
+            experiment: Experiment { seed, ..experiment },
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_run_of_an_earlier_version_is_read() {
+        let config = RunConfig::example("hopper-demo", 0);
+        let text = toml::to_string(&config).unwrap();
+        assert!(text.contains("incarnation = 1\n") && !text.contains("started"), "{text}");
+        let earlier = text.replace("device = \"cpu\"\n", "").replace("precision = \"f32\"\n", "");
+        assert_eq!(toml::from_str::<RunConfig>(&earlier).unwrap(), config);
+    }
+}

@@ -1,0 +1,43 @@
+//! The folder in which D4RL keeps its files, shared with everything else that uses D4RL.
+
+use std::path::{Path, PathBuf};
+
+use anyhow::anyhow;
+use indicatif::HumanBytes;
+use quad_dataset::{NamedDataset, catalogue};
+use quad_service::Hint;
+
+use super::partial::left_of;
+
+/// The environment variable that names another folder than the one in the home folder; D4RL's.
+const VARIABLE: &str = "D4RL_DATASET_DIR";
+
+/// Where D4RL keeps its files.
+pub fn folder() -> anyhow::Result<PathBuf> {
+    if let Some(folder) = std::env::var_os(VARIABLE).filter(|folder| !folder.is_empty()) {
+        return Ok(folder.into());
+    }
+    let home = std::env::home_dir().filter(|home| !home.as_os_str().is_empty());
+    home.map(|home| home.join(".d4rl/datasets"))
+        .ok_or_else(|| anyhow!("there is no home folder to keep datasets in"))
+        .hint(format!("name a folder in {VARIABLE}"))
+}
+
+/// The catalogue: name, environment, size, and what of it is in a folder already. Checksums are not computed for this.
+pub fn list(folder: &Path) -> impl Iterator<Item = [String; 4]> {
+    catalogue::all().iter().map(|dataset| {
+        let size = dataset.bytes.map_or("unknown".to_owned(), |bytes| HumanBytes(bytes).to_string());
+        [dataset.name.clone(), dataset.environment.clone(), size, state(dataset, &folder.join(&dataset.file))]
+    })
+}
+
+fn state(dataset: &NamedDataset, path: &Path) -> String {
+    let found = path.metadata().map(|metadata| metadata.len());
+    let part = left_of(path).into_iter().map(|(_, length)| length).max();
+    match (found, part) {
+        (Ok(found), _) if dataset.bytes.is_some_and(|bytes| bytes != found) => format!("another file of {found} bytes"),
+        (Ok(_), _) => "yes".to_owned(),
+        (Err(_), Some(part)) => format!("{} of it", HumanBytes(part)),
+        (Err(_), None) => "no".to_owned(),
+    }
+}

@@ -1,0 +1,143 @@
+//! A file of the catalogue: from the cache folder, or from the first address that has it.
+
+use std::fs;
+use std::io::{self, ErrorKind};
+use std::path::{Path, PathBuf};
+use std::time::Duration;
+
+use anyhow::{Error, anyhow};
+use quad_dataset::NamedDataset;
+use quad_service::{Hint, hinted};
+use ureq::Agent;
+
+use super::partial::Partial;
+use super::progress::Progress;
+use super::transfer::{Failure, client, transfer};
+use super::verify::verify;
+
+#[cfg(test)]
+mod tests;
+
+/// Attempts at one address, if none of them brings the file forward.
+const ATTEMPTS: u32 = 4;
+
+/// A dataset on this machine.
+#[derive(Clone, Debug, PartialEq)]
+pub struct LocalDataset {
+    /// The file, or the folder if it is Minari's.
+    pub path: PathBuf,
+    /// SHA-256 of the file, or of the folder's `main_data.hdf5`.
+    pub sha256: String,
+}
+
+/// Fetches files.
+pub struct Fetcher {
+    client: Agent,
+    /// Between two attempts.
+    pause: Duration,
+    mirror: Option<String>,
+}
+
+impl Fetcher {
+    /// `mirror` is the address of a folder that is tried before the catalogue's.
+    pub fn new(mirror: Option<String>) -> Self {
+        Self { client: client(Duration::from_secs(30)), pause: Duration::from_secs(2), mirror }
+    }
+
+    /// The dataset's file under its own name in `folder`, verified.
+    pub fn fetch(&self, dataset: &NamedDataset, folder: &Path) -> anyhow::Result<LocalDataset> {
+        let path = folder.join(&dataset.file);
+        let local = |error| local(error, dataset, folder);
+        match verify(dataset, &path) {
+            Ok(Ok(sha256)) => return Ok(LocalDataset { path, sha256 }),
+            Ok(Err(mismatch)) => {
+                return Err(anyhow!("{} is not the dataset {}: {mismatch}", path.display(), dataset.name))
+                    .hint("remove it or move it away, and it will be fetched anew");
+            }
+            Err(error) if error.kind() == ErrorKind::NotFound => {}
+            Err(error) => return Err(local(error)),
+        }
+        fs::create_dir_all(folder).map_err(local)?;
+        let mut partial = Partial::open(&path).map_err(local)?;
+        let progress = Progress::new();
+        let mut refusals = String::new();
+        for address in self.addresses(dataset) {
+            progress.say(&format!("fetching {} from {address}", dataset.name));
+            match self.fetch_from(&address, dataset, &mut partial, &progress) {
+                Ok(sha256) => {
+                    partial.finish(&path).map_err(local)?;
+                    progress.say(&format!("{}: size and {} verified", path.display(), dataset.sha256.known()));
+                    return Ok(LocalDataset { path, sha256 });
+                }
+                Err(Failure::Local(error)) => return Err(local(error)),
+                Err(Failure::Passing(reason) | Failure::Lasting(reason)) => {
+                    progress.say(&reason);
+                    refusals += &format!("\n  {address}: {reason}");
+                }
+            }
+        }
+        Err(anyhow!("no address has the dataset {}{refusals}", dataset.name)).hint(format!(
+            "fetch the file elsewhere and put it at {}, or name a mirror in QUAD_DATASETS_URL",
+            path.display()
+        ))
+    }
+
+    fn addresses(&self, dataset: &NamedDataset) -> Vec<String> {
+        let mirror = self.mirror.iter().map(|base| format!("{}/{}", base.trim_end_matches('/'), dataset.file));
+        mirror.chain(dataset.addresses.iter().cloned()).collect()
+    }
+
+    /// The whole file from one address, by as many attempts as bring it forward; its SHA-256.
+    fn fetch_from(
+        &self,
+        address: &str,
+        dataset: &NamedDataset,
+        partial: &mut Partial,
+        progress: &Progress,
+    ) -> Result<String, Failure> {
+        // Only a size and a checksum can tell whether what is here already belongs to the file.
+        if dataset.bytes.is_none_or(|bytes| partial.len() > bytes) {
+            partial.clear()?;
+        }
+        let (mut furthest, mut attempts) = (partial.len(), ATTEMPTS);
+        loop {
+            let result = match dataset.bytes {
+                Some(bytes) if bytes == partial.len() => Ok(()),
+                bytes => transfer(&self.client, address, bytes, partial, progress),
+            };
+            let failure = match result.and_then(|()| check(dataset, partial)) {
+                Ok(sha256) => return Ok(sha256),
+                Err(failure) => failure,
+            };
+            attempts -= 1;
+            if partial.len() > furthest {
+                (furthest, attempts) = (partial.len(), ATTEMPTS);
+            }
+            match failure {
+                Failure::Passing(reason) if attempts > 0 => progress.say(&format!("{reason}; trying again")),
+                failure => return Err(failure),
+            }
+            std::thread::sleep(self.pause);
+        }
+    }
+}
+
+/// SHA-256 of what has arrived, if it is the dataset's file; otherwise it is deleted.
+fn check(dataset: &NamedDataset, partial: &mut Partial) -> Result<String, Failure> {
+    verify(dataset, partial.path())?.or_else(|mismatch| {
+        partial.clear()?;
+        Err(Failure::Lasting(format!("what came is not the file and is deleted: {mismatch}")))
+    })
+}
+
+/// The file cannot be read or written here.
+fn local(error: io::Error, dataset: &NamedDataset, folder: &Path) -> Error {
+    let hint = match error.kind() {
+        ErrorKind::StorageFull => {
+            "make room, or name a folder on another disk in D4RL_DATASET_DIR; what has arrived is kept and will be \
+             continued"
+        }
+        _ => "name a folder that you may write to in D4RL_DATASET_DIR",
+    };
+    hinted(Error::new(error).context(format!("cannot keep the dataset {} in {}", dataset.name, folder.display())), hint)
+}

@@ -1,0 +1,82 @@
+//! What has arrived of a file so far.
+
+use std::fs::{self, File, OpenOptions};
+use std::io::{self, Write};
+use std::path::{Path, PathBuf};
+
+/// A file of this run alone beside the place of the whole one, `<file>.<number>.partial`.
+pub struct Partial {
+    path: PathBuf,
+    file: File,
+    length: u64,
+}
+
+impl Partial {
+    /// Goes on with what an interrupted run has left of `target`, or begins with nothing.
+    pub fn open(target: &Path) -> io::Result<Self> {
+        let path = target.with_added_extension(format!("{:08x}.partial", rand::random::<u32>()));
+        for (left, length) in left_of(target) {
+            // A run that is still fetching has a lock on its file.
+            let Ok(file) = OpenOptions::new().append(true).open(&left) else { continue };
+            if file.try_lock().is_ok() && fs::rename(&left, &path).is_ok() {
+                return Ok(Self { path, file, length });
+            }
+        }
+        let file = OpenOptions::new().append(true).create_new(true).open(&path)?;
+        // Where the file system has no locks, this run goes on all the same, and nothing is taken over there.
+        file.try_lock().ok();
+        Ok(Self { path, file, length: 0 })
+    }
+
+    /// Where it is.
+    pub fn path(&self) -> &Path {
+        &self.path
+    }
+
+    /// Bytes so far.
+    pub fn len(&self) -> u64 {
+        self.length
+    }
+
+    /// Appends bytes.
+    pub fn append(&mut self, bytes: &[u8]) -> io::Result<()> {
+        self.file.write_all(bytes)?;
+        self.length += bytes.len() as u64;
+        Ok(())
+    }
+
+    /// Forgets all bytes.
+    pub fn clear(&mut self) -> io::Result<()> {
+        self.length = 0;
+        self.file.set_len(0)
+    }
+
+    /// Gives it its final name, under which there is never less than the whole file, not even after a power cut.
+    pub fn finish(self, target: &Path) -> io::Result<()> {
+        self.file.sync_all()?;
+        fs::rename(&self.path, target)?;
+        File::open(target.parent().unwrap_or(Path::new(".")))?.sync_all()
+    }
+}
+
+impl Drop for Partial {
+    fn drop(&mut self) {
+        if self.length == 0 {
+            fs::remove_file(&self.path).ok();
+        }
+    }
+}
+
+/// The partial files of `target` that hold something, and how many bytes.
+pub fn left_of(target: &Path) -> Vec<(PathBuf, u64)> {
+    let folder = target.parent().and_then(|folder| fs::read_dir(folder).ok());
+    let file = target.file_name().unwrap_or_default().to_string_lossy();
+    let length = |entry: io::Result<fs::DirEntry>| {
+        let entry = entry.ok()?;
+        let name = entry.file_name().into_string().ok()?;
+        let is_part = name.strip_prefix(&*file)?.starts_with('.') && name.ends_with(".partial");
+        let length = entry.metadata().ok()?.len();
+        (is_part && length > 0).then(|| (entry.path(), length))
+    };
+    folder.into_iter().flatten().filter_map(length).collect()
+}

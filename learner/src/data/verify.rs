@@ -1,0 +1,45 @@
+//! Whether a file is the one that the catalogue means.
+
+use std::fs::File;
+use std::io::{self, Read};
+use std::path::Path;
+
+use quad_dataset::NamedDataset;
+use sha2::{Digest, Sha256};
+
+/// How an HDF5 file of D4RL begins. What some servers send instead of an error is a page for people.
+const HDF5_SIGNATURE: &[u8] = b"\x89HDF\r\n\x1a\n";
+/// Read at a time.
+const CHUNK: usize = 1 << 20;
+
+/// SHA-256 of a file in lower-case hexadecimal if the file is what `dataset` says, as far as that is known; else what is wrong.
+pub fn verify(dataset: &NamedDataset, path: &Path) -> io::Result<Result<String, String>> {
+    let mut file = File::open(path)?;
+    let found = file.metadata()?.len();
+    if let Some(expected) = dataset.bytes.filter(|expected| *expected != found) {
+        return Ok(Err(format!("it has {found} bytes, but must have {expected}")));
+    }
+    let mut start = Vec::new();
+    file.by_ref().take(HDF5_SIGNATURE.len() as u64).read_to_end(&mut start)?;
+    if start != HDF5_SIGNATURE {
+        return Ok(Err("it is not an HDF5 file".to_owned()));
+    }
+    let found = sha256(path)?;
+    match dataset.sha256.matches(&found) {
+        true => Ok(Ok(found)),
+        false => Ok(Err(format!("its SHA-256 is {found}, but must be {}", dataset.sha256))),
+    }
+}
+
+/// SHA-256 of a file in lower-case hexadecimal.
+pub fn sha256(path: &Path) -> io::Result<String> {
+    let mut file = File::open(path)?;
+    let mut hasher = Sha256::new();
+    let mut chunk = vec![0; CHUNK];
+    loop {
+        match file.read(&mut chunk)? {
+            0 => return Ok(format!("{:x}", hasher.finalize())),
+            count => hasher.update(&chunk[..count]),
+        }
+    }
+}

@@ -1,0 +1,52 @@
+//! In which ways runs of one of the paper's presets are not what the paper ran.
+
+use std::collections::BTreeSet;
+
+use quad_dataset::catalogue::{self, Checksum};
+
+use super::published::SEEDS;
+use super::run::RunReport;
+use crate::config::settings::{self, Settings, differences};
+use crate::config::{self, Experiment};
+
+/// Of runs that differ in their seed alone. `scored_in` is the precision of their scores.
+pub fn departures(runs: &[&RunReport], scored_in: &str) -> Vec<String> {
+    let Some(run) = runs.first() else { return Vec::new() };
+    let Ok(paper) = config::resolve(&run.preset, &toml::Table::new()) else { return Vec::new() };
+    let mut departures = Vec::new();
+    let ours = &run.config.experiment;
+    if !is_trained_on(run, paper.dataset.as_deref()) {
+        let name = |dataset: &Option<String>| dataset.clone().unwrap_or_else(|| "not named".to_owned());
+        departures.push(format!("dataset is {}, not {}", name(&ours.dataset), name(&paper.dataset)));
+    }
+    let (ours, paper) = (without_seed(ours), without_seed(&paper));
+    let keys: BTreeSet<&String> = differences(&ours, &paper).collect();
+    for key in keys {
+        let value = |settings: &Settings| settings.get(key).cloned().unwrap_or_else(|| "absent".to_owned());
+        departures.push(format!("{key} is {}, not {}", value(&ours), value(&paper)));
+    }
+    if scored_in != "f32" {
+        departures.push(format!("scored in {scored_in}, not in f32"));
+    }
+    if let Some(least) = runs.iter().filter(|run| !run.is_complete()).min_by_key(|run| run.evaluations_complete()) {
+        departures.push(least.how_complete());
+    }
+    if runs.len() < SEEDS {
+        departures.push(format!("{} of {SEEDS} seeds", runs.len()));
+    }
+    departures
+}
+
+fn without_seed(experiment: &Experiment) -> Settings {
+    let mut settings = settings::of_experiment(experiment);
+    settings.remove("seed");
+    settings
+}
+
+/// Whether a run learnt from the dataset of that name, whatever it was called on the command line.
+fn is_trained_on(run: &RunReport, dataset: Option<&str>) -> bool {
+    let known = dataset.and_then(catalogue::find).filter(|known| known.sha256 != Checksum::default());
+    let same_file =
+        run.config.dataset.sha256.as_ref().zip(known).is_some_and(|(sha256, known)| known.sha256.matches(sha256));
+    same_file || run.config.experiment.dataset.as_deref() == dataset
+}

@@ -1,0 +1,56 @@
+//! Where training runs.
+
+use anyhow::{Context, anyhow};
+use quad_policy::Precision;
+use quad_service::Hint;
+
+use crate::config::Device;
+
+impl Device {
+    /// That the device is there and can compute with this precision.
+    ///
+    /// # Errors
+    /// It is not, or it cannot.
+    pub fn check(self, precision: Precision) -> anyhow::Result<()> {
+        match (self, precision) {
+            (Self::Cpu, _) => Ok(()),
+            (Self::Cuda, Precision::F32) => gpu().map(drop),
+            (Self::Cuda, _) => Err(anyhow!("on a GPU the update computes in f32 only")).hint("use --precision f32"),
+        }
+    }
+
+    /// The device, as candle knows it.
+    ///
+    /// # Errors
+    /// There is no such device here.
+    pub fn open(self) -> anyhow::Result<candle_core::Device> {
+        match self {
+            Self::Cpu => Ok(candle_core::Device::Cpu),
+            Self::Cuda => gpu(),
+        }
+    }
+}
+
+fn gpu() -> anyhow::Result<candle_core::Device> {
+    let hint = match cfg!(feature = "cuda") {
+        true => "does `nvidia-smi` show a GPU on this machine, and a driver for CUDA 13? --device cpu needs neither",
+        false => "build a learner that can by deploy/cuda.sh, or train with --device cpu",
+    };
+    candle_core::Device::new_cuda(0).context("this learner cannot train on a GPU here").hint(hint)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_gpu_that_cannot_be_used_is_an_error() {
+        if !cfg!(feature = "cuda") {
+            let error = Device::Cuda.check(Precision::F32).unwrap_err();
+            assert!(error.to_string().contains("cannot train on a GPU"), "{error}");
+        }
+        let error = Device::Cuda.check(Precision::Bf16).unwrap_err();
+        assert!(error.to_string().contains("f32"), "{error}");
+        assert!(Device::Cpu.check(Precision::Bf16).is_ok());
+    }
+}
