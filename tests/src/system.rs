@@ -64,7 +64,6 @@ impl Scratch {
         let run_dir = self.path().join(run);
         let name = run_dir.file_name().and_then(|name| name.to_str()).expect("a run has a name");
         let preset = self.preset(name, setting);
-        // An earlier learner's in the same folder.
         fs::remove_file(run_dir.join("endpoints.json")).ok();
         let mut command = through(launcher, "learner");
         command.arg("train").arg("--preset").arg(preset).arg("--dataset").arg(self.dataset());

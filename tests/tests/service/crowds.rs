@@ -118,6 +118,7 @@ impl Scene {
 /// Lets them work; gives the slowest of a hundred claims, and training's speed as a share of its speed alone.
 fn work(size: &Size) -> (Duration, f64) {
     let scene = Scene::new(BUSY, size);
+    scene.learner.process.wait_for_log("snapshot handed to evaluation", PATIENCE);
     let (measured, share) = scene.work(size);
     let memory = scene.learner.process.peak_memory().unwrap();
     let scores = scene.learner.assert_scores_are_distinct().len();
