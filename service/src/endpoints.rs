@@ -15,9 +15,9 @@ const PROTECTED: &str = "tls/";
 /// directly; one that does not is a client of the peer or router that it connects to.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
 pub struct Endpoints {
-    /// Listen here. Port 0 takes a free one; [`reachable_at`] tells which.
+    /// Listen here. Port 0 takes a free one; [`reachable_at`](crate::reachable_at) tells which.
     pub listen: Vec<String>,
-    /// Connect to these. A client keeps one connection: to talk to several meeting points, open a session for each.
+    /// Connect to these. A client keeps one connection: to reach several learners or routers, open a session for each.
     pub connect: Vec<String>,
     /// With them, every connection is by TLS, and both sides show a certificate. A client of a session that listens may
     /// do what deploy/zenoh/router-tls.json5 allows its role.
@@ -78,7 +78,7 @@ impl SessionError {
 }
 
 impl Endpoints {
-    /// Tells early what [`open_session`] would refuse.
+    /// Tells early what [`open_session`](crate::open_session) would refuse.
     ///
     /// # Errors
     ///
