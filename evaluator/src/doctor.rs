@@ -11,8 +11,8 @@ use quad_service::doctor::{self, Findings};
 use quad_service::{Endpoints, Role, default_endpoint, parse_endpoint};
 use zenoh::Session;
 
-use crate::sim::Rollout;
 use crate::serve::DEFAULT_PORT;
+use crate::sim::Rollout;
 
 /// How long learners are waited for.
 const ANSWER: Duration = Duration::from_secs(5);
