@@ -16,6 +16,7 @@ use super::transfer::{Failure, client, transfer};
 use super::verify::verify;
 
 #[cfg(test)]
+#[path = "../../tests/unit/data/fetch.rs"]
 mod tests;
 
 /// Attempts at one address, if none of them brings the file forward.

@@ -15,6 +15,7 @@ mod pool;
 mod results;
 mod steps;
 #[cfg(test)]
+#[path = "../../tests/unit/train.rs"]
 mod tests;
 mod training;
 
