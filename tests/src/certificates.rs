@@ -36,7 +36,7 @@ impl Certificates {
     pub fn short(&self, name: &str, seconds: u64) {
         self.renew(name);
         let script = r#"
-            touch index; openssl rand -hex 8 >serial
+            : >index; openssl rand -hex 8 >serial
             printf '[ca]\ndefault_ca=it\n[it]\ndatabase=index\nserial=serial\nnew_certs_dir=.\npolicy=any\n[any]\n' >config
             printf 'organizationName=optional\norganizationalUnitName=optional\ncommonName=supplied\n' >>config
             printf 'extendedKeyUsage=clientAuth\n' >extensions

@@ -33,10 +33,7 @@ pub struct Host {
 }
 
 impl Network {
-    /// A bridge without hosts.
-    ///
-    /// # Errors
-    /// Why there can be none here.
+    /// A bridge without hosts, or why there can be none here.
     pub fn new() -> Result<Network, String> {
         let process = std::process::id();
         // Also what an earlier process of the same number may have left.
@@ -50,9 +47,6 @@ impl Network {
     }
 
     /// Adds a host, the `number`th from 1, whose line leads to a port of this machine.
-    ///
-    /// # Errors
-    /// Why there can be none here.
     pub fn host(&self, number: u32, port: u16) -> Result<Host, String> {
         let (name, address) = (format!("{}-{number}", self.name), address(1 + number));
         run(&format!("ip netns add {name}"))?;

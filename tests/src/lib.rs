@@ -9,8 +9,7 @@
 //!   learner tells and leaves in its run's folder.
 //! - [`http`]: fetch a page, read a metric, serve a file.
 //! - [`router`]: a Zenoh router in the test's own process; [`certificates`]: one for each role, and sessions that show them.
-//! - [`made_up`]: messages that tests make up; [`crowd`]: hundreds of evaluators that only talk; [`pace`]: how fast a learner
-//!   trains meanwhile.
+//! - [`made_up`]: messages that tests make up; [`crowd`]: hundreds of evaluators that only talk.
 //! - [`line`](mod@line): a connection on which things go wrong: a [`link`] of TCP, or a cable to a host of its own, in [`hosts`].
 //! - [`power`]: what a disk holds after a power cut; [`small_disk`]: one that is soon full.
 //! - [`peers`]: programs that are not ours; where one is missing, a test is skipped or fails.
@@ -28,7 +27,6 @@ pub mod learner;
 pub mod line;
 pub mod link;
 pub mod made_up;
-pub mod pace;
 pub mod peers;
 pub mod power;
 pub mod process;

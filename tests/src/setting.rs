@@ -34,40 +34,19 @@ impl Setting {
     pub fn to_toml(self) -> String {
         let Setting { steps, eval_interval, episodes, candidates, hidden, seed } = self;
         format!(
-            r#"environment = "hopper"
-reward = "locomotion"
+            r#"base = "hopper-demo"
 steps = {steps}
 eval_interval = {eval_interval}
 episodes = {episodes}
 candidates = {candidates}
 seed = {seed}
 batch_size = 16
-algorithm = "quad"
 
 [agent]
 hidden = {hidden}
 critics = 2
 diffusion_steps = 2
-gamma = 0.99
-rho = 1.0
-guidance = "quad"
-tau = 1.0
-delta = 1e-6
-samples = 1
-target_reduce = "mean"
-actor_learning_rate = 1e-3
-critic_learning_rate = 1e-3
-gradient_clip = 1.0
-ema_rate = 5e-3
-nu_ema_rate = 5e-3
-actor_ema_every = 5
 actor_ema_start = 10
-
-[agent.eta]
-initial = 1.0
-rate = 1e-3
-minimum = 1e-3
-maximum = 100.0
 "#
         )
     }

@@ -64,7 +64,6 @@ impl Scratch {
         let run_dir = self.path().join(run);
         let name = run_dir.file_name().and_then(|name| name.to_str()).expect("a run has a name");
         let preset = self.preset(name, setting);
-        // An earlier learner's in the same folder.
         fs::remove_file(run_dir.join("endpoints.json")).ok();
         let mut command = through(launcher, "learner");
         command.arg("train").arg("--preset").arg(preset).arg("--dataset").arg(self.dataset());
@@ -137,20 +136,20 @@ pub fn free_endpoint() -> String {
 fn write_dataset(path: &Path) {
     let spec = environment::find("hopper").expect("hopper is known");
     let mut writer = D4rlWriter::create(path, spec).expect("the scratch folder is writable");
-    let observation = |episode: usize, step: usize| -> Vec<f64> {
-        (0..spec.observation_dim).map(|i| ((episode * 7 + step + 3 * i) as f64 * 0.1).sin()).collect()
-    };
+    let [qpos, qvel] = [vec![0.0; spec.qpos_dim], vec![0.0; spec.qvel_dim]];
     for (episode, step) in (0..10).flat_map(|episode| (0..300).map(move |step| (episode, step))) {
-        let action: Vec<f64> = (0..spec.action_dim).map(|i| 0.9 * ((episode + 2 * step + i) as f64).cos()).collect();
+        let wave = |at: usize, i: usize| ((episode * 7 + at + 3 * i) as f64 * 0.1).sin();
+        let [now, next] = [step, step + 1].map(|at| Vec::from_iter((0..spec.observation_dim).map(|i| wave(at, i))));
+        let action = Vec::from_iter((0..spec.action_dim).map(|i| 0.9 * ((episode + 2 * step + i) as f64).cos()));
         let row = Row {
-            observation: &observation(episode, step),
+            observation: &now,
             action: &action,
-            next_observation: &observation(episode, step + 1),
+            next_observation: &next,
             reward: 1.0 + 0.1 * episode as f64 + action[0],
             terminal: false,
             timeout: step == 299,
-            qpos: &vec![0.0; spec.qpos_dim],
-            qvel: &vec![0.0; spec.qvel_dim],
+            qpos: &qpos,
+            qvel: &qvel,
         };
         writer.push(&row).expect("the row has the environment's sizes");
     }

@@ -3,7 +3,9 @@
 #[path = "../../../tests/golden/golden.rs"]
 mod reader;
 
-use super::*;
+use super::algorithm::{Metric, Minibatch, Setting};
+use candle_core::{Device, Tensor};
+use quad_policy::{Precision, Tensors};
 pub(super) use reader::{Golden, fresh, goldens, make};
 
 /// Where updates are tested: on the CPU, and on a GPU with the feature `cuda`. Without a GPU that share is skipped,

@@ -6,11 +6,18 @@
 #[allow(clippy::unwrap_used)]
 mod golden;
 
-use super::optimiser::{cosine_decay, follow};
+use super::algorithm::{
+    AgentError, Algorithm, AlgorithmError, Definition, Hyperparameters, Metric, Minibatch, Setting, check, check_count,
+    check_positive, check_rate, numbers, read,
+};
+use super::optimiser::{Adam, AdamStep, cosine_decay, follow};
 use super::random::{Purpose, stream};
-use super::*;
-use candle_core::DType;
-use quad_policy::{Ensemble, EnsembleShape, GaussianPolicy, GaussianShape, Layout, Part, Weights, gaussian_mean};
+use candle_core::backprop::GradStore;
+use candle_core::{DType, Result, Tensor};
+use quad_policy::{
+    Description, Ensemble, EnsembleShape, GaussianPolicy, GaussianShape, Layout, Part, PolicyError, Tensors, Weights,
+    gaussian_mean,
+};
 use serde::Deserialize;
 
 /// What the learner has to know of it.

@@ -7,9 +7,11 @@ mod config;
 mod golden;
 mod metrics;
 
+use super::algorithm::{
+    AgentError, Algorithm, AlgorithmError, Definition, Hyperparameters, Minibatch, Setting, numbers,
+};
 use super::optimiser::{Adam, AdamStep, cosine_decay, follow};
 use super::random::{Purpose, stream};
-use super::{Algorithm, AlgorithmError, Definition, Minibatch, Setting, numbers};
 use candle_core::{DType, Device, Result, Tensor};
 use candle_nn::loss::mse;
 use config::{Eta, Guidance, Quad as Config, TargetReduce};
@@ -22,7 +24,35 @@ use rand::Rng;
 use rand_distr::{Distribution, StandardNormal};
 
 /// What the learner has to know of it.
-pub const DEFINITION: Definition = Definition { name: "quad", metrics: METRICS, read: config::read };
+pub const DEFINITION: Definition = Definition { name: "quad", metrics: METRICS, read };
+
+fn read(table: &toml::Table) -> std::result::Result<Box<dyn Hyperparameters>, AgentError> {
+    Ok(Box::new(config::read(table)?))
+}
+
+impl Hyperparameters for Config {
+    fn variant(&self) -> String {
+        match self.guidance {
+            Guidance::Quad => "quad",
+            Guidance::Dac => "dac",
+            Guidance::None => "none",
+        }
+        .to_owned()
+    }
+
+    fn summary(&self) -> String {
+        let Self { samples, critics, hidden, .. } = self;
+        format!("guidance {}, {samples} samples, {critics} critics, {hidden} wide", self.variant())
+    }
+
+    fn samples_candidates(&self) -> bool {
+        true
+    }
+
+    fn start(&self, setting: &Setting) -> std::result::Result<Box<dyn Algorithm>, AlgorithmError> {
+        Ok(Box::new(Quad::new(self.clone(), setting.clone())?))
+    }
+}
 
 /// QUAD in the middle of a run.
 pub(super) struct Quad {

@@ -4,6 +4,9 @@ use super::golden::{devices, make};
 use super::*;
 use crate::config::resolve;
 use crate::train::agent::Agent;
+use candle_core::Device;
+use quad_dataset::Batch;
+use quad_policy::Precision;
 use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 

@@ -18,7 +18,8 @@ The file goes where D4RL keeps it: $D4RL_DATASET_DIR, or ~/.d4rl/datasets. The l
 a folder, first. It continues what a broken connection left, also the next time.";
 
 const DOCTOR_NOTE: &str = "\
-A line per check: ok, warn or FAIL, and a hint where there is something to do. The exit code is 1 if anything failed.";
+The learner prints a line per check: ok, warn or FAIL, with a hint where you can do something. The exit code is 1 if a check
+failed.";
 
 /// Trains a diffusion policy and a critic ensemble from a file of transitions.
 #[derive(Debug, Parser)]
@@ -40,18 +41,18 @@ pub enum Command {
     /// Datasets by name: list them, fetch one
     #[command(subcommand)]
     Datasets(DatasetsCommand),
-    /// Print the evaluations of finished or running runs, summaries over their seeds, and what the paper has for their tasks
+    /// Print the scores of finished or running runs, their summary over seeds, and the paper's figures for the same tasks
     Report(ReportArgs),
     /// Check by a run's folder alone that each episode is scored once, with the weights that are kept there
     Verify(VerifyArgs),
-    /// Check this machine before a run is trusted to it, and say what to do about what is wrong
+    /// Check that this machine is fit for a run, and say how to mend what is not
     Doctor(DoctorArgs),
 }
 
 /// Arguments of `learner presets`.
 #[derive(Debug, Args)]
 pub struct PresetsArgs {
-    /// Print this preset as a file of your own could have it, all bases merged
+    /// Print this preset, merged with its bases, as a file of your own could have it
     #[arg(value_name = "NAME", value_parser = parse_preset)]
     pub preset: Option<String>,
 }
@@ -67,7 +68,7 @@ pub enum DatasetsCommand {
         /// A name of `learner datasets list`
         name: String,
     },
-    /// Print what is in a dataset and what is wrong with it, before a day of training is spent on it
+    /// Print what is in a dataset and what is wrong with it, before you spend a day of training on it
     Inspect(InspectArgs),
 }
 
@@ -100,7 +101,7 @@ pub struct VerifyArgs {
 #[derive(Debug, Args)]
 #[command(after_help = DOCTOR_NOTE)]
 pub struct DoctorArgs {
-    /// The router that the run is to join; without it, whether the learner can listen at its usual port is checked
+    /// The router that the run is to join; without it, the learner checks that it can listen at its usual port
     #[arg(long, value_name = "ENDPOINT", value_parser = parse_endpoint)]
     pub connect: Option<String>,
     /// Folder of the run that is to begin or to go on
@@ -147,39 +148,5 @@ pub(crate) fn print(text: &str) -> anyhow::Result<()> {
 }
 
 #[cfg(test)]
-mod tests {
-    use super::*;
-    use clap::CommandFactory;
-
-    pub(super) fn parse(arguments: &[&str]) -> Result<Cli, clap::Error> {
-        Cli::try_parse_from(
-            ["learner", "train", "--preset", "hopper-demo", "--dataset", "d.hdf5"].iter().chain(arguments),
-        )
-    }
-
-    #[test]
-    fn definition_is_consistent() {
-        Cli::command().debug_assert();
-    }
-
-    #[test]
-    fn wrong_command_lines_exit_with_2() {
-        let wrong: [&[&str]; 10] = [
-            &["--audit", "0.5"],
-            &["--steps", "0"],
-            &["--candidates", "0"],
-            &["--seed", "9223372036854775808"],
-            &["--set", "agent.tau"],
-            &["--listen", "127.0.0.1:7447"],
-            &["--listen", "tcp/127.0.0.1:1", "--connect", "tcp/127.0.0.1:2"],
-            &["--metrics", "9090"],
-            &["--device", "tpu"],
-            &["--nonsense"],
-        ];
-        for flags in wrong {
-            assert_eq!(parse(flags).unwrap_err().exit_code(), 2, "{flags:?}");
-        }
-        let unknown = Cli::try_parse_from(["learner", "train", "--preset", "walker", "--dataset", "d"]).unwrap_err();
-        assert!(unknown.to_string().contains("walker2d-demo"), "{unknown}");
-    }
-}
+#[path = "../../tests/unit/cli.rs"]
+mod tests;

@@ -22,9 +22,9 @@ Examples:
 
   # Go on after a crash or Ctrl-C: the same command again.
 
-Ctrl-C or SIGTERM stops early with a checkpoint, and the exit code is 1; a second one ends at once. The same command goes on
-from the run folder's newest checkpoint. On the same machine a run that was interrupted ends with the same weights, bit for
-bit, as one that was not.";
+At Ctrl-C or SIGTERM the learner saves a checkpoint and ends with exit code 1; at a second one it ends at once. The same
+command goes on from the run folder's newest checkpoint. On the same machine a run that was interrupted ends with the same
+weights, bit for bit, as one that was not.";
 
 /// Arguments of `learner train`.
 #[derive(Debug, Args)]
@@ -60,7 +60,7 @@ pub struct TrainArgs {
     /// Serve /metrics and /healthz here; port 0 takes a free one (see DIR/endpoints.json)
     #[arg(long, value_name = "ADDR:PORT", default_value = "127.0.0.1:0")]
     pub metrics: SocketAddr,
-    /// Train on the CPU, or on the first Nvidia GPU, with a learner that was built by deploy/cuda.sh
+    /// Train on the CPU, or on the first Nvidia GPU, which needs a learner that deploy/cuda.sh has built
     #[arg(long, value_name = "cpu|cuda", value_enum, hide_possible_values = true, default_value_t)]
     pub device: Device,
     /// Any other value of the preset, in TOML's notation: agent.tau=0.5, environment=my-robot; repeatable
@@ -132,23 +132,5 @@ impl TrainArgs {
 }
 
 #[cfg(test)]
-mod tests {
-    use super::super::{Command, tests::parse};
-
-    #[test]
-    fn flags_change_the_preset() {
-        let flags = ["--steps", "7", "--eval-interval", "0", "--guidance", "dac", "--set", "agent.samples=2"];
-        let Command::Train(train) = parse(&flags).unwrap().command else { panic!("not train") };
-        let expected =
-            toml::toml! { dataset = "d.hdf5" steps = 7 eval_interval = 0 agent = { guidance = "dac", samples = 2 } };
-        assert_eq!(train.changes(), expected);
-        let Command::Train(train) = parse(&["--set", "seed=2", "--seed", "3"]).unwrap().command else { panic!() };
-        assert_eq!(train.changes(), toml::toml! { dataset = "d.hdf5" seed = 3 });
-    }
-
-    #[test]
-    fn only_this_machine_sees_the_metrics_unless_told_otherwise() {
-        let Command::Train(train) = parse(&[]).unwrap().command else { panic!("not train") };
-        assert!(train.metrics.ip().is_loopback(), "{}", train.metrics);
-    }
-}
+#[path = "../../tests/unit/cli/train.rs"]
+mod tests;

@@ -10,7 +10,7 @@ use quad_service::{Hint, hinted};
 use tracing::{info, warn};
 
 use crate::cli::{Cli, Command, DatasetsCommand, DoctorArgs, InspectArgs, PresetsArgs, ReportArgs, VerifyArgs, print};
-use crate::config::{self, ConfigError, presets};
+use crate::config::{self, presets};
 use crate::data::{Source, cache};
 use crate::report::{Report, Style, Table, learning_curves};
 use crate::run::{RunDir, RunDirError, verify};
@@ -28,15 +28,10 @@ pub fn run(cli: &Cli) -> anyhow::Result<()> {
         Command::Verify(args) => check_run(args),
         Command::Doctor(args) => examine(args),
     };
-    done.map_err(|error| match hint(&error) {
+    done.map_err(|error| match error.downcast_ref().map(RunDirError::hint) {
         Some(hint) => hinted(error, hint),
         None => error,
     })
-}
-
-fn hint(error: &anyhow::Error) -> Option<String> {
-    let of_config = error.downcast_ref().and_then(ConfigError::hint);
-    of_config.or_else(|| error.downcast_ref().map(|error: &RunDirError| error.hint().to_owned()))
 }
 
 fn list_presets(args: &PresetsArgs) -> anyhow::Result<()> {

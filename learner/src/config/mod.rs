@@ -17,7 +17,7 @@ mod schedule;
 pub(crate) mod settings;
 
 pub use device::Device;
-pub use experiment::{ConfigError, Experiment, resolve};
+pub use experiment::{Experiment, resolve};
 pub(crate) use nearest::did_you_mean;
 pub use run_config::{DatasetInfo, RunConfig, RunInfo};
 pub use schedule::Schedule;

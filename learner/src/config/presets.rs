@@ -3,8 +3,10 @@
 //! Besides the keys of an experiment a preset may have `base`, the name of an embedded preset that it changes key by key, and
 //! `about`, a few words for the list of presets. A preset that names no environment is a base and nothing else.
 
-use std::path::{Path, PathBuf};
+use std::path::Path;
 
+use anyhow::{Context, anyhow};
+use quad_service::hinted;
 use toml::{Table, Value};
 
 use super::nearest::did_you_mean;
@@ -15,32 +17,15 @@ macro_rules! embedded {
 
 /// Name and TOML of each, in the order in which they are listed.
 const EMBEDDED: &[(&str, &str)] = embedded![
-    "hopper-demo"
-    "hopper-demo-iql"
-    "halfcheetah-demo"
-    "walker2d-demo"
-    "antmaze-umaze-demo"
-    "antmaze-medium-demo"
+    "hopper-demo" "hopper-demo-iql" "halfcheetah-demo" "walker2d-demo" "antmaze-umaze-demo" "antmaze-medium-demo"
     "own-data"
-    "hopper-medium-v2"
-    "hopper-medium-replay-v2"
-    "hopper-medium-expert-v2"
-    "walker2d-medium-v2"
-    "walker2d-medium-replay-v2"
-    "walker2d-medium-expert-v2"
-    "halfcheetah-medium-v2"
-    "halfcheetah-medium-replay-v2"
-    "halfcheetah-medium-expert-v2"
-    "antmaze-umaze-v0"
-    "antmaze-umaze-diverse-v0"
-    "antmaze-medium-play-v0"
-    "antmaze-medium-diverse-v0"
-    "antmaze-large-play-v0"
-    "antmaze-large-diverse-v0"
-    "paper"
-    "paper-locomotion"
-    "paper-antmaze"
-    "paper-antmaze-large"
+    "hopper-medium-v2" "hopper-medium-replay-v2" "hopper-medium-expert-v2"
+    "walker2d-medium-v2" "walker2d-medium-replay-v2" "walker2d-medium-expert-v2"
+    "halfcheetah-medium-v2" "halfcheetah-medium-replay-v2" "halfcheetah-medium-expert-v2"
+    "antmaze-umaze-v0" "antmaze-umaze-diverse-v0"
+    "antmaze-medium-play-v0" "antmaze-medium-diverse-v0"
+    "antmaze-large-play-v0" "antmaze-large-diverse-v0"
+    "paper" "paper-locomotion" "paper-antmaze" "paper-antmaze-large"
 ];
 
 /// The names of the embedded presets, bases included.
@@ -59,30 +44,6 @@ pub fn is_path(preset: &str) -> bool {
     preset.ends_with(".toml")
 }
 
-/// A preset that cannot be read.
-#[derive(Debug, thiserror::Error)]
-pub enum PresetError {
-    /// The file cannot be read.
-    #[error("cannot read the preset {path}")]
-    #[allow(missing_docs)] // The message says it all.
-    Read { path: PathBuf, source: std::io::Error },
-    /// Neither embedded nor a path.
-    #[error("there is no preset named {0}")]
-    Unknown(String),
-    /// Not TOML.
-    #[error("preset {preset}: {source}")]
-    #[allow(missing_docs)] // The message says it all.
-    Parse { preset: String, source: toml::de::Error },
-}
-
-impl PresetError {
-    /// What to do about it.
-    pub fn hint(&self) -> Option<String> {
-        let Self::Unknown(preset) = self else { return None };
-        Some(unknown_hint(preset))
-    }
-}
-
 /// What to do about a name that no preset has.
 pub fn unknown_hint(preset: &str) -> String {
     let nearest = did_you_mean(preset, names()).map(|nearest| nearest + " ").unwrap_or_default();
@@ -93,13 +54,13 @@ pub fn unknown_hint(preset: &str) -> String {
 ///
 /// # Errors
 /// There is no such preset or base, the file cannot be read, or it is not TOML.
-pub fn load(preset: &str) -> Result<Table, PresetError> {
+pub fn load(preset: &str) -> anyhow::Result<Table> {
     let own = own(preset)?;
     let mut table = match own.get("base") {
         None => Table::new(),
         // Only embedded presets are bases, and those have no cycle, so this ends.
         Some(Value::String(base)) if !is_path(base) => load(base)?,
-        Some(base) => return Err(PresetError::Unknown(base.to_string())),
+        Some(base) => return Err(unknown(&base.to_string())),
     };
     merge(&mut table, own);
     table.retain(|key, _| key != "base" && key != "about");
@@ -107,14 +68,19 @@ pub fn load(preset: &str) -> Result<Table, PresetError> {
 }
 
 /// What a preset says itself, its bases left out.
-fn own(preset: &str) -> Result<Table, PresetError> {
-    let unreadable = |source| PresetError::Read { path: preset.into(), source };
+fn own(preset: &str) -> anyhow::Result<Table> {
     let text = match EMBEDDED.iter().find(|(name, _)| *name == preset) {
         Some((_, text)) => (*text).to_owned(),
-        None if is_path(preset) => std::fs::read_to_string(preset).map_err(unreadable)?,
-        None => return Err(PresetError::Unknown(preset.to_owned())),
+        None if is_path(preset) => {
+            std::fs::read_to_string(preset).with_context(|| format!("cannot read the preset {preset}"))?
+        }
+        None => return Err(unknown(preset)),
     };
-    text.parse().map_err(|source| PresetError::Parse { preset: preset.to_owned(), source })
+    text.parse().with_context(|| format!("preset {preset} is not TOML"))
+}
+
+fn unknown(preset: &str) -> anyhow::Error {
+    hinted(anyhow!("there is no preset named {preset}"), unknown_hint(preset))
 }
 
 /// Lays `changes` over `table`: tables key by key, anything else in place of what was there. An integer that takes a
@@ -157,7 +123,7 @@ pub(super) fn keys(table: &Table) -> Vec<(String, &Value)> {
 ///
 /// # Errors
 /// An embedded preset is broken, which a test of each excludes.
-pub fn tasks() -> Result<Vec<[String; 4]>, PresetError> {
+pub fn tasks() -> anyhow::Result<Vec<[String; 4]>> {
     let mut tasks = Vec::new();
     for name in names() {
         let table = load(name)?;
@@ -183,4 +149,5 @@ fn special(own: &Table) -> String {
 }
 
 #[cfg(test)]
+#[path = "../../tests/unit/config/presets.rs"]
 mod tests;

@@ -16,6 +16,7 @@ use super::transfer::{Failure, client, transfer};
 use super::verify::verify;
 
 #[cfg(test)]
+#[path = "../../tests/unit/data/fetch.rs"]
 mod tests;
 
 /// Attempts at one address, if none of them brings the file forward.
@@ -96,13 +97,13 @@ impl Fetcher {
         progress: &Progress,
     ) -> Result<String, Failure> {
         // Only a size and a checksum can tell whether what is here already belongs to the file.
-        if dataset.bytes.is_none_or(|bytes| partial.len() > bytes) {
+        if dataset.bytes.is_none_or(|bytes| partial.length > bytes) {
             partial.clear()?;
         }
-        let (mut furthest, mut attempts) = (partial.len(), ATTEMPTS);
+        let (mut furthest, mut attempts) = (partial.length, ATTEMPTS);
         loop {
             let result = match dataset.bytes {
-                Some(bytes) if bytes == partial.len() => Ok(()),
+                Some(bytes) if bytes == partial.length => Ok(()),
                 bytes => transfer(&self.client, address, bytes, partial, progress),
             };
             let failure = match result.and_then(|()| check(dataset, partial)) {
@@ -110,8 +111,8 @@ impl Fetcher {
                 Err(failure) => failure,
             };
             attempts -= 1;
-            if partial.len() > furthest {
-                (furthest, attempts) = (partial.len(), ATTEMPTS);
+            if partial.length > furthest {
+                (furthest, attempts) = (partial.length, ATTEMPTS);
             }
             match failure {
                 Failure::Passing(reason) if attempts > 0 => progress.say(&format!("{reason}; trying again")),
@@ -124,7 +125,7 @@ impl Fetcher {
 
 /// SHA-256 of what has arrived, if it is the dataset's file; otherwise it is deleted.
 fn check(dataset: &NamedDataset, partial: &mut Partial) -> Result<String, Failure> {
-    verify(dataset, partial.path())?.or_else(|mismatch| {
+    verify(dataset, &partial.path)?.or_else(|mismatch| {
         partial.clear()?;
         Err(Failure::Lasting(format!("what came is not the file and is deleted: {mismatch}")))
     })

@@ -6,9 +6,11 @@ use std::path::{Path, PathBuf};
 
 /// A file of this run alone beside the place of the whole one, `<file>.<number>.partial`.
 pub struct Partial {
-    path: PathBuf,
+    /// Where it is.
+    pub path: PathBuf,
+    /// Bytes so far.
+    pub length: u64,
     file: File,
-    length: u64,
 }
 
 impl Partial {
@@ -19,26 +21,15 @@ impl Partial {
             // A run that is still fetching has a lock on its file.
             let Ok(file) = OpenOptions::new().append(true).open(&left) else { continue };
             if file.try_lock().is_ok() && fs::rename(&left, &path).is_ok() {
-                return Ok(Self { path, file, length });
+                return Ok(Self { path, length, file });
             }
         }
         let file = OpenOptions::new().append(true).create_new(true).open(&path)?;
         // Where the file system has no locks, this run goes on all the same, and nothing is taken over there.
         file.try_lock().ok();
-        Ok(Self { path, file, length: 0 })
+        Ok(Self { path, length: 0, file })
     }
 
-    /// Where it is.
-    pub fn path(&self) -> &Path {
-        &self.path
-    }
-
-    /// Bytes so far.
-    pub fn len(&self) -> u64 {
-        self.length
-    }
-
-    /// Appends bytes.
     pub fn append(&mut self, bytes: &[u8]) -> io::Result<()> {
         self.file.write_all(bytes)?;
         self.length += bytes.len() as u64;
@@ -72,11 +63,10 @@ pub fn left_of(target: &Path) -> Vec<(PathBuf, u64)> {
     let folder = target.parent().and_then(|folder| fs::read_dir(folder).ok());
     let file = target.file_name().unwrap_or_default().to_string_lossy();
     let length = |entry: io::Result<fs::DirEntry>| {
-        let entry = entry.ok()?;
-        let name = entry.file_name().into_string().ok()?;
-        let is_part = name.strip_prefix(&*file)?.starts_with('.') && name.ends_with(".partial");
-        let length = entry.metadata().ok()?.len();
-        (is_part && length > 0).then(|| (entry.path(), length))
+        let path = entry.ok()?.path();
+        let rest = path.file_name()?.to_str()?.strip_prefix(&*file)?;
+        let length = path.metadata().ok()?.len();
+        (rest.starts_with('.') && rest.ends_with(".partial") && length > 0).then_some((path, length))
     };
     folder.into_iter().flatten().filter_map(length).collect()
 }

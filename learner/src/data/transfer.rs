@@ -55,20 +55,20 @@ pub fn transfer(
     progress: &Progress,
 ) -> Result<(), Failure> {
     let mut request = client.get(address);
-    if partial.len() > 0 {
-        request = request.header("Range", format!("bytes={}-", partial.len()));
+    if partial.length > 0 {
+        request = request.header("Range", format!("bytes={}-", partial.length));
     }
     let mut response = request.call().map_err(network)?;
     match response.status() {
         StatusCode::OK => partial.clear()?,
-        StatusCode::PARTIAL_CONTENT if first_byte(&response) == Some(partial.len()) => {}
+        StatusCode::PARTIAL_CONTENT if first_byte(&response) == Some(partial.length) => {}
         StatusCode::PARTIAL_CONTENT | StatusCode::RANGE_NOT_SATISFIABLE => {
             partial.clear()?;
             return Err(Failure::Passing("the server did not continue where the last connection broke".to_owned()));
         }
         status => return Err(refusal(status)),
     }
-    let found = response.body().content_length().map(|rest| partial.len() + rest);
+    let found = response.body().content_length().map(|rest| partial.length + rest);
     let bytes = match (expected, found) {
         (Some(expected), Some(found)) if found != expected => {
             return Err(Failure::Lasting(format!("the server's file has {found} bytes, but must have {expected}")));
@@ -76,22 +76,22 @@ pub fn transfer(
         (Some(bytes), _) | (None, Some(bytes)) => bytes,
         (None, None) => return Err(Failure::Lasting("the server does not say how large the file is".to_owned())),
     };
-    progress.start(partial.len(), bytes);
+    progress.start(partial.length, bytes);
     append(response.body_mut(), bytes, partial, progress)
 }
 
 /// Appends what a server sends, until there are `bytes`.
 fn append(body: &mut Body, bytes: u64, partial: &mut Partial, progress: &Progress) -> Result<(), Failure> {
-    let mut reader = body.as_reader().take(bytes.saturating_sub(partial.len()));
+    let mut reader = body.as_reader().take(bytes.saturating_sub(partial.length));
     let mut chunk = vec![0; CHUNK];
-    while partial.len() < bytes {
-        let broken = |why| Failure::Passing(format!("the connection broke after {} bytes: {why}", partial.len()));
+    while partial.length < bytes {
+        let broken = |why| Failure::Passing(format!("the connection broke after {} bytes: {why}", partial.length));
         match reader.read(&mut chunk) {
             Ok(0) => return Err(broken("it was closed".to_owned())),
             Ok(count) => partial.append(&chunk[..count])?,
             Err(error) => return Err(broken(error.to_string())),
         }
-        progress.advance(partial.len());
+        progress.advance(partial.length);
     }
     Ok(())
 }

@@ -17,6 +17,7 @@ mod outcomes;
 mod refusal;
 mod scoreboard;
 #[cfg(test)]
+#[path = "../../tests/unit/evaluation/mod.rs"]
 pub(crate) mod tests;
 mod validate;
 

@@ -19,8 +19,6 @@ mod seeds;
 mod spread;
 mod summary;
 mod table;
-#[cfg(test)]
-mod tests;
 
 pub(crate) use plot::learning_curves;
 pub(crate) use run::RunReport;

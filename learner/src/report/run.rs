@@ -5,14 +5,15 @@ use std::fmt::Alignment::Right;
 use std::fmt::Write;
 use std::path::{Path, PathBuf};
 
+use anyhow::Context;
 use quad_dataset::environment;
 use serde::Serialize;
 
 use super::spread::Spread;
 use super::table::{Style, Table};
 use crate::algorithms::Hyperparameters;
-use crate::config::{ConfigError, RunConfig};
-use crate::run::{RunDir, RunDirError, ScoreLine};
+use crate::config::RunConfig;
+use crate::run::{RunDir, ScoreLine};
 
 /// Gradient steps at the end of a run over which the paper's appendix B takes the mean.
 const FINAL_STEPS: u64 = 50_000;
@@ -89,14 +90,10 @@ impl RunReport {
     ///
     /// # Errors
     /// There is no run in it, or a file is not what a learner writes.
-    pub fn read(path: &Path) -> Result<Self, RunDirError> {
+    pub fn read(path: &Path) -> anyhow::Result<Self> {
         let (dir, config) = RunDir::open(path)?;
-        let unusable = |error: ConfigError| RunDirError::Content {
-            path: path.join("config.toml"),
-            line: None,
-            reason: error.to_string(),
-        };
-        let agent = config.experiment.hyperparameters().map_err(unusable)?;
+        let agent = config.experiment.hyperparameters();
+        let agent = agent.with_context(|| format!("config.toml in {} cannot be used", path.display()))?;
         Ok(Self::new(path, config, &*agent, &dir.read_scores()?))
     }
 

@@ -60,8 +60,14 @@ impl GroupReport {
         let seeds = self.seeds.len();
         let plural = if seeds == 1 { "" } else { "s" };
         let goals = self.goals.map(|_| " with a goal each").unwrap_or_default();
-        let (steps, device, scored_in) = (self.steps, self.device.name(), &self.scored_in);
-        format!("{seeds} seed{plural}{goals}, {steps} steps on {device}, scored in {scored_in}")
+        let (steps, device, scored_in) = (self.steps_in_words(), self.device.name(), &self.scored_in);
+        format!("{seeds} seed{plural}{goals}, {steps} on {device}, scored in {scored_in}")
+    }
+
+    /// How many gradient steps, and that a run has not come to the end of them if that is so.
+    pub fn steps_in_words(&self) -> String {
+        let part = if self.unfinished.is_empty() { "" } else { " (not complete)" };
+        format!("{} steps{part}", self.steps)
     }
 }
 

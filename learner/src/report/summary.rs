@@ -9,7 +9,6 @@ use super::run::RunReport;
 use super::seeds::{self, GroupReport};
 use super::spread::Spread;
 use super::table::{Style, Table};
-use crate::run::RunDirError;
 
 /// What `learner report` says.
 #[derive(Clone, Debug, PartialEq, Serialize)]
@@ -25,8 +24,8 @@ impl Report {
     ///
     /// # Errors
     /// One of them holds no run, or a file that no learner writes.
-    pub fn read(paths: &[PathBuf]) -> Result<Self, RunDirError> {
-        let runs: Vec<_> = paths.iter().map(|path| RunReport::read(path)).collect::<Result<_, _>>()?;
+    pub fn read(paths: &[PathBuf]) -> anyhow::Result<Self> {
+        let runs: Vec<_> = paths.iter().map(|path| RunReport::read(path)).collect::<anyhow::Result<_>>()?;
         Ok(Self { groups: seeds::groups(&runs), runs })
     }
 
@@ -52,7 +51,7 @@ impl Report {
             ("preset", Left),
             ("algorithm", Left),
             ("candidates", Right),
-            ("steps", Right),
+            ("trained for", Right),
             ("seeds", Right),
             ("scored in", Left),
             ("last 3", Right),
@@ -67,7 +66,7 @@ impl Report {
                 g.preset.clone(),
                 g.agent.clone(),
                 g.candidates.to_string(),
-                g.steps.to_string(),
+                g.steps_in_words(),
                 g.seeds.len().to_string() + &g.goals.map(|goals| format!(", {goals} goals")).unwrap_or_default(),
                 format!("{}{measure}", g.scored_in),
                 cell(g.mean_last_3),
@@ -129,8 +128,8 @@ impl Report {
             }
             if let Some(goals) = g.goals {
                 notes += &format!(
-                    "\nAntMaze-v0 has one goal a run, so {goals} goals stand behind the ± ({ours}). D4RL's code says that 50 \
-                     to 100 seeds are needed.\n"
+                    "\nAntMaze-v0 has one goal a run: {goals} behind this ± ({ours}), where D4RL's code asks for 50 to 100 \
+                     seeds.\n"
                 );
             }
         }

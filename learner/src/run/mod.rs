@@ -15,6 +15,7 @@ mod lines;
 mod log;
 mod resume;
 #[cfg(test)]
+#[path = "../../tests/unit/run.rs"]
 pub(crate) mod tests;
 pub(crate) mod verify;
 

@@ -32,6 +32,7 @@ mod services;
 mod snapshots;
 mod spawn;
 #[cfg(test)]
+#[path = "../../tests/unit/service/mod.rs"]
 mod tests;
 mod threads;
 mod weights;

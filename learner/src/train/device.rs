@@ -40,17 +40,5 @@ fn gpu() -> anyhow::Result<candle_core::Device> {
 }
 
 #[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn a_gpu_that_cannot_be_used_is_an_error() {
-        if !cfg!(feature = "cuda") {
-            let error = Device::Cuda.check(Precision::F32).unwrap_err();
-            assert!(error.to_string().contains("cannot train on a GPU"), "{error}");
-        }
-        let error = Device::Cuda.check(Precision::Bf16).unwrap_err();
-        assert!(error.to_string().contains("f32"), "{error}");
-        assert!(Device::Cpu.check(Precision::Bf16).is_ok());
-    }
-}
+#[path = "../../tests/unit/train/device.rs"]
+mod tests;

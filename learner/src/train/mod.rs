@@ -5,19 +5,21 @@
 //! thread `snapshots` takes it. The room `service` starts it.
 //!
 //! In reading order: `training` (the thread's work), `steps` (the loop), `agent` (an algorithm at work, saved and loaded),
-//! `device` (where it computes), `pool` (rayon's threads kept awake), `outbox`, `metrics`.
+//! `device` (where it computes), `pool` (rayon's threads kept awake), `results`, `outbox`, `metrics`.
 
 pub mod agent;
 mod device;
 mod metrics;
 mod outbox;
 mod pool;
+mod results;
 mod steps;
 #[cfg(test)]
+#[path = "../../tests/unit/train.rs"]
 mod tests;
 mod training;
 
 pub(crate) use metrics::{Registrar, TrainingMetrics};
-pub(crate) use outbox::{Outbox, TrainedPolicy, Work};
-pub(crate) use steps::Outcome;
+pub(crate) use outbox::{Outbox, Work};
+pub(crate) use results::{Outcome, TrainedPolicy};
 pub(crate) use training::Training;

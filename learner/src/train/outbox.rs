@@ -12,8 +12,7 @@ use std::time::Duration;
 
 use quad_service::Beat;
 
-use super::agent::PolicyFile;
-use super::steps::{Outcome, Row};
+use super::results::{Outcome, Row, TrainedPolicy};
 use crate::run::Checkpoint;
 
 /// Most bytes of snapshots that wait for the disk: forty of the paper's size.
@@ -22,17 +21,6 @@ const MOST_BYTES: usize = 256 << 20;
 const MOST_ROWS: usize = 10_000;
 /// How often a training that waits for the disk looks whether it is to stop.
 const GLANCE: Duration = Duration::from_millis(100);
-
-/// The policy after a gradient step.
-#[derive(Debug)]
-pub(crate) struct TrainedPolicy {
-    /// After which step.
-    pub step: u64,
-    /// What it is, and its weights.
-    pub policy: PolicyFile,
-    /// Whether it is to be evaluated, or only kept.
-    pub evaluate: bool,
-}
 
 /// The next thing to be done for training.
 #[derive(Debug)]

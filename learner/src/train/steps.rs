@@ -6,13 +6,12 @@ use std::time::{Duration, Instant};
 use quad_dataset::{Batch, BatchSampler, Transitions};
 use quad_policy::PolicyError;
 use quad_service::Beat;
-use serde::ser::SerializeMap;
-use serde::{Serialize, Serializer};
 use tracing::debug;
 
 use super::agent::Agent;
 use super::metrics::TrainingMetrics;
-use super::outbox::{Outbox, TrainedPolicy};
+use super::outbox::Outbox;
+use super::results::{Outcome, Row, TrainedPolicy};
 use crate::algorithms::{AlgorithmError, Metric};
 use crate::config::Schedule;
 use crate::run::Checkpoint;
@@ -43,43 +42,6 @@ pub(crate) struct Outlets<'a> {
     pub stop: &'a AtomicBool,
     /// Told after every step.
     pub beat: &'a Beat,
-}
-
-/// A line of `metrics.jsonl`: means over the gradient steps since the line before.
-#[derive(Clone, Debug)]
-pub(crate) struct Row {
-    /// Gradient steps done.
-    pub step: u64,
-    /// Since training began.
-    pub seconds: f64,
-    /// What was measured.
-    pub metrics: &'static [Metric],
-    /// The means, in the order of `metrics`.
-    pub values: Vec<f32>,
-}
-
-impl Serialize for Row {
-    fn serialize<S: Serializer>(&self, serializer: S) -> Result<S::Ok, S::Error> {
-        let mut map = serializer.serialize_map(Some(2 + self.values.len()))?;
-        map.serialize_entry("step", &self.step)?;
-        map.serialize_entry("seconds", &self.seconds)?;
-        for (metric, value) in self.metrics.iter().zip(&self.values) {
-            map.serialize_entry(metric.name, value)?;
-        }
-        map.end()
-    }
-}
-
-/// How training ended well.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub(crate) enum Outcome {
-    /// All steps are done.
-    Completed,
-    /// It was stopped after this many.
-    Stopped {
-        /// Gradient steps done.
-        step: u64,
-    },
 }
 
 /// Why training cannot go on.

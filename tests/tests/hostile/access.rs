@@ -6,7 +6,7 @@ use std::sync::{LazyLock, Mutex};
 
 use quad_tests::certificates::{Certificates, connect};
 use quad_tests::router::protected_router;
-use quad_tests::setting::{ENDLESS, SHORT};
+use quad_tests::setting::{ENDLESS, IDLE, SHORT};
 use quad_tests::system::Scratch;
 use quad_tests::{PATIENCE, eventually};
 use tempfile::NamedTempFile;
@@ -119,10 +119,9 @@ async fn the_router_refuses_and_logs_those_without_a_valid_certificate() {
 /// With an evaluator at `endpoint` whose certificate expires soon, and which gets a new one.
 async fn expires_and_is_renewed(certificates: &Certificates, scratch: &Scratch, name: &str, endpoint: &str) {
     let monitor = connect(endpoint, &certificates.of("router"), Some(&certificates.of("monitor"))).await.unwrap();
-    let token = format!("quad/run/live/evaluator/{name}");
+    let token = format!("quad/*/live/evaluator/{name}");
     let tokens = monitor.liveliness().declare_subscriber(token).history(true).await.unwrap();
     let next = async || timeout(PATIENCE, tokens.recv_async()).await.expect("it comes or goes").unwrap().kind();
-    certificates.short(name, 10);
     let folder = certificates.argument(name);
     let evaluator = scratch.evaluator_with(name, &["--connect", endpoint, "--certificates", &folder]);
     assert_eq!(next().await, SampleKind::Put);
@@ -138,9 +137,13 @@ async fn an_expired_certificate_ends_a_connection_and_a_renewed_one_brings_it_ba
     let Some(certificates) = make_certificates() else { return };
     let (scratch, folder) = (Scratch::new(), certificates.argument("learner"));
     let (_router, endpoint) = protected_router(HOST, &certificates.of("router")).await;
-    let arguments = ["--connect", &endpoint, "--listen", "tls/127.0.0.1:0", "--certificates", &folder];
-    let learner = scratch.learner_with("run", ENDLESS, &arguments);
-    let own = learner.endpoint();
+    let connected = ["--connect", &endpoint, "--certificates", &folder];
+    let _connected = scratch.learner_with("connected", IDLE, &connected);
+    let listening = ["--listen", "tls/127.0.0.1:0", "--certificates", &folder];
+    let listening = scratch.learner_with("listening", IDLE, &listening);
+    let own = listening.endpoint();
+    certificates.short("at-the-router", 12);
+    certificates.short("at-the-learner", 12);
     tokio::join!(
         expires_and_is_renewed(&certificates, &scratch, "at-the-router", &endpoint),
         expires_and_is_renewed(&certificates, &scratch, "at-the-learner", &own),

@@ -8,13 +8,15 @@ use std::time::Duration;
 use quad_protocol::{Name, encode, keys};
 use quad_service::{Endpoints, open_session};
 use quad_tests::made_up::{self, name};
-use quad_tests::setting::{SHORT, Setting};
+use quad_tests::setting::{ENDLESS, Setting};
 use quad_tests::system::Scratch;
 use quad_tests::{PATIENCE, eventually};
 use zenoh::Session;
 
 /// Most that a learner's memory may grow by, MiB.
 const MOST_GROWTH: u64 = 150;
+/// The first step that is evaluated.
+const STEP: u64 = 5000;
 /// Most tokens of one client at a time.
 const MOST_TOKENS: usize = 1000;
 
@@ -54,7 +56,7 @@ impl Client {
         let ask = |key: String| self.session.get(key).timeout(Duration::from_secs(1)).callback(drop);
         ask(format!("{key}?{much}")).payload(claim.clone()).await.unwrap();
         ask(key.to_owned()).payload(claim.clone()).attachment(&much).await.unwrap();
-        ask(key.to_owned()).payload(claim).encoding(format!("text/plain;{much}")).await.unwrap();
+        ask(key.to_owned()).payload(claim).encoding("text/plain;much").await.unwrap();
         ask(key.to_owned()).payload(vec![0; 1_000_000]).await.unwrap();
     }
 
@@ -70,7 +72,7 @@ impl Client {
             }
             Flood::Claims => self.ask(&keys::jobs(&run), claim(&format!("flood-{number}"))).await,
             Flood::Reports => {
-                let report = encode(&made_up::report(&run, SHORT.eval_interval, number)).unwrap();
+                let report = encode(&made_up::report(&run, STEP, number)).unwrap();
                 self.ask(&keys::scores(&run), report).await;
             }
             Flood::Garbage => {
@@ -89,7 +91,7 @@ impl Client {
                     self.tokens.clear();
                 }
             }
-            Flood::Downloads => self.ask(&keys::weights_at(&run, SHORT.eval_interval), Vec::new()).await,
+            Flood::Downloads => self.ask(&keys::weights_at(&run, STEP), Vec::new()).await,
         }
     }
 }
@@ -116,11 +118,9 @@ async fn start(flood: Flood, endpoint: &str, stop: Arc<AtomicBool>) -> tokio::ta
 /// Lets a learner that listens bear each flood for so long.
 async fn bear(each: Duration) {
     let scratch = Scratch::new();
-    // With more to evaluate than can be done meanwhile.
-    let setting = Setting { episodes: 4000, steps: 40, ..SHORT };
-    let mut learner = scratch.learner("run", setting);
+    // Something new to evaluate about every second.
+    let mut learner = scratch.learner("run", Setting { eval_interval: STEP, episodes: 400, ..ENDLESS });
     let endpoint = learner.endpoint();
-    learner.process.wait_for_log("training is done", PATIENCE);
     let evaluator = scratch.evaluator("steady", &endpoint);
     learner.wait_for_scores(0);
     let quiet = learner.process.peak_memory().unwrap();

@@ -45,7 +45,7 @@ fn a_wrong_command_line_exits_with_2() {
 fn an_algorithm_that_lacks_a_hyper_parameter_says_what_it_has() {
     for (preset, flags, words) in [
         ("hopper-demo", ["--guidance", "sac"], ["sac", "`dac`"]),
-        ("hopper-demo-iql", ["--guidance", "dac"], ["agent.guidance", "`learner presets NAME`"]),
+        ("hopper-demo-iql", ["--guidance", "dac"], ["guidance", "`learner presets NAME`"]),
         ("hopper-demo-iql", ["--candidates", "10"], ["candidates", "must be 1"]),
     ] {
         refused(&[&["--preset", preset, "--dataset", "x"][..], &flags].concat(), 1, &words);
@@ -53,15 +53,15 @@ fn an_algorithm_that_lacks_a_hyper_parameter_says_what_it_has() {
 }
 
 #[test]
-fn a_wrong_name_is_answered_with_the_nearest() {
+fn a_wrong_name_is_answered_with_the_right_ones() {
     let folder = tempfile::tempdir().unwrap();
     let own = folder.path().join("own.toml");
     std::fs::write(&own, "base = \"hopper-demo\"\nbatchsize = 3\n").unwrap();
     for (arguments, code, words) in [
         (&["--preset", "walker2d-medium-reply-v2"][..], 2, &["walker2d-medium-replay-v2"][..]),
-        (&["--preset", "hopper-demo", "--set", "agent.tua=0.5"], 1, &["agent.tua", "hint:", "agent.tau"]),
-        (&["--preset", "hopper-demo", "--set", "tau=0.5"], 1, &["name tau", "hint:", "agent.tau"]),
-        (&["--preset", own.to_str().unwrap()], 1, &["batchsize", "hint:", "batch_size"]),
+        (&["--preset", "hopper-demo", "--set", "agent.tua=0.5"], 1, &["`tua`", "`tau`", "hint:"]),
+        (&["--preset", "hopper-demo", "--set", "tau=0.5"], 1, &["`tau`", "hint:", "agent.KEY"]),
+        (&["--preset", own.to_str().unwrap()], 1, &["`batchsize`", "`batch_size`", "hint:"]),
     ] {
         refused(&[&["--dataset", "x"], arguments].concat(), code, words);
     }

@@ -11,7 +11,6 @@ use quad_tests::router::router;
 use quad_tests::setting::IDLE;
 use quad_tests::small_disk::SmallDisk;
 use quad_tests::system::{Scratch, free_endpoint};
-use quad_tests::{PATIENCE, eventually};
 use serde_json::Value;
 
 fn doctor(program: &str, arguments: &[&str]) -> Output {
@@ -63,22 +62,6 @@ fn a_machine_that_is_well() {
     let output = doctor("evaluator", &["--json", "--connect", &endpoint]);
     let list: Vec<Value> = serde_json::from_slice(&output.stdout).unwrap();
     assert!(list.len() > 4 && list.iter().all(|finding| finding["verdict"] != "fail"), "{list:?}");
-}
-
-#[tokio::test(flavor = "multi_thread")]
-async fn a_name_that_is_taken() {
-    let scratch = Scratch::new();
-    let endpoint = free_endpoint();
-    let _session = router(&endpoint).await;
-    let _learner = scratch.learner_with("taken", IDLE, &["--connect", &endpoint]);
-    let examine = |run: &str| {
-        let folder = scratch.path().join("elsewhere").join(run);
-        findings(&doctor("learner", &["--connect", &endpoint, "--run-dir", folder.to_str().unwrap()]))
-    };
-    let text = eventually("the learner is seen", PATIENCE, || Some(examine("taken")).filter(|(_, well)| !well)).0;
-    assert_found(&text, "FAIL", "run name", &["taken is there already"]);
-    let (text, well) = examine("free");
-    assert!(well, "{text}");
 }
 
 #[test]

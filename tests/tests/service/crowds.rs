@@ -8,13 +8,17 @@ use std::time::Duration;
 use quad_tests::crowd::{Crowd, Measured, Pace, longest_job};
 use quad_tests::learner::Learner;
 use quad_tests::made_up::name;
-use quad_tests::pace::{BUSY, SETTLE, compare};
 use quad_tests::router::router;
-use quad_tests::setting::{IDLE, Setting};
+use quad_tests::setting::{ENDLESS, IDLE, Setting};
 use quad_tests::system::{Scratch, free_endpoint};
 use quad_tests::{PATIENCE, eventually};
 use tokio::runtime::Runtime;
 use zenoh::Session;
+
+use crate::pace::{SETTLE, compare};
+
+/// With more episodes than any crowd can score while it is measured.
+const BUSY: Setting = Setting { eval_interval: 30_000, episodes: 10_000, candidates: 1, hidden: 64, ..ENDLESS };
 
 fn percentile(times: &[Duration], share: f64) -> Duration {
     let mut times = times.to_vec();
@@ -114,6 +118,7 @@ impl Scene {
 /// Lets them work; gives the slowest of a hundred claims, and training's speed as a share of its speed alone.
 fn work(size: &Size) -> (Duration, f64) {
     let scene = Scene::new(BUSY, size);
+    scene.learner.process.wait_for_log("snapshot handed to evaluation", PATIENCE);
     let (measured, share) = scene.work(size);
     let memory = scene.learner.process.peak_memory().unwrap();
     let scores = scene.learner.assert_scores_are_distinct().len();

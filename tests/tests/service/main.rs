@@ -7,4 +7,5 @@
 mod crowds;
 mod leaving;
 mod names;
+mod pace;
 mod runs;

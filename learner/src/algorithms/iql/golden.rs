@@ -1,8 +1,11 @@
 //! Tests: the update against an independent implementation (docs/golden.md).
 
-use super::super::golden::{Golden, check_update, devices, fresh, golden_batch, golden_setting, golden_table, goldens};
 use super::*;
-use quad_policy::{ActionNoise, load_policy};
+use crate::algorithms::golden::{
+    Golden, check_update, devices, fresh, golden_batch, golden_setting, golden_table, goldens,
+};
+use candle_core::Device;
+use quad_policy::{ActionNoise, Precision, load_policy};
 
 #[test]
 fn golden_update() {

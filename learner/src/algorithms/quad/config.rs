@@ -1,7 +1,6 @@
 //! QUAD's hyper-parameters: the `[agent]` table of a preset.
 
-use super::super::{AgentError, Algorithm, AlgorithmError, Hyperparameters, Setting};
-use super::super::{check, check_count, check_positive, check_rate};
+use crate::algorithms::algorithm::{self, AgentError, check, check_count, check_positive, check_rate};
 use serde::Deserialize;
 
 /// What pulls the policy away from the data.
@@ -85,10 +84,10 @@ pub(super) struct Quad {
 }
 
 /// Reads and checks the table.
-pub(super) fn read(table: &toml::Table) -> Result<Box<dyn Hyperparameters>, AgentError> {
-    let config: Quad = super::super::read(table)?;
+pub(super) fn read(table: &toml::Table) -> Result<Quad, AgentError> {
+    let config: Quad = algorithm::read(table)?;
     config.validate()?;
-    Ok(Box::new(config))
+    Ok(config)
 }
 
 impl Quad {
@@ -113,29 +112,5 @@ impl Quad {
         check("eta.initial", initial, (minimum..=maximum).contains(&initial), "between eta.minimum and eta.maximum")?;
         check("eta.rate", rate, rate >= 0.0 && rate.is_finite(), "at least 0")?;
         threshold.map_or(Ok(()), |threshold| check_positive("eta.threshold", threshold))
-    }
-}
-
-impl Hyperparameters for Quad {
-    fn variant(&self) -> String {
-        match self.guidance {
-            Guidance::Quad => "quad",
-            Guidance::Dac => "dac",
-            Guidance::None => "none",
-        }
-        .to_owned()
-    }
-
-    fn summary(&self) -> String {
-        let Self { samples, critics, hidden, .. } = self;
-        format!("guidance {}, {samples} samples, {critics} critics, {hidden} wide", self.variant())
-    }
-
-    fn samples_candidates(&self) -> bool {
-        true
-    }
-
-    fn start(&self, setting: &Setting) -> Result<Box<dyn Algorithm>, AlgorithmError> {
-        Ok(Box::new(super::Quad::new(self.clone(), setting.clone())?))
     }
 }

@@ -1,10 +1,12 @@
 //! Tests: the update against an independent implementation (docs/golden.md).
 
-use super::super::golden::{Golden, check_update, devices, fresh, golden_batch, golden_setting, golden_table, goldens};
 use super::*;
+use crate::algorithms::golden::{
+    Golden, check_update, devices, fresh, golden_batch, golden_setting, golden_table, goldens,
+};
 
 fn start(golden: &Golden, device: &Device) -> Quad {
-    let config: Config = super::super::read(&golden_table(golden)).unwrap();
+    let config: Config = config::read(&golden_table(golden)).unwrap();
     let mut quad = Quad::new(config, golden_setting(golden, device)).unwrap();
     let mut state = golden.state.clone();
     // Below 0: not set yet.

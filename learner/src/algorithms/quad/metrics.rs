@@ -1,6 +1,6 @@
 //! What an update of QUAD measures.
 
-use super::super::Metric;
+use crate::algorithms::algorithm::Metric;
 
 /// In the order of the values that an update gives.
 pub(super) const METRICS: &[Metric] = &[

@@ -8,23 +8,18 @@ use std::sync::{Arc, Mutex};
 /// What is done with a request.
 #[derive(Clone, Debug)]
 pub enum Answer {
-    /// The file, or the part that was asked for.
-    Whole,
-    /// So many bytes of that, and the connection is closed.
-    Cut(usize),
-    /// So many bytes of that, and then silence.
+    /// So many bytes of the file, or of the part that was asked for, and the connection is closed.
+    Send(usize),
+    /// So many, and then silence.
     Stall(usize),
     /// A status line and headers, and then these bytes, whatever was asked for.
     Other(String, Vec<u8>),
 }
 
-/// An answer without the file.
-pub fn status(status: u16) -> Answer {
-    Answer::Other(format!("{status} No\r\nContent-Length: 0"), Vec::new())
-}
+pub const WHOLE: Answer = Answer::Send(usize::MAX);
 
 pub struct Server {
-    address: String,
+    pub url: String,
     requests: Arc<Mutex<Vec<Option<usize>>>>,
 }
 
@@ -32,7 +27,7 @@ impl Server {
     /// Serves `content` on a free port: an answer a request, the last of them for ever.
     pub fn start(content: &[u8], answers: &[Answer]) -> Self {
         let listener = TcpListener::bind("127.0.0.1:0").unwrap();
-        let address = listener.local_addr().unwrap().to_string();
+        let url = format!("http://{}/file.hdf5", listener.local_addr().unwrap());
         let requests = Arc::new(Mutex::new(Vec::new()));
         let (content, mut answers, log) = (content.to_owned(), VecDeque::from(answers.to_owned()), requests.clone());
         std::thread::spawn(move || {
@@ -45,12 +40,7 @@ impl Server {
                 std::thread::spawn(move || reply(stream, start, &content, answer.unwrap()).ok());
             }
         });
-        Self { address, requests }
-    }
-
-    /// The file's address.
-    pub fn url(&self) -> String {
-        format!("http://{}/file.hdf5", self.address)
+        Self { url, requests }
     }
 
     /// Where each request wanted to start.
@@ -68,22 +58,18 @@ fn read_request(stream: &TcpStream) -> Option<usize> {
 
 fn reply(mut stream: TcpStream, start: Option<usize>, content: &[u8], answer: Answer) -> std::io::Result<()> {
     let rest = &content[start.unwrap_or(0)..];
-    let (count, is_silent) = match answer {
-        Answer::Whole => (rest.len(), false),
-        Answer::Cut(count) => (count, false),
-        Answer::Stall(count) => (count, true),
-        Answer::Other(head, body) => {
-            write!(stream, "HTTP/1.1 {head}\r\nConnection: close\r\n\r\n")?;
-            return stream.write_all(&body);
-        }
-    };
-    let (last, size) = (content.len().saturating_sub(1), content.len());
     let head = match start {
         None => "200 OK".to_owned(),
-        Some(start) => format!("206 Partial Content\r\nContent-Range: bytes {start}-{last}/{size}"),
+        Some(start) => format!("206 Partial Content\r\nContent-Range: bytes {start}-{}/*", content.len() - 1),
     };
-    write!(stream, "HTTP/1.1 {head}\r\nContent-Length: {}\r\nConnection: close\r\n\r\n", rest.len())?;
-    stream.write_all(&rest[..count])?;
+    let head = format!("{head}\r\nContent-Length: {}", rest.len());
+    let is_silent = matches!(answer, Answer::Stall(_));
+    let (head, body) = match answer {
+        Answer::Send(count) | Answer::Stall(count) => (head, rest[..count.min(rest.len())].to_owned()),
+        Answer::Other(head, body) => (head, body),
+    };
+    write!(stream, "HTTP/1.1 {head}\r\nConnection: close\r\n\r\n")?;
+    stream.write_all(&body)?;
     // Ends when the client leaves.
     if is_silent { stream.read(&mut [0]).map(drop) } else { Ok(()) }
 }

@@ -10,7 +10,8 @@ use quad_service::{Beat, Health};
 
 use super::agent::Agent;
 use super::outbox::{Outbox, Work};
-use super::steps::{self, Outcome, Outlets, Plan, TrainError, train};
+use super::results::{self, Outcome};
+use super::steps::{Outlets, Plan, TrainError, train};
 use super::{Registrar, TrainingMetrics};
 use crate::algorithms::{Setting, named};
 use crate::config::{Schedule, resolve};
@@ -23,7 +24,7 @@ struct Result {
     snapshots: Vec<(u64, bool)>,
     /// The newest one.
     checkpoint: Option<Checkpoint>,
-    rows: Vec<steps::Row>,
+    rows: Vec<results::Row>,
     metrics: TrainingMetrics,
 }
 
@@ -178,7 +179,7 @@ fn training_goes_on_from_a_checkpoint_bit_for_bit() {
 fn what_the_disk_does_not_take_comes_later_in_its_order() {
     let outbox = Outbox::default();
     let checkpoint = |step: u64| Checkpoint { step, state: vec![step as u8] };
-    let row = |step| steps::Row { step, seconds: 0.0, metrics: &[], values: vec![] };
+    let row = |step| results::Row { step, seconds: 0.0, metrics: &[], values: vec![] };
     (1..=3).for_each(|step| outbox.checkpoint(checkpoint(step)));
     (1..=3).for_each(|step| outbox.row(row(step)));
     let Some(refused) = outbox.next(&beat()) else { panic!("something waits") };

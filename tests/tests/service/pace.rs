@@ -5,18 +5,13 @@ use std::fs;
 use std::thread;
 use std::time::{Duration, Instant};
 
-use crate::learner::Learner;
-use crate::setting::Setting;
+use quad_tests::learner::Learner;
 
-/// A run with more episodes than any crowd can score while it is measured.
-pub const BUSY: Setting =
-    Setting { steps: 100_000_000, eval_interval: 30_000, episodes: 10_000, candidates: 1, hidden: 64, seed: 3 };
 /// After a change between quiet and loud, this long is not counted.
 pub const SETTLE: Duration = Duration::from_millis(500);
 
 /// What was found in all phases of one kind.
-#[derive(Clone, Copy, Debug, Default)]
-pub struct Pace {
+pub struct Speed {
     /// Gradient steps per second: the median of the phases.
     pub steps_per_second: f64,
     /// Processor time of all threads that do not train, in seconds per second.
@@ -25,7 +20,7 @@ pub struct Pace {
 
 /// Lets `rounds` quiet and loud phases follow each other; `loud` begins and ends the noise. Gives the quiet pace and the loud
 /// one.
-pub fn compare(learner: &Learner, rounds: usize, phase: Duration, mut loud: impl FnMut(bool)) -> [Pace; 2] {
+pub fn compare(learner: &Learner, rounds: usize, phase: Duration, mut loud: impl FnMut(bool)) -> [Speed; 2] {
     let mut phases = [Vec::new(), Vec::new()];
     for _ in 0..rounds {
         for (kind, found) in phases.iter_mut().enumerate() {
@@ -34,21 +29,20 @@ pub fn compare(learner: &Learner, rounds: usize, phase: Duration, mut loud: impl
             let (begin, steps, other) = (Instant::now(), steps(learner), other_threads(learner));
             thread::sleep(phase);
             let passed = begin.elapsed().as_secs_f64();
-            found.push(Pace {
+            found.push(Speed {
                 steps_per_second: (self::steps(learner) - steps) / passed,
                 other_threads: (other_threads(learner) - other) / passed,
             });
         }
     }
     loud(false);
-    phases.map(|phases| Pace {
-        steps_per_second: median(phases.iter().map(|pace| pace.steps_per_second)),
-        other_threads: median(phases.iter().map(|pace| pace.other_threads)),
+    phases.map(|phases| Speed {
+        steps_per_second: median(phases.iter().map(|speed| speed.steps_per_second)),
+        other_threads: median(phases.iter().map(|speed| speed.other_threads)),
     })
 }
 
-/// The middle of some numbers.
-pub fn median(numbers: impl Iterator<Item = f64>) -> f64 {
+fn median(numbers: impl Iterator<Item = f64>) -> f64 {
     let mut numbers: Vec<f64> = numbers.collect();
     numbers.sort_by(f64::total_cmp);
     numbers[numbers.len() / 2]

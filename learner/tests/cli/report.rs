@@ -1,0 +1,252 @@
+//! What `learner report` says of runs.
+
+use std::fs;
+
+use serde_json::{Value, json};
+
+use crate::printed;
+use crate::run::Run;
+
+/// What is reported of runs, which lie in folders a, b, …
+struct Reported {
+    json: Value,
+    text: String,
+    markdown: String,
+    picture: String,
+}
+
+fn report(runs: &[Run]) -> Reported {
+    let folder = tempfile::tempdir().unwrap();
+    let paths: Vec<_> = ('a'..='z').take(runs.len()).map(|name| folder.path().join(name.to_string())).collect();
+    runs.iter().zip(&paths).for_each(|(run, path)| run.write(path));
+    let picture = folder.path().join("curve.svg");
+    let print = |flags: &[&str]| {
+        let paths = paths.iter().map(|path| path.to_str().unwrap());
+        printed(&["report"].into_iter().chain(paths).chain(flags.iter().copied()).collect::<Vec<_>>())
+    };
+    let json = serde_json::from_str(&print(&["--json", "--plot", picture.to_str().unwrap()])).unwrap();
+    Reported { json, text: print(&[]), markdown: print(&["--markdown"]), picture: fs::read_to_string(picture).unwrap() }
+}
+
+impl Reported {
+    /// The only group of runs.
+    fn group(&self) -> &Value {
+        let groups = self.json["groups"].as_array().unwrap();
+        assert_eq!(groups.len(), 1, "{}", self.text);
+        &groups[0]
+    }
+
+    /// That both forms of the report say this.
+    fn says(&self, words: &[&str]) {
+        for text in [&self.text, &self.markdown] {
+            words.iter().for_each(|words| assert!(text.contains(words), "{words} is missing in\n{text}"));
+        }
+    }
+
+    /// That both have a line with all these words.
+    fn has_row(&self, words: &[&str]) {
+        for text in [&self.text, &self.markdown] {
+            let has_all = |line: &str| words.iter().all(|word| line.contains(word));
+            assert!(text.lines().any(has_all), "a line with {words:?} is missing in\n{text}");
+        }
+    }
+}
+
+/// A run of 6,000 steps with an evaluation of two episodes every thousand: complete ones with means 2, 4, 6, 8, 10 (+ shift),
+/// each ± √2, and half of a sixth.
+fn small(seed: u64, shift: f64) -> Run {
+    let [steps, eval_interval, episodes] = [6000, 1000, 2].map(toml::Value::from);
+    let mut run = Run::new("hopper-demo", seed).set(&[
+        ("experiment.steps", steps),
+        ("experiment.eval_interval", eval_interval),
+        ("experiment.episodes", episodes),
+    ]);
+    for n in 1..=5 {
+        let mean = 2.0 * n as f64 + shift;
+        run.score(1000 * n, 0, mean - 1.0, "00");
+        run.score(1000 * n, 1, mean + 1.0, "00");
+    }
+    run.score(6000, 1, 99.0, "00");
+    run
+}
+
+/// Four runs of one of the paper's presets, with a score of each evaluation up to `last`.
+fn paper(preset: &str, last: u64, score: impl Fn(u64) -> f64) -> Vec<Run> {
+    let run = |seed| {
+        let mut run = Run::new(preset, seed);
+        for step in (20_000..=last).step_by(20_000) {
+            (0..10).for_each(|episode| run.score(step, episode, score(step) + seed as f64, "00"));
+        }
+        run
+    };
+    (0..4).map(run).collect()
+}
+
+const HOPPER: &str = "hopper-medium-replay-v2";
+
+#[test]
+fn a_run_is_summarised_by_its_complete_evaluations_and_says_how_many_there_are() {
+    let reported = report(&[small(3, 0.0)]);
+    let run = &reported.json["runs"][0];
+    assert_eq!((&run["variant"], &run["seed"], &run["dataset_score"]), (&json!("quad"), &json!(3), &json!(10.7)));
+    assert_eq!((&run["mean_last_3"], &run["mean_last_5"]), (&json!(8.0), &json!(6.0)));
+    assert_eq!(run["missing"], json!([{ "step": 6000, "episodes": 1 }]));
+    let fifth = &run["evaluations"][4];
+    assert_eq!((&fifth["score"]["mean"], &fifth["mean_return"]), (&json!(10.0), &json!(100.0)));
+    for words in [
+        "10.00 ± 1.41",
+        "1 (part)",
+        "last 3 evaluations: 8.00",
+        "last 5 evaluations: 6.00",
+        "dataset:            10.70",
+        "scored in f32",
+        "1 episodes have no score: 5 of 6 evaluations are complete, the last of them after 5000 of 6000 steps",
+    ] {
+        assert!(reported.text.contains(words), "{words} is missing in\n{}", reported.text);
+    }
+}
+
+#[test]
+fn several_runs_are_summarised_over_seeds_with_both_deviations() {
+    let reported = report(&[small(0, 0.0), small(1, 4.0)]);
+    let group = reported.group();
+    assert_eq!((&group["seeds"], &group["mean_last_3"]["mean"]), (&json!([0, 1]), &json!(10.0)));
+    assert_eq!(group["mean_last_3"]["population_std"], json!(2.0));
+    assert!((group["mean_last_3"]["std"].as_f64().unwrap() - 8f64.sqrt()).abs() < 1e-12);
+    reported.says(&["10.00 ± 2.83 (2.00)", "divided by n - 1 (in parentheses: by n)"]);
+}
+
+#[test]
+fn a_run_that_is_not_complete_is_marked_over_seeds() {
+    let [mut complete, mut stopped] = [small(0, 0.0), small(1, 0.0)];
+    complete.score(6000, 0, 12.0, "00");
+    stopped.scores.truncate(4);
+    let reported = report(&[complete, stopped]);
+    let [marked] = &reported.group()["unfinished"].as_array().unwrap()[..] else { panic!("{}", reported.json) };
+    let words = "2 of 6 evaluations are complete, the last of them after 2000 of 6000 steps";
+    assert!(marked.as_str().unwrap().ends_with(words), "{marked}");
+    reported.has_row(&["Not complete: in ", words]);
+    reported.has_row(&["hopper-demo", "6000 steps (not complete)"]);
+}
+
+#[test]
+fn unlike_runs_are_no_seeds_of_each_other_and_the_report_says_what_differs() {
+    for (key, value, differs) in [
+        ("experiment.agent.tau", 0.5.into(), &["agent.tau = 0.1", "agent.tau = 0.5"][..]),
+        ("experiment.candidates", 1.into(), &["candidates = 10", "candidates = 1"]),
+        ("run.device", "cuda".into(), &["device = cpu", "device = cuda"]),
+        ("dataset.mean_return", 21.0.into(), &["dataset.mean_return = 20.0", "dataset.mean_return = 21.0"]),
+        ("experiment.agent.eta.threshold", 1.0.into(), &["no agent.eta.threshold", "agent.eta.threshold = 1.0"]),
+        ("experiment.reward", "as-is".into(), &["reward = \"locomotion\"", "reward = \"as-is\""]),
+        // The same file in another place.
+        ("dataset.path", "elsewhere.hdf5".into(), &[]),
+        ("experiment.dataset", "elsewhere.hdf5".into(), &[]),
+    ] {
+        let reported = report(&[small(0, 0.0), small(1, 0.0).set(&[(key, value)])]);
+        let groups = reported.json["groups"].as_array().unwrap();
+        let found: Vec<_> = groups.iter().flat_map(|group| group["differs"].as_array().unwrap()).collect();
+        assert_eq!(found, differs.iter().map(|&words| json!(words)).collect::<Vec<_>>().iter().collect::<Vec<_>>());
+        assert_eq!(groups.len(), 1.max(differs.len()));
+        reported.says(differs);
+    }
+}
+
+#[test]
+fn a_seed_counts_once_and_a_run_without_a_complete_evaluation_not_at_all() {
+    let mut unscored = small(1, 0.0);
+    unscored.scores.clear();
+    let reported = report(&[small(0, 0.0), small(0, 4.0), unscored]);
+    let group = reported.group();
+    assert_eq!((&group["seeds"], &group["mean_last_5"]["mean"]), (&json!([0]), &json!(6.0)), "the first is counted");
+    reported.has_row(&["Not counted: ", "b has seed 0 like "]);
+    reported.has_row(&["Not counted: ", "c has no complete evaluation"]);
+    assert!(reported.text.contains("no evaluation has a score yet"), "{}", reported.text);
+}
+
+#[test]
+fn the_papers_protocol_stands_beside_the_papers_figures() {
+    // The last five: 1,920,000 to 2,000,000; the last 50,000 steps: 1,960,000 to 2,000,000. An early best one counts nowhere.
+    let score = |step| if step == 20_000 { 1000.0 } else { step as f64 / 20_000.0 };
+    let reported = report(&paper(HOPPER, 2_000_000, score));
+    let group = reported.group();
+    assert_eq!((&group["mean_last_5"]["mean"], &group["mean_last_50000_steps"]["mean"]), (&json!(99.5), &json!(100.5)));
+    assert_eq!((&group["departures"], &group["published"][0]["score"]["mean"]), (&json!([]), &json!(104.9)));
+    reported.has_row(&[HOPPER, "score", "± by n ", "± by n - 1"]);
+    reported.has_row(&[
+        "ours: quad",
+        " 99.50 ",
+        " 1.12 ",
+        " 1.29 ",
+        "last 5 evaluations; 4 seeds, 2000000 steps on cpu",
+    ]);
+    reported.has_row(&["ours: quad", " 100.50 ", "last 50000 steps", "scored in f32"]);
+    reported.has_row(&["QUAD", " 104.9 ", " 0.2 ", "Table 1"]);
+    reported.has_row(&["IQL"]);
+    reported.has_row(&["DAC's code", "divides by the number of seeds n"]);
+    assert!(!reported.text.contains("Not the paper's"), "{}", reported.text);
+    assert!(reported.markdown.contains("\n| --- |"), "{}", reported.markdown);
+}
+
+#[test]
+fn what_is_not_the_papers_protocol_is_called_so() {
+    let departures = |runs: &[Run]| {
+        let reported = report(runs);
+        let departures: Vec<String> = serde_json::from_value(reported.group()["departures"].clone()).unwrap();
+        departures.iter().for_each(|words| reported.says(&[words]));
+        departures
+    };
+    let stopped = &paper(HOPPER, 400_000, |_| 50.0)[..1];
+    let changes = [("experiment.dataset", "x.hdf5".into()), ("experiment.agent.tau", 1.0.into())];
+    let stopped = stopped[0].clone().set(&changes);
+    let expected = [
+        "dataset is x.hdf5, not hopper-medium-replay-v2",
+        "agent.tau is 1.0, not 0.1",
+        "20 of 100 evaluations are complete, the last of them after 400000 of 2000000 steps",
+        "1 of 4 seeds",
+    ];
+    assert_eq!(departures(std::slice::from_ref(&stopped)), expected);
+    // The named file in another place, known by its checksum.
+    let sha256 = "e121c5f7c9857a307baa9edc6a2c3b48e85fedb9ac316ecddd0f48ca7ef4e39b";
+    assert_eq!(departures(&[stopped.set(&[("dataset.sha256", sha256.into())])]), expected[1..]);
+
+    // What evaluators computed in does not part the seeds, but it is named.
+    let mut mixed = paper(HOPPER, 2_000_000, |_| 50.0);
+    mixed[1].scores.iter_mut().for_each(|line| line["precision"] = json!("bf16-amx"));
+    assert_eq!(departures(&mixed), ["scored in bf16 and f32, not in f32"]);
+    mixed.iter_mut().flat_map(|run| &mut run.scores).for_each(|line| line["precision"] = json!("bf16-amx"));
+    assert_eq!(departures(&mixed), ["scored in bf16, not in f32"]);
+}
+
+#[test]
+fn the_number_of_goals_stands_beside_the_score_where_a_run_has_one() {
+    let reported = report(&paper("antmaze-umaze-v0", 100_000, |_| 50.0));
+    assert_eq!(reported.group()["goals"], json!(4));
+    reported.says(&[
+        "4, 4 goals",
+        "4 seeds with a goal each",
+        "one goal a run: 4 behind this ±",
+        "asks for 50 to 100 seeds",
+    ]);
+    let reported = report(&paper(HOPPER, 100_000, |_| 50.0));
+    assert!(reported.group()["goals"].is_null() && !reported.text.contains("goal"), "{}", reported.text);
+}
+
+#[test]
+fn scores_without_references_are_called_returns() {
+    let mut run = small(0, 0.0).set(&[("experiment.environment", "my-robot".into())]);
+    run.config["dataset"].as_table_mut().unwrap().remove("mean_score");
+    let Reported { text, picture, .. } = report(&[run]);
+    assert!(text.contains("mean return of the dataset") && !text.contains("score "), "{text}");
+    assert!(!picture.contains("normalised"));
+}
+
+#[test]
+fn a_picture_shows_the_curves_and_the_reference() {
+    let one = report(&[small(0, 0.0)]).picture;
+    let both = report(&[small(0, 0.0), small(1, 4.0)]).picture;
+    for text in ["<svg", "gradient steps", "dataset mean 10.7", "<polygon"] {
+        assert!(one.contains(text), "{text} is missing");
+    }
+    assert!(both.contains("r (quad, 10 candidates)"), "{both}");
+    assert!(both.matches("<circle").count() > one.matches("<circle").count());
+}

@@ -1,0 +1,20 @@
+//! Tests of `cli/train.rs`.
+
+use super::super::{Command, tests::parse};
+
+#[test]
+fn flags_change_the_preset() {
+    let flags = ["--steps", "7", "--eval-interval", "0", "--guidance", "dac", "--set", "agent.samples=2"];
+    let Command::Train(train) = parse(&flags).unwrap().command else { panic!("not train") };
+    let expected =
+        toml::toml! { dataset = "d.hdf5" steps = 7 eval_interval = 0 agent = { guidance = "dac", samples = 2 } };
+    assert_eq!(train.changes(), expected);
+    let Command::Train(train) = parse(&["--set", "seed=2", "--seed", "3"]).unwrap().command else { panic!() };
+    assert_eq!(train.changes(), toml::toml! { dataset = "d.hdf5" seed = 3 });
+}
+
+#[test]
+fn only_this_machine_sees_the_metrics_unless_told_otherwise() {
+    let Command::Train(train) = parse(&[]).unwrap().command else { panic!("not train") };
+    assert!(train.metrics.ip().is_loopback(), "{}", train.metrics);
+}

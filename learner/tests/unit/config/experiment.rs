@@ -1,0 +1,30 @@
+//! Tests of `config/experiment.rs`.
+
+use super::*;
+use toml::toml;
+
+#[test]
+fn changes_override_the_preset() {
+    let preset = resolve("hopper-demo", &Table::new()).unwrap();
+    let resolved = resolve("hopper-demo", &toml! { steps = 5 agent.guidance = "none" agent.tau = 1 }).unwrap();
+    assert_eq!((resolved.steps, resolved.eval_interval), (5, preset.eval_interval));
+    assert_eq!((&resolved.agent["guidance"], &resolved.agent["tau"]), (&"none".into(), &1.0.into()));
+}
+
+#[test]
+fn what_cannot_be_used_is_named_with_what_can() {
+    for (preset, changes, words) in [
+        ("hopper-demo", toml! { tau = 3 }, "unknown field `tau`, expected one of `environment`"),
+        ("hopper-demo", toml! { agent.rate = 1.0 }, "unknown field `rate`, expected one of `hidden`, `critics`"),
+        ("hopper-demo", toml! { agent.eta.treshold = 1.0 }, "`threshold`"),
+        ("hopper-demo", toml! { agent.guidance = "sac" }, "`quad`, `dac`, `none`"),
+        ("hopper-demo", toml! { agent.samples = 0 }, "samples is 0"),
+        ("hopper-demo", toml! { algorithm = "td3" }, "there are quad, iql"),
+        ("hopper-demo", toml! { episodes = 0 }, "episodes is 0, but must be from 1 to 10000"),
+        ("hopper-demo-iql", toml! { candidates = 2 }, "must be 1"),
+        ("paper", toml! { environment = "hopper" }, "missing field"),
+    ] {
+        let error = format!("{:#}", resolve(preset, &changes).unwrap_err());
+        assert!(error.contains(words), "{error}");
+    }
+}

@@ -1,0 +1,19 @@
+//! Tests of `config/presets.rs`.
+
+use super::*;
+
+#[test]
+fn a_difference_changes_what_it_names_and_nothing_else() {
+    let mut table = toml::toml! { a = 1.5 b = [1, 2] [c] d = 1 e = "x" };
+    merge(&mut table, toml::toml! { a = 2 b = [3] [c] e = "y" f = true });
+    assert_eq!(table, toml::toml! { a = 2.0 b = [3] [c] d = 1 e = "y" f = true });
+}
+
+#[test]
+fn assignments_are_toml_and_words_need_no_quotes() {
+    assert_eq!(parse_assignment("agent.tau=0.5").unwrap(), toml::toml! { agent.tau = 0.5 });
+    assert_eq!(parse_assignment("environment=my-robot").unwrap(), toml::toml! { environment = "my-robot" });
+    assert_eq!(parse_assignment("dataset=a b/c=\"d\".hdf5").unwrap()["dataset"].as_str(), Some("a b/c=\"d\".hdf5"));
+    assert!(parse_assignment("agent.tau").unwrap_err().contains("KEY=VALUE"));
+    assert!(parse_assignment("agent tau=1").unwrap_err().contains("agent tau"));
+}

@@ -1,0 +1,48 @@
+//! Tests of `run/checkpoints.rs`.
+
+use super::*;
+
+fn checkpoint(step: u64) -> Checkpoint {
+    Checkpoint { step, state: vec![step as u8; 1000] }
+}
+
+#[test]
+fn the_newest_are_kept_and_a_damaged_one_falls_back_to_the_one_before() {
+    let folder = tempfile::tempdir().unwrap();
+    let checkpoints = Checkpoints::of_run(folder.path());
+    fs::create_dir(&checkpoints.folder).unwrap();
+    assert_eq!(checkpoints.newest().unwrap(), None);
+    for step in [1, 9, 10, 200, 1_000_000_000] {
+        checkpoints.save(&checkpoint(step)).unwrap();
+        assert_eq!(checkpoints.newest().unwrap(), Some(checkpoint(step)));
+    }
+    let files = checkpoints.files().unwrap();
+    assert_eq!(files.iter().map(|file| step(file).unwrap()).collect::<Vec<_>>(), [1_000_000_000, 200, 10]);
+
+    // Torn, then a flipped bit, then gone; and what a crash leaves beside them.
+    fs::write(&files[0], &checkpoint(0).state[..500]).unwrap();
+    assert_eq!(checkpoints.newest().unwrap(), Some(checkpoint(200)));
+    let mut bytes = fs::read(&files[1]).unwrap();
+    bytes[700] ^= 1;
+    fs::write(&files[1], bytes).unwrap();
+    fs::write(checkpoints.folder.join("step_000000300_00.safetensors.partial"), "half").unwrap();
+    assert_eq!(checkpoints.newest().unwrap(), Some(checkpoint(10)));
+    assert_eq!(checkpoints.files().unwrap(), files[2..], "damaged ones do not take the place of good ones");
+    fs::remove_file(&files[2]).unwrap();
+    assert_eq!(checkpoints.newest().unwrap(), None);
+}
+
+#[test]
+fn one_that_cannot_be_read_falls_back_and_does_not_count_as_none() {
+    let folder = tempfile::tempdir().unwrap();
+    let checkpoints = Checkpoints::of_run(folder.path());
+    fs::create_dir(&checkpoints.folder).unwrap();
+    // A folder cannot be read as a file, not even by root.
+    let unreadable = checkpoints.folder.join("step_000000300_00.safetensors");
+    fs::create_dir_all(&unreadable).unwrap();
+    let error = checkpoints.newest().unwrap_err();
+    assert!(matches!(error, RunDirError::Io { action: "read", ref path, .. } if *path == unreadable), "{error}");
+    checkpoints.save(&checkpoint(200)).unwrap();
+    assert_eq!(checkpoints.newest().unwrap(), Some(checkpoint(200)));
+    assert!(unreadable.exists());
+}
