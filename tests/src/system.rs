@@ -18,6 +18,7 @@ pub struct Scratch {
     folder: TempDir,
 }
 
+#[allow(clippy::new_without_default)]
 impl Scratch {
     /// Makes it, with a dataset of a few thousand made-up transitions.
     pub fn new() -> Scratch {
@@ -90,12 +91,6 @@ impl Scratch {
         let mut command = through(launcher, "evaluator");
         command.args(["serve", "--name", name]).args(arguments);
         Evaluator { process: Process::start(name, self.path(), command) }
-    }
-}
-
-impl Default for Scratch {
-    fn default() -> Scratch {
-        Scratch::new()
     }
 }
 

@@ -23,7 +23,6 @@ fn compose_runs_the_whole_system() {
     dashboard::assert_every_panel_shows_data(&prometheus, PATIENCE);
 
     let evaluators = compose.containers("evaluator");
-    assert_eq!(evaluators.len(), EVALUATORS);
     let others = ["learner", "router", "prometheus"].map(|service| compose.container(service));
     for container in evaluators.iter().chain(&others) {
         let state = inspect(container, "{{.State.Health.Status}} {{.Config.User}}");

@@ -119,7 +119,7 @@ async fn start(flood: Flood, endpoint: &str, stop: Arc<AtomicBool>) -> tokio::ta
 async fn bear(each: Duration) {
     let scratch = Scratch::new();
     // Something new to evaluate about every second.
-    let mut learner = scratch.learner("run", Setting { eval_interval: STEP, episodes: 400, ..ENDLESS });
+    let learner = scratch.learner("run", Setting { eval_interval: STEP, episodes: 400, ..ENDLESS });
     let endpoint = learner.endpoint();
     let evaluator = scratch.evaluator("steady", &endpoint);
     learner.wait_for_scores(0);
@@ -143,8 +143,6 @@ async fn bear(each: Duration) {
     assert!(!learner.process.log().contains("panicked") && !evaluator.process.log().contains("panicked"));
     let lines = learner.process.log().lines().count();
     assert!(lines < 1000, "{lines} lines in the log");
-    let (took, _) = learner.process.terminate(PATIENCE);
-    assert!(took < Duration::from_secs(10), "it took {took:?} to leave");
 }
 
 #[tokio::test(flavor = "multi_thread")]
