@@ -1,5 +1,5 @@
-//! With the feature `cuda`: tells the binaries where the CUDA toolkit lies that they are linked with, so that nobody has
-//! to set LD_LIBRARY_PATH.
+//! With the feature `cuda`: tells the binaries where the CUDA toolkit lies that they are linked with, so that the user need not
+//! set LD_LIBRARY_PATH.
 
 use std::env;
 use std::path::Path;

@@ -1,5 +1,5 @@
 """Runs the benchmarks of learner, evaluator and kernels and of their peers in turns, and prints what
-docs/performance.md shows. To be started by deploy/bench.sh.
+docs/results.md shows. To be started by deploy/bench.sh.
 
     bench.py ROUNDS
 

@@ -3,7 +3,7 @@
 //! # Layout
 //!
 //! - [`product`]: dense products on one thread, in f32 and with operands rounded to bfloat16.
-//! - `avx512`: the products that the libraries at hand do more slowly (docs/performance.md says by how much).
+//! - `avx512`: the products that the libraries at hand do more slowly (docs/results.md says by how much).
 //! - [`activation`]: Mish and its derivative; [`narrow`]: the first and last layer of a network, fused with it.
 //! - [`optimiser`]: Adam, EMA and sums over whole parameter vectors.
 //! - [`Buffer`] (`buffer`): memory that is used again and again, aligned to cache lines.

@@ -1,5 +1,5 @@
-//! The thread `snapshots`: writes what training makes to the disk, publishes the snapshots that are to be evaluated, and opens
-//! their evaluations, in this order.
+//! The thread `snapshots`: writes what training makes to the disk, then opens the evaluations of snapshots that are to be
+//! evaluated, then publishes these.
 
 use std::collections::BTreeMap;
 use std::time::{Duration, SystemTime, UNIX_EPOCH};

@@ -4,6 +4,7 @@
 mod presets;
 mod report;
 mod run;
+mod threads;
 mod verify;
 
 use std::process::{Command, Output};
