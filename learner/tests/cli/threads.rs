@@ -16,7 +16,7 @@ fn write_dataset(path: &Path) {
             observation: &observation(step),
             action: &[0.1, -0.2, 0.3],
             next_observation: &observation(step + 1),
-            reward: 1.0,
+            reward: if step < 50 { 1.0 } else { 2.0 },
             terminal: false,
             timeout: step % 50 == 49,
             qpos: &[0.0; 6],
