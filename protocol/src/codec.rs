@@ -1,4 +1,4 @@
-//! Messages to bytes and back; the only place that knows the encoding.
+//! Messages to bytes and back. Each message says beside its fields which kind of frame it is.
 //!
 //! A frame is the four bytes `QUAD`, the protocol version (u16), the message's kind (u8) and its fields in order of
 //! declaration, without padding: integers and floats little-endian at their own width, texts and lists with their
@@ -11,13 +11,11 @@
 use std::io::Read;
 
 use bincode::config::{Configuration, Fixint, LittleEndian};
-use bincode::de::Decoder;
-use bincode::enc::Encoder;
-use bincode::error::{DecodeError, EncodeError};
+use bincode::error::DecodeError;
 
-pub(crate) use bincode::{Decode, Encode};
+use bincode::{Decode, Encode};
 
-use crate::{Hash, JobReply, JobRequest, Name, Progress, Schema, ScoreReply, ScoreReport, Snapshot};
+use crate::hash::Hash;
 
 /// Version of keys, messages and encoding. Frames of another version are refused.
 pub const PROTOCOL_VERSION: u16 = 7;
@@ -28,7 +26,7 @@ const HEADER_LENGTH: usize = MAGIC.len() + size_of::<u16>() + size_of::<u8>();
 /// Largest frame without tensors: tens of thousands of episodes fit.
 const SMALL: usize = 1 << 20;
 /// Largest frame with tensors; the paper's networks take a tenth of it.
-const LARGE: usize = 64 << 20;
+pub(crate) const LARGE: usize = 64 << 20;
 /// Most bytes of memory per byte of a valid small frame: an empty text in a list takes 24 bytes, 8 of them in the frame.
 const MEMORY_PER_WIRE_BYTE: usize = 4;
 
@@ -45,44 +43,6 @@ pub trait Message: Encode + Decode<()> {
     fn verify(&self) -> Result<(), CodecError> {
         Ok(())
     }
-}
-
-impl Message for Snapshot {
-    const KIND: u8 = 1;
-    const LIMIT: usize = LARGE;
-
-    fn verify(&self) -> Result<(), CodecError> {
-        for (field, text) in [("environment", &self.schema.environment), ("policy", &self.schema.policy)] {
-            let (length, most) = (text.len(), Schema::MAX_NAME_LENGTH);
-            if length > most {
-                return Err(CodecError::Malformed(format!(
-                    "the {field} has {length} bytes, at most {most} are allowed"
-                )));
-            }
-        }
-        let found = Hash::of(&self.tensors);
-        if found == self.hash { Ok(()) } else { Err(CodecError::Hash { claimed: self.hash, found }) }
-    }
-}
-
-impl Message for JobRequest {
-    const KIND: u8 = 2;
-}
-
-impl Message for JobReply {
-    const KIND: u8 = 3;
-}
-
-impl Message for ScoreReport {
-    const KIND: u8 = 4;
-}
-
-impl Message for ScoreReply {
-    const KIND: u8 = 5;
-}
-
-impl Message for Progress {
-    const KIND: u8 = 6;
 }
 
 /// Why bytes are not the expected message, or a message cannot be sent.
@@ -226,17 +186,3 @@ fn body_error(error: DecodeError) -> CodecError {
         other => CodecError::Malformed(other.to_string()),
     }
 }
-
-impl Encode for Name {
-    fn encode<E: Encoder>(&self, encoder: &mut E) -> Result<(), EncodeError> {
-        self.as_str().encode(encoder)
-    }
-}
-
-impl<Context> Decode<Context> for Name {
-    fn decode<D: Decoder<Context = Context>>(decoder: &mut D) -> Result<Name, DecodeError> {
-        Name::new(String::decode(decoder)?).map_err(|error| DecodeError::OtherString(error.to_string()))
-    }
-}
-
-bincode::impl_borrow_decode!(Name);

@@ -2,7 +2,7 @@
 
 use std::fmt;
 
-use crate::codec::{Decode, Encode};
+use bincode::{Decode, Encode};
 
 /// BLAKE3 hash; as text, 64 lower-case hexadecimal digits, like `b3sum` prints it.
 #[derive(Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash, Encode, Decode)]

@@ -2,8 +2,11 @@
 
 use std::time::Duration;
 
-use crate::codec::{Decode, Encode};
-use crate::{Hash, Name};
+use bincode::{Decode, Encode};
+
+use crate::codec::Message;
+use crate::hash::Hash;
+use crate::name::Name;
 
 /// What an evaluator asks a learner about jobs.
 #[derive(Clone, Debug, PartialEq, Eq, Encode, Decode)]
@@ -88,4 +91,12 @@ pub struct Job {
 impl Job {
     /// Longest time that an evaluator may have a job, whatever its progress.
     pub const LONGEST: Duration = Duration::from_secs(3600);
+}
+
+impl Message for JobRequest {
+    const KIND: u8 = 2;
+}
+
+impl Message for JobReply {
+    const KIND: u8 = 3;
 }

@@ -13,7 +13,7 @@
 //! A learner's answers, jobs and snapshots name its incarnation: an evaluator believes those of the incarnation that it
 //! follows by its token, and not those of an earlier life. Which peers may use these keys is up to TLS and access control.
 
-use crate::Name;
+use crate::name::Name;
 
 /// Key expression of the liveliness tokens of all runs' learners.
 pub const ALL_LEARNERS: &str = "quad/*/live/learner/*";

@@ -10,7 +10,7 @@
 //! - `seeds`: which episodes an evaluation has; `job`: an evaluator asks for work and gets some.
 //! - `progress`: an evaluator tells how far its job is.
 //! - `score`: an evaluator delivers scores, the learner acknowledges them.
-//! - `codec`: messages to bytes and back; the only place that knows the encoding.
+//! - `codec`: messages to bytes and back.
 //!
 //! Nothing here knows what the weights mean or how episodes are simulated.
 

@@ -2,6 +2,11 @@
 
 use std::fmt;
 
+use bincode::de::Decoder;
+use bincode::enc::Encoder;
+use bincode::error::{DecodeError, EncodeError};
+use bincode::{Decode, Encode};
+
 /// Name of a run or of an evaluator: 1 to 64 ASCII letters, digits, dots, dashes and underscores.
 ///
 /// It fits into a Zenoh key, a file name and a metric's label without quoting.
@@ -47,6 +52,20 @@ impl fmt::Display for Name {
         f.write_str(&self.0)
     }
 }
+
+impl Encode for Name {
+    fn encode<E: Encoder>(&self, encoder: &mut E) -> Result<(), EncodeError> {
+        self.as_str().encode(encoder)
+    }
+}
+
+impl<Context> Decode<Context> for Name {
+    fn decode<D: Decoder<Context = Context>>(decoder: &mut D) -> Result<Name, DecodeError> {
+        Name::new(String::decode(decoder)?).map_err(|error| DecodeError::OtherString(error.to_string()))
+    }
+}
+
+bincode::impl_borrow_decode!(Name);
 
 #[cfg(test)]
 mod tests {

@@ -1,7 +1,10 @@
 //! Progress of an evaluator.
 
-use crate::codec::{Decode, Encode};
-use crate::{Job, Name};
+use bincode::{Decode, Encode};
+
+use crate::codec::Message;
+use crate::job::Job;
+use crate::name::Name;
 
 /// How far a job is, and what the evaluator has done so far. Extends the job's lease, if it is further than before.
 #[derive(Clone, Debug, PartialEq, Eq, Encode, Decode)]
@@ -44,4 +47,8 @@ impl Progress {
             episodes: 0,
         }
     }
+}
+
+impl Message for Progress {
+    const KIND: u8 = 6;
 }

@@ -1,7 +1,11 @@
 //! Scores: an evaluator delivers them, the learner acknowledges them.
 
-use crate::codec::{Decode, Encode};
-use crate::{Hash, Job, Name};
+use bincode::{Decode, Encode};
+
+use crate::codec::Message;
+use crate::hash::Hash;
+use crate::job::Job;
+use crate::name::Name;
 
 /// The result of one episode.
 #[derive(Clone, Copy, Debug, PartialEq, Encode, Decode)]
@@ -74,4 +78,12 @@ impl ScoreReply {
             Self::Recorded { incarnation, .. } | Self::Refused { incarnation, .. } => *incarnation,
         }
     }
+}
+
+impl Message for ScoreReport {
+    const KIND: u8 = 4;
+}
+
+impl Message for ScoreReply {
+    const KIND: u8 = 5;
 }

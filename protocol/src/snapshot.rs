@@ -1,7 +1,10 @@
 //! Weights, from the learner to evaluators.
 
-use crate::codec::{Decode, Encode};
-use crate::{Hash, Name};
+use bincode::{Decode, Encode};
+
+use crate::codec::{CodecError, LARGE, Message};
+use crate::hash::Hash;
+use crate::name::Name;
 
 /// What a snapshot says of its policy beside the tensors. The shapes of the networks are in the tensors' own file.
 #[derive(Clone, Debug, PartialEq, Eq, Encode, Decode)]
@@ -38,4 +41,22 @@ pub struct Snapshot {
     /// A whole safetensors file with the shapes of its networks and its [`Origin`](crate::Origin) in its metadata. It is
     /// not looked into here.
     pub tensors: Vec<u8>,
+}
+
+impl Message for Snapshot {
+    const KIND: u8 = 1;
+    const LIMIT: usize = LARGE;
+
+    fn verify(&self) -> Result<(), CodecError> {
+        for (field, text) in [("environment", &self.schema.environment), ("policy", &self.schema.policy)] {
+            let (length, most) = (text.len(), Schema::MAX_NAME_LENGTH);
+            if length > most {
+                return Err(CodecError::Malformed(format!(
+                    "the {field} has {length} bytes, at most {most} are allowed"
+                )));
+            }
+        }
+        let found = Hash::of(&self.tensors);
+        if found == self.hash { Ok(()) } else { Err(CodecError::Hash { claimed: self.hash, found }) }
+    }
 }

@@ -278,7 +278,6 @@ fn what_every_receiver_refuses_is_not_sent() {
     assert!(matches!(error, CodecError::Oversized { length, limit } if length > limit), "{error}");
 }
 
-/// A snapshot crosses between two gradient steps of some milliseconds. Byte by byte it would take ten times as long.
 #[test]
 fn six_megabytes_take_milliseconds() {
     let tensors: Vec<u8> = (0..6_000_000u32).map(|i| i.wrapping_mul(2_654_435_761).to_le_bytes()[3]).collect();
@@ -296,7 +295,6 @@ fn six_megabytes_take_milliseconds() {
     let frame = encode(&message).unwrap();
     let encoding = fastest(&|| drop(encode(&message).unwrap()));
     let decoding = fastest(&|| drop(decode::<Snapshot>(&frame).unwrap()));
-    println!("encode {encoding:?}, decode and verify {decoding:?}");
     assert!(encoding < Duration::from_millis(20), "{encoding:?}");
     assert!(decoding < Duration::from_millis(60), "{decoding:?}");
 }
