@@ -1,5 +1,6 @@
 //! The threads of a run, started together and ended in order.
 
+use std::collections::BTreeMap;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::thread::JoinHandle;
@@ -19,8 +20,8 @@ use super::services::Services;
 use super::snapshots::Snapshots;
 use super::spawn::spawn_alive;
 use super::weights::Weights;
-use crate::config::RunConfig;
-use crate::evaluation::Rules;
+use crate::config::{Experiment, RunConfig};
+use crate::evaluation::{Earlier, Rules};
 use crate::run::{Log, Past, RunDir};
 use crate::train::{Outbox, Training};
 
@@ -70,15 +71,6 @@ impl Threads {
         let Past { checkpoint, snapshots: known, scores: earlier } = past;
         let experiment = &config.experiment;
         let task = Task::new(&experiment.environment, transitions.observation_dim(), transitions.action_dim());
-        let rules = Rules {
-            run: life.run.clone(),
-            incarnation: life.incarnation,
-            task: task.clone(),
-            instance: experiment.seed,
-            candidates: experiment.candidates,
-            job_episodes: JOB_EPISODES,
-            lease: LEASE,
-        };
         let origin = Origin {
             environment: task.environment.clone(),
             seed: experiment.seed,
@@ -86,8 +78,7 @@ impl Threads {
             episodes: experiment.episodes,
             candidates: experiment.candidates,
         };
-        let plan = EvaluationPlan { seed: experiment.seed, episodes: experiment.episodes };
-        let coordinator = Coordinator::new(rules, plan, earlier, metrics.clone(), events.clone());
+        let coordinator = coordinator(&life, experiment, &task, earlier, metrics, events);
         for (&step, &hash) in &known {
             coordinator.open(step, hash)?;
         }
@@ -149,4 +140,26 @@ impl Threads {
         self.services.deliveries.send(None).ok();
         self.scores.join().ok();
     }
+}
+
+/// Who has which job, at the start of this life of the run.
+fn coordinator(
+    life: &Life,
+    experiment: &Experiment,
+    task: &Task,
+    earlier: BTreeMap<u64, Earlier>,
+    metrics: &Metrics,
+    events: &Events,
+) -> Coordinator {
+    let rules = Rules {
+        run: life.run.clone(),
+        incarnation: life.incarnation,
+        task: task.clone(),
+        instance: experiment.seed,
+        candidates: experiment.candidates,
+        job_episodes: JOB_EPISODES,
+        lease: LEASE,
+    };
+    let plan = EvaluationPlan { seed: experiment.seed, episodes: experiment.episodes };
+    Coordinator::new(rules, plan, earlier, metrics.clone(), events.clone())
 }
