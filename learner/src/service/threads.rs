@@ -71,18 +71,11 @@ impl Threads {
         let Past { checkpoint, snapshots: known, scores: earlier } = past;
         let experiment = &config.experiment;
         let task = Task::new(&experiment.environment, transitions.observation_dim(), transitions.action_dim());
-        let origin = Origin {
-            environment: task.environment.clone(),
-            seed: experiment.seed,
-            step: 0,
-            episodes: experiment.episodes,
-            candidates: experiment.candidates,
-        };
         let coordinator = coordinator(&life, experiment, &task, earlier, metrics, events);
         for (&step, &hash) in &known {
             coordinator.open(step, hash)?;
         }
-        let weights = Weights::new(life.run, life.incarnation, task, dir.clone(), coordinator.clone());
+        let weights = Weights::new(life.run, life.incarnation, task.clone(), dir.clone(), coordinator.clone());
         let (services, deliveries) =
             Services::start(coordinator.clone(), weights.clone(), metrics.clone(), events.clone())?;
 
@@ -97,7 +90,7 @@ impl Threads {
         let outbox = Outbox::default();
         let snapshots = Snapshots {
             outbox: outbox.clone(),
-            origin,
+            origin: origin(experiment, &task),
             run_dir: dir.clone(),
             rows,
             weights,
@@ -162,4 +155,15 @@ fn coordinator(
     };
     let plan = EvaluationPlan { seed: experiment.seed, episodes: experiment.episodes };
     Coordinator::new(rules, plan, earlier, metrics.clone(), events.clone())
+}
+
+/// What snapshots say of their origin, without the step.
+fn origin(experiment: &Experiment, task: &Task) -> Origin {
+    Origin {
+        environment: task.environment.clone(),
+        seed: experiment.seed,
+        step: 0,
+        episodes: experiment.episodes,
+        candidates: experiment.candidates,
+    }
 }
