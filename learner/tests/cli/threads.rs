@@ -5,27 +5,7 @@ use std::path::Path;
 use std::process::{Command, Stdio};
 use std::time::{Duration, Instant};
 
-use quad_dataset::{D4rlWriter, Metadata, Row, environment};
-
-/// A small file of Hopper.
-fn write_dataset(path: &Path) {
-    let mut writer = D4rlWriter::create(path, environment::find("hopper").unwrap()).unwrap();
-    for step in 0..100 {
-        let observation = |step: usize| [(step as f64 * 0.1).sin(); 11];
-        let row = Row {
-            observation: &observation(step),
-            action: &[0.1, -0.2, 0.3],
-            next_observation: &observation(step + 1),
-            reward: if step < 50 { 1.0 } else { 2.0 },
-            terminal: false,
-            timeout: step % 50 == 49,
-            qpos: &[0.0; 6],
-            qvel: &[0.0; 6],
-        };
-        writer.push(&row).unwrap();
-    }
-    writer.finish(&Metadata { algorithm: "made up", iteration: 0, seed: 0 }).unwrap();
-}
+use crate::write_dataset;
 
 /// The first column of the table.
 fn described() -> BTreeSet<String> {
