@@ -116,36 +116,23 @@ async fn the_router_refuses_and_logs_those_without_a_valid_certificate() {
     assert!(!stray.process.log().contains("connected"));
 }
 
-/// With an evaluator at `endpoint` whose certificate expires soon, and which gets a new one.
-async fn expires_and_is_renewed(certificates: &Certificates, scratch: &Scratch, name: &str, endpoint: &str) {
-    let monitor = connect(endpoint, &certificates.of("router"), Some(&certificates.of("monitor"))).await.unwrap();
-    let token = format!("quad/*/live/evaluator/{name}");
-    let tokens = monitor.liveliness().declare_subscriber(token).history(true).await.unwrap();
-    let next = async || timeout(PATIENCE, tokens.recv_async()).await.expect("it comes or goes").unwrap().kind();
-    let folder = certificates.argument(name);
-    let evaluator = scratch.evaluator_with(name, &["--connect", endpoint, "--certificates", &folder]);
-    assert_eq!(next().await, SampleKind::Put);
-    assert_eq!(next().await, SampleKind::Delete, "it stays after its certificate has expired");
-
-    certificates.renew(name);
-    assert_eq!(next().await, SampleKind::Put);
-    assert!(evaluator.process.log().contains("make a new one soon"));
-}
-
+/// At a learner that listens itself, the same is tested beside the session.
 #[tokio::test(flavor = "multi_thread")]
 async fn an_expired_certificate_ends_a_connection_and_a_renewed_one_brings_it_back() {
     let Some(certificates) = make_certificates() else { return };
     let (scratch, folder) = (Scratch::new(), certificates.argument("learner"));
     let (_router, endpoint) = protected_router(HOST, &certificates.of("router")).await;
-    let connected = ["--connect", &endpoint, "--certificates", &folder];
-    let _connected = scratch.learner_with("connected", IDLE, &connected);
-    let listening = ["--listen", "tls/127.0.0.1:0", "--certificates", &folder];
-    let listening = scratch.learner_with("listening", IDLE, &listening);
-    let own = listening.endpoint();
-    certificates.short("at-the-router", 12);
-    certificates.short("at-the-learner", 12);
-    tokio::join!(
-        expires_and_is_renewed(&certificates, &scratch, "at-the-router", &endpoint),
-        expires_and_is_renewed(&certificates, &scratch, "at-the-learner", &own),
-    );
+    let _learner = scratch.learner_with("run", IDLE, &["--connect", &endpoint, "--certificates", &folder]);
+    let monitor = connect(&endpoint, &certificates.of("router"), Some(&certificates.of("monitor"))).await.unwrap();
+    let tokens = monitor.liveliness().declare_subscriber("quad/run/live/evaluator/*").history(true).await.unwrap();
+    let next = async || timeout(PATIENCE, tokens.recv_async()).await.expect("it comes or goes").unwrap().kind();
+    certificates.short("brief", 10);
+    let folder = certificates.argument("brief");
+    let evaluator = scratch.evaluator_with("brief", &["--connect", &endpoint, "--certificates", &folder]);
+    assert_eq!(next().await, SampleKind::Put);
+    assert_eq!(next().await, SampleKind::Delete, "it stays after its certificate has expired");
+
+    certificates.renew("brief");
+    assert_eq!(next().await, SampleKind::Put);
+    assert!(evaluator.process.log().contains("make a new one soon"));
 }
