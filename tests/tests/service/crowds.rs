@@ -52,7 +52,7 @@ const LONG: Size = Size {
     count: 500,
     launcher: &["taskset", "-c", "1"],
     episode: Duration::from_millis(1600),
-    rounds: 3,
+    rounds: 2,
     phase: Duration::from_secs(10),
 };
 
@@ -134,7 +134,7 @@ fn fifty_evaluators_are_served_and_each_score_counts_once() {
 }
 
 #[test]
-#[ignore = "nine minutes, on two cores of its own"]
+#[ignore = "eight minutes, on two cores of its own"]
 fn five_hundred_evaluators_are_served_and_training_hardly_notices() {
     // All but the learner runs on the other core.
     let me = std::process::id().to_string();
