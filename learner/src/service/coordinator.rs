@@ -165,9 +165,10 @@ impl Coordinator {
         self.lost(&state, lost);
     }
 
-    /// What is new in a report, which changes nothing yet.
-    pub fn validate(&self, report: &ScoreReport) -> Result<Validated, Refusal> {
-        self.lock().scoreboard.validate(report)
+    /// What is new in each of some reports, which changes nothing yet.
+    pub fn validate<'a>(&self, reports: impl Iterator<Item = &'a ScoreReport>) -> Vec<Result<Validated, Refusal>> {
+        let state = self.lock();
+        reports.map(|report| state.scoreboard.validate(report)).collect()
     }
 
     /// Lets an evaluator keep its job whose scores have come but are not on the disk yet.
@@ -175,10 +176,16 @@ impl Coordinator {
         self.lock().scoreboard.keep(report, Instant::now());
     }
 
-    /// Counts scores that are on the disk. Gives the acknowledgement.
-    pub fn record(&self, report: &ScoreReport, validated: &Validated) -> ScoreReply {
-        let Validated { new, duplicates } = validated;
+    /// Counts scores that are on the disk. Gives the acknowledgement of each report.
+    pub fn record<'a>(&self, reports: impl Iterator<Item = (&'a ScoreReport, &'a Validated)>) -> Vec<ScoreReply> {
         let mut state = self.lock();
+        let replies = reports.map(|(report, validated)| self.record_one(&mut state, report, validated)).collect();
+        self.count(&state);
+        replies
+    }
+
+    fn record_one(&self, state: &mut State, report: &ScoreReport, validated: &Validated) -> ScoreReply {
+        let Validated { new, duplicates } = validated;
         let recorded = state.scoreboard.record(report, new);
         let evaluation = &self.metrics.evaluation;
         evaluation.scores_recorded.inc_by(new.len() as u64);
@@ -188,7 +195,6 @@ impl Coordinator {
             self.show(report.step, &scores);
             self.events.send(Event::Evaluated { step: report.step, scores }).ok();
         }
-        self.count(&state);
         ScoreReply::Recorded { incarnation: self.incarnation, new: new.len() as u32, duplicates: *duplicates }
     }
 

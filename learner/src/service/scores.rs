@@ -6,8 +6,8 @@
 use std::collections::BTreeSet;
 use std::sync::mpsc::{Receiver, RecvTimeoutError};
 
-use quad_protocol::{ScoreReply, ScoreReport};
-use quad_service::{Beat, stay_in_background};
+use quad_protocol::ScoreReport;
+use quad_service::Beat;
 
 use super::coordinator::Coordinator;
 use super::disk::DiskStatus;
@@ -36,7 +36,6 @@ pub(super) struct Scores {
 impl Scores {
     /// The thread's work, until it is told that nothing more will come.
     pub fn run(mut self, beat: &Beat) -> anyhow::Result<()> {
-        stay_in_background();
         let mut ended = false;
         while !ended {
             beat.alive();
@@ -62,54 +61,53 @@ impl Scores {
     /// Handles some reports together. Gives those back that have an episode that another one of them has, too: they are
     /// looked at once the other one is counted.
     fn take_in(&mut self, reports: Vec<(Request, ScoreReport)>, beat: &Beat) -> Vec<(Request, ScoreReport)> {
-        let (mut new, mut later, mut seen) = (Vec::new(), Vec::new(), BTreeSet::new());
-        for (request, report) in reports {
+        let mut seen = BTreeSet::new();
+        let (now, later): (Vec<_>, Vec<_>) = reports.into_iter().partition(|(_, report)| {
             let keys = || report.episodes.iter().map(|score| (report.step, score.seed));
-            if keys().any(|key| seen.contains(&key)) {
-                later.push((request, report));
-                continue;
-            }
-            match self.coordinator.validate(&report) {
+            let first = !keys().any(|key| seen.contains(&key));
+            seen.extend(keys().filter(|_| first));
+            first
+        });
+        let mut accepted = Vec::new();
+        let validated = self.coordinator.validate(now.iter().map(|(_, report)| report));
+        for ((request, report), validated) in now.into_iter().zip(validated) {
+            match validated {
+                Ok(validated) => accepted.push((request, report, validated)),
                 Err(refusal) => {
                     self.metrics.reject(refusal.label());
                     request.reply(&self.coordinator.refused(refusal));
                 }
-                Ok(validated) if validated.new.is_empty() => {
-                    request.reply(&self.coordinator.record(&report, &validated));
-                }
-                Ok(validated) => {
-                    seen.extend(keys());
-                    new.push((request, report, validated));
-                }
             }
         }
-        self.write(new, beat);
+        self.write(accepted, beat);
         later
     }
 
     /// Writes the new scores of reports, and answers each.
-    fn write(&mut self, new: Vec<(Request, ScoreReport, Validated)>, beat: &Beat) {
-        if new.is_empty() {
-            return;
-        }
+    fn write(&mut self, reports: Vec<(Request, ScoreReport, Validated)>, beat: &Beat) {
         let of = |(_, report, validated): &(_, ScoreReport, Validated)| {
             validated.new.iter().map(|score| ScoreLine::new(report, score)).collect::<Vec<_>>()
         };
-        let lines: Vec<_> = new.iter().flat_map(of).collect();
-        let written = self.log.append(&lines).map_err(|error| format!("{:#}", anyhow::Error::from(error)));
-        match &written {
-            Ok(()) => self.disk.well(beat),
-            Err(error) => self.disk.refused(beat, error),
-        }
-        for (request, report, validated) in new {
-            match &written {
-                Ok(()) => request.reply::<ScoreReply>(&self.coordinator.record(&report, &validated)),
-                // Nothing is counted, so the scores are new again when the evaluator delivers them once more.
-                Err(error) => {
-                    self.coordinator.keep(&report);
-                    request.reject(&Rejection::NotSaved(error.clone()), &self.metrics);
-                }
+        let lines: Vec<_> = reports.iter().flat_map(of).collect();
+        if !lines.is_empty() {
+            let written = self.log.append(&lines).map_err(|error| format!("{:#}", anyhow::Error::from(error)));
+            if let Err(error) = written {
+                self.disk.refused(beat, &error);
+                return self.refuse(reports, &error);
             }
+            self.disk.well(beat);
+        }
+        let replies = self.coordinator.record(reports.iter().map(|(_, report, validated)| (report, validated)));
+        for ((request, ..), reply) in reports.into_iter().zip(replies) {
+            request.reply(&reply);
+        }
+    }
+
+    /// Nothing is counted, so the scores are new again when the evaluators deliver them once more.
+    fn refuse(&self, reports: Vec<(Request, ScoreReport, Validated)>, error: &str) {
+        for (request, report, _) in reports {
+            self.coordinator.keep(&report);
+            request.reject(&Rejection::NotSaved(error.to_owned()), &self.metrics);
         }
     }
 }

@@ -5,7 +5,7 @@ use std::collections::BTreeMap;
 use std::time::{Duration, SystemTime, UNIX_EPOCH};
 
 use quad_protocol::{Hash, Origin};
-use quad_service::{Beat, hinted, stay_in_background};
+use quad_service::{Beat, hinted};
 use tracing::debug;
 
 use super::disk::DiskStatus;
@@ -38,7 +38,6 @@ pub(super) struct Snapshots {
 impl Snapshots {
     /// The thread's work, until the outbox is closed and empty. What the disk refuses is tried again until it is taken.
     pub fn run(mut self, beat: &Beat) -> anyhow::Result<()> {
-        stay_in_background();
         while let Some(work) = self.outbox.next(beat) {
             match self.carry_out(&work) {
                 Ok(()) => {
