@@ -2,7 +2,6 @@
 
 use std::net::TcpListener;
 use std::process::Command;
-use std::time::{Duration, Instant};
 
 use quad_protocol::{Name, keys};
 use quad_service::{Endpoints, open_session};
@@ -21,14 +20,12 @@ async fn while_a_learner_waits_for_the_token_of_another_one_to_go_it_hears_that_
     let token = keys::live_learner(&Name::new("run").unwrap(), 1);
     let _token = other.liveliness().declare_token(token).await.unwrap();
 
-    let start = Instant::now();
     let mut learner = Command::new(env!("CARGO_BIN_EXE_learner"));
     learner.args(["train", "--preset", "hopper-demo", "--set", "batch_size=4", "--set", "agent.hidden=8"]);
     learner.args(["--set", "agent.critic_learning_rate=1e30", "--connect", &endpoint]);
     learner.arg("--dataset").arg(&dataset).arg("--run-dir").arg(folder.path().join("run"));
     let output = tokio::task::spawn_blocking(move || learner.output().unwrap()).await.unwrap();
     let text = String::from_utf8_lossy(&output.stderr);
+    // One that heard nothing would say after eight seconds that there is another learner.
     assert!(text.contains("training diverged"), "{text}");
-    // It would have waited for eight seconds.
-    assert!(start.elapsed() < Duration::from_secs(7), "{:?}", start.elapsed());
 }
