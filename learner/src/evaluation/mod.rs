@@ -8,8 +8,8 @@
 //! It runs on no thread of its own: the room `service` holds it behind a lock for microseconds. The current time is an
 //! argument, so tests have a clock of their own.
 //!
-//! In reading order: `scoreboard`, `outcomes` (its questions and answers), `episodes` (one evaluation), `jobs` (who has what until when), `validate` (which reports
-//! are accepted), `refusal` (why a message is not).
+//! In reading order: `scoreboard`, `outcomes` (its questions and answers), `episodes` (one evaluation), `jobs` (which
+//! evaluator has what until when), `validate` (which reports are accepted), `refusal` (why a message is not).
 
 mod episodes;
 mod jobs;

@@ -137,10 +137,13 @@ impl RunDir {
 
     /// Makes a folder of the run again that was removed, but not the run's own.
     fn make_folder(&self, name: &str) -> Result<(), RunDirError> {
-        match fs::create_dir(self.path.join(name)) {
+        let folder = self.path.join(name);
+        match fs::create_dir(&folder) {
+            // Else a power cut could take what will be in it.
+            Ok(()) => durable::synchronise_folder(&folder).map_err(io_error("write", &folder)),
             Err(error) if error.kind() == io::ErrorKind::NotFound => Err(RunDirError::Gone(self.path.clone())),
             // There it is, or writing into it will say what is wrong.
-            _ => Ok(()),
+            Err(_) => Ok(()),
         }
     }
 

@@ -79,7 +79,11 @@ impl Scores {
                 }
             }
         }
-        self.write(accepted, beat);
+        // What is on the disk already does not wait for it.
+        let (new, known): (Vec<_>, Vec<_>) =
+            accepted.into_iter().partition(|(_, _, validated)| !validated.new.is_empty());
+        self.acknowledge(known);
+        self.write(new, beat);
         later
     }
 
@@ -89,14 +93,20 @@ impl Scores {
             validated.new.iter().map(|score| ScoreLine::new(report, score)).collect::<Vec<_>>()
         };
         let lines: Vec<_> = reports.iter().flat_map(of).collect();
-        if !lines.is_empty() {
-            let written = self.log.append(&lines).map_err(|error| format!("{:#}", anyhow::Error::from(error)));
-            if let Err(error) = written {
-                self.disk.refused(beat, &error);
-                return self.refuse(reports, &error);
-            }
-            self.disk.well(beat);
+        if lines.is_empty() {
+            return;
         }
+        if let Err(error) = self.log.append(&lines) {
+            let error = format!("{:#}", anyhow::Error::from(error));
+            self.disk.refused(beat, &error);
+            return self.refuse(reports, &error);
+        }
+        self.disk.well(beat);
+        self.acknowledge(reports);
+    }
+
+    /// Counts the scores of reports, which are on the disk, and answers each.
+    fn acknowledge(&self, reports: Vec<(Request, ScoreReport, Validated)>) {
         let replies = self.coordinator.record(reports.iter().map(|(_, report, validated)| (report, validated)));
         for ((request, ..), reply) in reports.into_iter().zip(replies) {
             request.reply(&reply);
