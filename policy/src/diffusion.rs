@@ -5,7 +5,8 @@ use crate::error::PolicyError;
 use crate::noise_predictor::NoisePredictor;
 use crate::policy::{ActionNoise, Cost, Policy, check_range};
 use crate::precision::Precision;
-use crate::shape::{EnsembleShape, NoiseShape, tile_numbers};
+use crate::schedule::Reverse;
+use crate::shape::{EnsembleShape, MlpConfig, NoiseShape, tile_numbers};
 use crate::slices::read;
 use crate::weights::{Layout, Tensors, Weights};
 use candle_core::{Device, Tensor};
@@ -18,37 +19,43 @@ const ACTOR: &str = "actor.";
 const CRITIC: &str = "critic.";
 
 /// The shapes of a diffusion policy's networks.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
 pub struct DiffusionShape {
     /// Numbers in an observation s.
     pub observation_dim: usize,
     /// Numbers in an action a.
     pub action_dim: usize,
-    /// Width of the three hidden layers of noise predictor and critics.
-    pub hidden: usize,
+    /// The noise predictor's hidden layers.
+    pub actor: MlpConfig,
+    /// The critics' hidden layers.
+    pub critic: MlpConfig,
     /// Ensemble size K.
     pub critics: usize,
     /// Denoising steps T.
     pub diffusion_steps: usize,
+    /// How each of them is made when sampling.
+    #[serde(default)]
+    pub reverse: Reverse,
 }
 
 impl DiffusionShape {
     /// Of the noise predictor.
     pub fn actor(&self) -> NoiseShape {
-        let Self { observation_dim, action_dim, hidden, diffusion_steps, .. } = *self;
-        NoiseShape { observation_dim, action_dim, hidden, diffusion_steps }
+        let Self { observation_dim, action_dim, diffusion_steps, reverse, .. } = *self;
+        NoiseShape { observation_dim, action_dim, layers: self.actor.clone(), diffusion_steps, reverse }
     }
 
     /// Of the critics.
     pub fn critics(&self) -> EnsembleShape {
-        let Self { observation_dim, action_dim, hidden, critics, .. } = *self;
-        EnsembleShape { members: critics, observation_dim, action_dim, hidden, outputs: 1 }
+        let Self { observation_dim, action_dim, critics, .. } = *self;
+        EnsembleShape { members: critics, observation_dim, action_dim, layers: self.critic.clone(), outputs: 1 }
     }
 
     fn check(&self) -> Result<(), PolicyError> {
         check_range("observation_dim", self.observation_dim)?;
         check_range("action_dim", self.action_dim)?;
-        check_range("hidden", self.hidden)?;
+        self.actor.check("actor.hidden")?;
+        self.critic.check("critic.hidden")?;
         check_range("critics", self.critics)?;
         if self.diffusion_steps > MOST_STEPS {
             return Err(PolicyError::Range { field: "diffusion_steps", value: self.diffusion_steps });
@@ -143,19 +150,15 @@ impl Policy for DiffusionPolicy {
     }
 
     fn cost(&self, states: usize, candidates: usize) -> Cost {
-        let DiffusionShape { observation_dim, action_dim, hidden, diffusion_steps, .. } = self.shape;
+        let DiffusionShape { observation_dim, action_dim, diffusion_steps, .. } = self.shape;
         let (states, candidates, steps) = (states as u64, candidates as u64, diffusion_steps as u64);
         let rows = states.saturating_mul(candidates);
         // The noise of all steps, the candidates and their copies, and their values.
         let drawn = rows.saturating_mul(action_dim as u64).saturating_mul(steps + 3).saturating_add(rows);
         let observed = states.saturating_mul(observation_dim as u64);
-        let sampling = drawn.saturating_add(observed).saturating_add(tile_numbers(candidates, hidden));
-        let critics = self.shape.critics().cost(states, candidates);
-        let actor = rows.saturating_mul(steps).saturating_mul(self.shape.actor().layout().count() as u64);
-        Cost {
-            bytes: sampling.saturating_mul(4).saturating_add(critics.bytes),
-            products: actor.saturating_add(critics.products),
-        }
+        let sampling = drawn.saturating_add(observed).saturating_add(tile_numbers(candidates, &self.shape.actor));
+        let critics = self.shape.critics().memory(states, candidates);
+        Cost { bytes: sampling.saturating_mul(4).saturating_add(critics), products: 0 }
     }
 
     fn act(

@@ -4,7 +4,7 @@ use crate::ensemble::Ensemble;
 use crate::error::PolicyError;
 use crate::policy::{ActionNoise, Cost, Policy, check_range};
 use crate::precision::Precision;
-use crate::shape::EnsembleShape;
+use crate::shape::{EnsembleShape, MlpConfig};
 use crate::slices::read;
 use crate::weights::{Tensors, Weights};
 use candle_core::{Device, Result, Tensor};
@@ -14,21 +14,22 @@ use serde::{Deserialize, Serialize};
 const ACTOR: &str = "actor.";
 
 /// The shape of a Gaussian policy's network.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
 pub struct GaussianShape {
     /// Numbers in an observation s.
     pub observation_dim: usize,
     /// Numbers in an action a.
     pub action_dim: usize,
-    /// Width of the three hidden layers.
-    pub hidden: usize,
+    /// Its hidden layers.
+    pub actor: MlpConfig,
 }
 
 impl GaussianShape {
     /// Of the network whose tanh is the mean.
     pub fn actor(&self) -> EnsembleShape {
-        let Self { observation_dim, action_dim, hidden } = *self;
-        EnsembleShape { members: 1, observation_dim, action_dim: 0, hidden, outputs: action_dim }
+        let Self { observation_dim, action_dim, .. } = *self;
+        let layers = self.actor.clone();
+        EnsembleShape { members: 1, observation_dim, action_dim: 0, layers, outputs: action_dim }
     }
 }
 
@@ -55,10 +56,11 @@ impl GaussianPolicy {
     pub(crate) fn load(shape: GaussianShape, tensors: &mut Tensors) -> std::result::Result<Self, PolicyError> {
         check_range("observation_dim", shape.observation_dim)?;
         check_range("action_dim", shape.action_dim)?;
-        check_range("hidden", shape.hidden)?;
+        shape.actor.check("actor.hidden")?;
         let layout = shape.actor().layout();
         let values = layout.join(tensors, ACTOR)?;
-        Ok(Self { shape, actor: Ensemble::new(shape.actor(), Weights::constant(layout, values), Precision::F32) })
+        let actor = Ensemble::new(shape.actor(), Weights::constant(layout, values), Precision::F32);
+        Ok(Self { shape, actor })
     }
 }
 
@@ -81,8 +83,8 @@ impl Policy for GaussianPolicy {
 
     fn cost(&self, states: usize, _candidates: usize) -> Cost {
         let GaussianShape { observation_dim, action_dim, .. } = self.shape;
-        let Cost { bytes, products } = self.shape.actor().cost(states as u64, 1);
-        Cost { bytes: bytes + 4 * states as u64 * (observation_dim + 2 * action_dim) as u64, products }
+        let bytes = self.shape.actor().memory(states as u64, 1);
+        Cost { bytes: bytes + 4 * states as u64 * (observation_dim + 2 * action_dim) as u64, products: 0 }
     }
 
     fn act(

@@ -11,17 +11,25 @@ use crate::kind::{Description, load_policy};
 use crate::noise_predictor::NoisePredictor;
 use crate::policy::{ActionNoise, Policy};
 use crate::precision::Precision;
+use crate::schedule::Reverse;
+use crate::shape::MlpConfig;
 use crate::weights::{Layout, Tensors, Weights};
 use candle_core::{Device, Tensor};
 use reader::{Golden, goldens};
+
+fn layers(hidden: usize) -> MlpConfig {
+    MlpConfig { hidden: vec![hidden; 3], ..MlpConfig::default() }
+}
 
 fn shape(golden: &Golden) -> DiffusionShape {
     DiffusionShape {
         observation_dim: golden.count("/observation_dim"),
         action_dim: golden.count("/action_dim"),
-        hidden: golden.count("/agent/hidden"),
+        actor: layers(golden.count("/agent/hidden")),
+        critic: layers(golden.count("/agent/hidden")),
         critics: golden.count("/agent/critics"),
         diffusion_steps: golden.count("/agent/diffusion_steps"),
+        reverse: Reverse::ClipClean,
     }
 }
 
@@ -30,7 +38,8 @@ fn golden_reverse_steps() {
     for golden in goldens("quad") {
         let shape = shape(&golden).actor();
         let values = shape.layout().join(&mut golden.state.clone(), "target_actor.").unwrap();
-        let actor = NoisePredictor::new(shape, Weights::constant(shape.layout(), values), Precision::F32);
+        let weights = Weights::constant(shape.layout(), values);
+        let actor = NoisePredictor::new(shape.clone(), weights, Precision::F32);
         let observations = golden.input("observations", &Device::Cpu);
         let rows = observations.dim(0).unwrap();
         let step = |t: usize| {
@@ -65,10 +74,22 @@ fn golden_choices() {
     }
 }
 
+fn small() -> DiffusionShape {
+    DiffusionShape {
+        observation_dim: 4,
+        action_dim: 2,
+        actor: layers(8),
+        critic: layers(8),
+        critics: 3,
+        diffusion_steps: 2,
+        reverse: Reverse::ClipClean,
+    }
+}
+
 /// Finite weights so large that values overflow: the error says what is not a number, and nothing is chosen.
 #[test]
 fn a_candidate_without_a_value_is_an_error() {
-    let shape = DiffusionShape { observation_dim: 4, action_dim: 2, hidden: 8, critics: 3, diffusion_steps: 2 };
+    let shape = small();
     // Of both signs, so that infinities meet.
     let constant = |layout: Layout, size: f32| {
         let values = (0..layout.count()).map(|i| if i / 3 % 2 == 0 { size } else { -size });
@@ -78,7 +99,7 @@ fn a_candidate_without_a_value_is_an_error() {
         let actor = NoisePredictor::new(shape.actor(), constant(shape.actor().layout(), actor), Precision::F32);
         let critics = Ensemble::new(shape.critics(), constant(shape.critics().layout(), critics), Precision::F32);
         let tensors = DiffusionPolicy::tensors(&actor, &critics).unwrap();
-        let bytes = Description::Diffusion(shape).to_safetensors(&tensors).unwrap();
+        let bytes = Description::Diffusion(shape.clone()).to_safetensors(&tensors).unwrap();
         load_policy(&bytes, Precision::F32).unwrap()
     };
     let act = |policy: &dyn Policy, observations: &[f32]| {
@@ -95,14 +116,17 @@ fn a_candidate_without_a_value_is_an_error() {
 /// Shapes come from strangers: none may ask for unbounded memory, whatever it wraps around to.
 #[test]
 fn a_shape_out_of_range_is_refused() {
-    let good = DiffusionShape { observation_dim: 4, action_dim: 2, hidden: 8, critics: 3, diffusion_steps: 2 };
-    let refused = |shape| {
+    let good = small();
+    let refused = |shape: DiffusionShape| {
         let bytes = Description::Diffusion(shape).to_safetensors(&Tensors::new()).unwrap();
         matches!(load_policy(&bytes, Precision::F32), Err(PolicyError::Range { .. }))
     };
     for steps in [0, 1001, (1 << 58) + 1, usize::MAX] {
-        assert!(refused(DiffusionShape { diffusion_steps: steps, ..good }), "{steps} denoising steps");
+        assert!(refused(DiffusionShape { diffusion_steps: steps, ..good.clone() }), "{steps} denoising steps");
     }
-    assert!(refused(DiffusionShape { hidden: usize::MAX, ..good }) && refused(DiffusionShape { critics: 0, ..good }));
+    assert!(
+        refused(DiffusionShape { critic: layers(usize::MAX), ..good.clone() })
+            && refused(DiffusionShape { critics: 0, ..good.clone() })
+    );
     assert!(!refused(good), "it lacks its tensors, but its shape is one");
 }

@@ -19,7 +19,7 @@ const DESCRIPTION: &str = "policy";
 const MAX_HEADER: u64 = 1 << 20;
 
 /// What a file of weights says about itself: the kind of policy and the shapes of its networks.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(tag = "kind", rename_all = "lowercase")]
 pub enum Description {
     /// Best of several samples of a diffusion model.

@@ -27,19 +27,22 @@ mod gaussian;
 #[cfg(test)]
 #[allow(clippy::unwrap_used)]
 mod golden;
+mod gradient;
 #[cfg(test)]
 #[allow(clippy::unwrap_used)]
 mod implementations;
 mod kind;
 mod layers;
+mod mlp;
 mod network;
-mod noise_ops;
 mod noise_predictor;
 mod operation;
+mod optimiser;
 mod plain;
 mod policy;
 mod precision;
 mod rounded;
+mod sampler;
 mod saved;
 mod schedule;
 mod shape;
@@ -51,12 +54,14 @@ pub use diffusion::{DiffusionPolicy, DiffusionShape};
 pub use ensemble::Ensemble;
 pub use error::PolicyError;
 pub use gaussian::{GaussianPolicy, GaussianShape, gaussian_mean};
+pub use gradient::Gradients;
 pub use kind::{Description, load_policy, read_tensors};
 pub use noise_predictor::NoisePredictor;
+pub use optimiser::{Adam, AdamStep, cosine_decay};
 pub use policy::{ActionNoise, Cost, Policy};
 pub use precision::Precision;
-pub use schedule::Schedule;
-pub use shape::{EnsembleShape, NoiseShape};
-pub use slices::{has_fast_body, modify, read};
+pub use quad_kernels::activation::Activation;
+pub use schedule::{Reverse, Schedule};
+pub use shape::{EnsembleShape, Initial, MlpConfig, NoiseShape};
 pub use statistics::mean_and_variance;
-pub use weights::{Layout, Part, Tensors, Weights, check_finite};
+pub use weights::{Layout, Part, Start, Tensors, Weights, check_finite, take};

@@ -1,0 +1,166 @@
+//! Adam over the weights of a network, with an implementation for the CPU and one of plain candle operations.
+
+use crate::error::PolicyError;
+use crate::gradient::Gradients;
+use crate::slices::{has_fast_body, modify, read};
+use crate::weights::{Tensors, Weights};
+use candle_core::{DType, Result, Tensor};
+use quad_kernels::optimiser::{BETA1, BETA2, EPSILON, adam, norm};
+
+/// Adam (Kingma and Ba 2015), with β = (0.9, 0.999) and ε = 1e-8, for the weights of one network.
+pub struct Adam {
+    /// Running means of the gradient and of its square, `[2, P]`.
+    moments: Tensor,
+}
+
+/// One step's numbers.
+#[derive(Clone, Copy, Debug)]
+pub struct AdamStep {
+    /// Step size, before the moments' bias corrections.
+    pub rate: f32,
+    /// Norm above which the gradient is scaled down to it.
+    pub clip: Option<f32>,
+    /// 1 for the first.
+    pub count: u64,
+}
+
+impl Adam {
+    /// For weights that have not moved yet.
+    pub fn new(weights: &Weights) -> Result<Self> {
+        let values = weights.values();
+        Ok(Self { moments: Tensor::zeros((2, values.elem_count()), DType::F32, values.device())? })
+    }
+
+    /// Moves the weights down the loss that `gradients` are of. Gives the gradient's norm before clipping, `[]`.
+    pub fn step(&mut self, weights: &mut Weights, gradients: &Gradients, step: AdamStep) -> Result<Tensor> {
+        let gradient = gradients.with_respect_to(weights)?;
+        self.descend(weights, &gradient, step)
+    }
+
+    /// [`Self::step`] along a gradient.
+    pub fn descend(&mut self, weights: &mut Weights, gradient: &Tensor, step: AdamStep) -> Result<Tensor> {
+        match has_fast_body(gradient.device()) {
+            true => self.fused_step(weights, gradient, step),
+            false => self.plain_step(weights, gradient, step),
+        }
+    }
+
+    fn fused_step(&mut self, weights: &mut Weights, gradient: &Tensor, step: AdamStep) -> Result<Tensor> {
+        let len = gradient.elem_count();
+        let size = read(gradient, norm)?;
+        let scale = step.clip.map_or(1.0, |clip| (clip / size).min(1.0));
+        let AdamStep { rate, count, .. } = step;
+        read(gradient, |gradient: &[f32]| {
+            modify(&self.moments, |moments| {
+                let moments = moments.split_at_mut(len);
+                weights
+                    .change(|weights| modify(weights, |weights| adam(weights, moments, gradient, scale, rate, count)))
+            })
+        })???;
+        Tensor::new(size, gradient.device())
+    }
+
+    fn plain_step(&mut self, weights: &mut Weights, gradient: &Tensor, step: AdamStep) -> Result<Tensor> {
+        let size = gradient.sqr()?.sum_all()?.sqrt()?;
+        let gradient = match step.clip {
+            Some(clip) => gradient.broadcast_mul(&(size.recip()? * f64::from(clip))?.minimum(1f32)?)?,
+            None => gradient.clone(),
+        };
+        let first = ((self.moments.get(0)? * BETA1)? + (&gradient * (1.0 - BETA1))?)?;
+        let second = ((self.moments.get(1)? * BETA2)? + (gradient.sqr()? * (1.0 - BETA2))?)?;
+        let unbiased = (&first / (1.0 - BETA1.powf(step.count as f64)))?;
+        let deviation = (&second / (1.0 - BETA2.powf(step.count as f64)))?.sqrt()?;
+        let change = ((unbiased / (deviation + f64::from(EPSILON))?)? * f64::from(step.rate))?;
+        self.moments = Tensor::stack(&[first, second], 0)?;
+        weights.change(|weights| weights.slice_set(&(weights - change)?, 0, 0))?;
+        Ok(size)
+    }
+
+    /// The moments by name, like the weights they are of: `adam_m.…` and `adam_v.…`.
+    pub fn tensors(&self, weights: &Weights, name: &str) -> Result<Tensors> {
+        let mut tensors = weights.layout().split(&self.moments.get(0)?, &format!("adam_m.{name}"))?;
+        tensors.extend(weights.layout().split(&self.moments.get(1)?, &format!("adam_v.{name}"))?);
+        Ok(tensors)
+    }
+
+    /// Takes over moments that [`Self::tensors`] gave.
+    ///
+    /// # Errors
+    /// A moment that is missing or does not fit.
+    pub fn load(
+        &mut self,
+        weights: &Weights,
+        tensors: &mut Tensors,
+        name: &str,
+    ) -> std::result::Result<(), PolicyError> {
+        let first = weights.layout().join(tensors, &format!("adam_m.{name}"))?;
+        let second = weights.layout().join(tensors, &format!("adam_v.{name}"))?;
+        self.moments = Tensor::stack(&[first, second], 0)?.to_device(self.moments.device())?;
+        Ok(())
+    }
+}
+
+/// A factor that falls from 1 at step 0 to 0 at `total` along a cosine.
+pub fn cosine_decay(step: u64, total: u64) -> f32 {
+    let progress = (step as f64 / total.max(1) as f64).min(1.0);
+    (0.5 * (1.0 + (std::f64::consts::PI * progress).cos())) as f32
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::shape::{EnsembleShape, MlpConfig};
+    use candle_core::Device;
+    use rand::{Rng, SeedableRng};
+    use rand_chacha::ChaCha8Rng;
+
+    fn close(fast: &Tensor, plain: &Tensor) {
+        let [fast, plain] = [fast, plain].map(|x| x.flatten_all().unwrap().to_vec1::<f32>().unwrap());
+        for (fast, plain) in fast.iter().zip(&plain) {
+            assert!((fast - plain).abs() <= 1e-5 * plain.abs() + 1e-8, "{fast} for {plain}");
+        }
+    }
+
+    /// Enough numbers for several chunks, and no whole number of registers.
+    fn weights() -> Weights {
+        let shape = EnsembleShape {
+            members: 3,
+            observation_dim: 5,
+            action_dim: 2,
+            layers: MlpConfig { hidden: vec![77, 78], ..MlpConfig::default() },
+            outputs: 1,
+        };
+        let layout = shape.layout();
+        let values = Weights::initial(&layout, &mut ChaCha8Rng::seed_from_u64(0), &Device::Cpu).unwrap();
+        Weights::trainable(layout, &values).unwrap()
+    }
+
+    #[test]
+    fn both_implementations_of_adam_and_the_ema_do_what_they_should() {
+        let mut generator = ChaCha8Rng::seed_from_u64(1);
+        for clip in [None, Some(0.3), Some(1e6)] {
+            let [mut fast, mut plain] = [weights(), weights()];
+            let [mut fast_adam, mut plain_adam] = [Adam::new(&fast).unwrap(), Adam::new(&plain).unwrap()];
+            let mut target = fast.copy().unwrap();
+            let before = target.values().copy().unwrap();
+            for count in 1..4 {
+                let len = fast.values().elem_count();
+                let gradient: Vec<f32> = (0..len).map(|_| generator.random_range(-1.0..1.0)).collect();
+                let gradient = Tensor::from_vec(gradient, len, &Device::Cpu).unwrap();
+                let step = AdamStep { rate: 0.01, clip, count };
+                let size = fast_adam.fused_step(&mut fast, &gradient, step).unwrap();
+                close(&size, &plain_adam.plain_step(&mut plain, &gradient, step).unwrap());
+                close(&fast_adam.moments, &plain_adam.moments);
+                close(fast.values(), plain.values());
+            }
+            target.follow(&fast, 0.25).unwrap();
+            close(target.values(), &((before * 0.75).unwrap() + (fast.values() * 0.25).unwrap()).unwrap());
+        }
+    }
+
+    #[test]
+    fn the_learning_rate_falls_along_a_cosine() {
+        assert_eq!((cosine_decay(0, 100), cosine_decay(100, 100), cosine_decay(200, 100)), (1.0, 0.0, 0.0));
+        assert!((cosine_decay(50, 100) - 0.5).abs() < 1e-7);
+    }
+}
