@@ -2,7 +2,6 @@
 
 use crate::layers::Layers;
 use crate::network::TILE;
-use crate::policy::Cost;
 use crate::weights::Layout;
 
 /// Size of the sinusoidal features of a denoising step.
@@ -31,12 +30,11 @@ impl EnsembleShape {
         Layers::new(self.members, &[observation_dim + action_dim, hidden, hidden, hidden, self.outputs], 0)
     }
 
-    /// What it takes to run all networks forward on so many states, `repeat` rows for each.
-    pub(crate) fn cost(&self, states: u64, repeat: u64) -> Cost {
-        let (rows, members) = (states.saturating_mul(repeat), self.members as u64);
-        let outputs = rows.saturating_mul(members).saturating_mul(self.outputs as u64);
-        let bytes = 4 * outputs.saturating_add(tile_numbers(repeat, self.hidden));
-        Cost { bytes, products: rows.saturating_mul(self.layout().count() as u64) }
+    /// Memory that running all networks forward on so many states takes, `repeat` rows for each, bytes.
+    pub(crate) fn memory(&self, states: u64, repeat: u64) -> u64 {
+        let outputs = states.saturating_mul(repeat).saturating_mul(self.members as u64);
+        let outputs = outputs.saturating_mul(self.outputs as u64);
+        outputs.saturating_add(tile_numbers(repeat, self.hidden)).saturating_mul(4)
     }
 
     /// Tensors `{0..3}.kernel` `[K, in, out]` and `{0..3}.bias` `[K, out]`.
