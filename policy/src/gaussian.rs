@@ -1,8 +1,9 @@
 //! The Gaussian policy: its mean, tanh of a network of the state, is the action. Nothing is sampled.
 
+use crate::choice::Choice;
 use crate::ensemble::Ensemble;
 use crate::error::PolicyError;
-use crate::policy::{ActionNoise, Cost, Policy, check_range};
+use crate::policy::{EpisodeState, Policy, check_range};
 use crate::precision::Precision;
 use crate::shape::{EnsembleShape, MlpConfig};
 use crate::slices::read;
@@ -15,6 +16,7 @@ const ACTOR: &str = "actor.";
 
 /// The shape of a Gaussian policy's network.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
 pub struct GaussianShape {
     /// Numbers in an observation s.
     pub observation_dim: usize,
@@ -45,9 +47,6 @@ pub fn gaussian_mean(actor: &Ensemble, observations: &Tensor) -> Result<Tensor> 
 }
 
 impl GaussianPolicy {
-    /// What it is called on the wire.
-    pub const KIND: &str = "gaussian";
-
     /// The tensors of a policy with this network, as they are named in a file.
     pub fn tensors(actor: &Ensemble) -> Result<Tensors> {
         actor.weights().tensors(ACTOR)
@@ -65,10 +64,6 @@ impl GaussianPolicy {
 }
 
 impl Policy for GaussianPolicy {
-    fn kind(&self) -> &'static str {
-        Self::KIND
-    }
-
     fn observation_dim(&self) -> usize {
         self.shape.observation_dim
     }
@@ -77,24 +72,31 @@ impl Policy for GaussianPolicy {
         self.shape.action_dim
     }
 
-    fn samples_candidates(&self) -> bool {
-        false
+    fn precision(&self) -> Precision {
+        Precision::F32
     }
 
-    fn cost(&self, states: usize, _candidates: usize) -> Cost {
+    fn choice(&self) -> Option<Choice> {
+        None
+    }
+
+    fn choose(&mut self, _choice: Choice) -> std::result::Result<(), PolicyError> {
+        Err(PolicyError::NoCandidates)
+    }
+
+    fn memory(&self, states: usize) -> u64 {
         let GaussianShape { observation_dim, action_dim, .. } = self.shape;
-        let bytes = self.shape.actor().memory(states as u64, 1);
-        Cost { bytes: bytes + 4 * states as u64 * (observation_dim + 2 * action_dim) as u64, products: 0 }
+        let numbers = states as u64 * (observation_dim + 2 * action_dim) as u64;
+        self.shape.actor().memory(states as u64, 1) + 4 * numbers
     }
 
     fn act(
         &self,
         observations: &[f32],
-        _candidates: usize,
-        noise: &mut [ActionNoise],
+        states: &mut [EpisodeState],
         actions: &mut [f32],
     ) -> std::result::Result<(), PolicyError> {
-        let observations = Tensor::from_slice(observations, (noise.len(), self.shape.observation_dim), &Device::Cpu)?;
+        let observations = Tensor::from_slice(observations, (states.len(), self.shape.observation_dim), &Device::Cpu)?;
         let means = gaussian_mean(&self.actor, &observations)?;
         read(&means, |means: &[f32]| actions.copy_from_slice(means))?;
         if actions.iter().any(|x| x.is_nan()) {

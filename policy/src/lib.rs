@@ -7,8 +7,9 @@
 //!   Each works on candle's tensors, and has two implementations: a custom operation for the CPU, and plain operations
 //!   (`plain`) that run on any device.
 //! - [`Weights`] (`weights`): a network's weights as one vector with named tensors in it, and their gradient.
-//! - [`Policy`] (`policy`): what any policy can do. `kind` reads one from a file that says what kind it is:
-//!   [`DiffusionPolicy`] (`diffusion`, the best of N_a samples) or [`GaussianPolicy`] (`gaussian`, a mean).
+//! - [`Policy`] (`policy`): what any policy can do, and what it carries through an episode. `kind` reads one from a file whose
+//!   [`Header`] says what it is: [`DiffusionPolicy`] (`diffusion`, one of N_a samples by its [`Choice`], in `choice`) or
+//!   [`GaussianPolicy`] (`gaussian`, a mean).
 //! - [`Precision`] (`precision`): how exactly networks are evaluated that no gradient is taken of.
 //! - Below: `ensemble_ops` and `noise_ops` (those custom operations, which `operation` gives to candle), `shape` and
 //!   `layers` (where each layer lies in the vector), `network` (one network on one tile of rows, over the crate `kernels`),
@@ -19,6 +20,7 @@
 
 #![deny(unsafe_code)]
 
+mod choice;
 mod diffusion;
 mod ensemble;
 mod ensemble_ops;
@@ -50,15 +52,16 @@ mod slices;
 mod statistics;
 mod weights;
 
+pub use choice::{Choice, Reduce, Rule};
 pub use diffusion::{DiffusionPolicy, DiffusionShape};
 pub use ensemble::Ensemble;
 pub use error::PolicyError;
 pub use gaussian::{GaussianPolicy, GaussianShape, gaussian_mean};
 pub use gradient::Gradients;
-pub use kind::{Description, load_policy, read_tensors};
+pub use kind::{Header, PolicyConfig, load_policy, read_tensors};
 pub use noise_predictor::NoisePredictor;
 pub use optimiser::{Adam, AdamStep, cosine_decay};
-pub use policy::{ActionNoise, Cost, Policy};
+pub use policy::{EpisodeState, Policy};
 pub use precision::Precision;
 pub use quad_kernels::activation::Activation;
 pub use schedule::{Reverse, Schedule};

@@ -50,7 +50,6 @@ def make_config(variant, size):
         "observation_dim": 11,
         "action_dim": 3,
         "batch_size": SIZES[size]["batch_size"],
-        "candidates": 1,
         "total_steps": 2000,
         "step": 700,
         "adam": ADAM,

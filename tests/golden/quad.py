@@ -40,6 +40,7 @@ AGENT = {
     "nu_ema_rate": 0.1,
     "actor_ema_every": 5,
     "actor_ema_start": 1000,
+    "candidates": 10,
 }
 # Small and odd, so that no row is a whole number of vector registers.
 SIZES = {
@@ -77,7 +78,6 @@ def make_config(variant, size):
         "observation_dim": 11,
         "action_dim": 3,
         "batch_size": batch_size,
-        "candidates": 10,
         "total_steps": 2000,
         "step": VARIANTS[variant].step,
         "adam": ADAM,
@@ -253,7 +253,7 @@ def random_inputs(config, rng, size, state):
         "select_observations": single(rng.normal(size=(n, o))),
     }
     # A choice between candidates of nearly equal value would depend on rounding: draw such states' noise again.
-    noise = np.zeros((steps, n, config["candidates"], a))
+    noise = np.zeros((steps, n, agent["candidates"], a))
     close = np.full(n, True)
     while close.any():
         noise[:, close] = single(rng.normal(size=noise[:, close].shape))

@@ -3,7 +3,7 @@
 
 use candle_core::{Device, Result, Tensor};
 use quad_dataset::Batch;
-use quad_policy::{Description, PolicyError, Precision, Tensors};
+use quad_policy::{PolicyConfig, PolicyError, Precision, Tensors};
 use serde::de::DeserializeOwned;
 
 /// What is known of an algorithm before it runs.
@@ -35,9 +35,6 @@ pub trait Hyperparameters: Send + Sync {
 
     /// The figures that matter most, for a line of the log.
     fn summary(&self) -> String;
-
-    /// Whether its policy samples candidates and chooses the best.
-    fn samples_candidates(&self) -> bool;
 
     /// The algorithm at step 0.
     ///
@@ -74,11 +71,11 @@ pub trait Algorithm: Send {
     /// Candle fails, for example because the batch does not fit the networks.
     fn update(&mut self, step: u64, batch: &Minibatch) -> Result<Vec<f32>>;
 
-    /// The policy to be evaluated: what kind it is, and its tensors.
+    /// The policy to be evaluated: what it is, and its tensors.
     ///
     /// # Errors
     /// Candle fails.
-    fn policy(&self) -> Result<(Description, Tensors)>;
+    fn policy(&self) -> Result<(PolicyConfig, Tensors)>;
 
     /// Everything that updates change: with the step it decides the future of the run.
     ///

@@ -15,7 +15,7 @@ use super::random::{Purpose, stream};
 use candle_core::backprop::GradStore;
 use candle_core::{DType, Result, Tensor};
 use quad_policy::{
-    Description, Ensemble, EnsembleShape, GaussianPolicy, GaussianShape, Layout, Part, PolicyError, Tensors, Weights,
+    Ensemble, EnsembleShape, GaussianPolicy, GaussianShape, Layout, Part, PolicyConfig, PolicyError, Tensors, Weights,
     gaussian_mean,
 };
 use serde::Deserialize;
@@ -101,10 +101,6 @@ impl Hyperparameters for Config {
 
     fn summary(&self) -> String {
         format!("iql, expectile {}, temperature {}, {} wide", self.expectile, self.temperature, self.hidden)
-    }
-
-    fn samples_candidates(&self) -> bool {
-        false
     }
 
     fn start(&self, setting: &Setting) -> std::result::Result<Box<dyn Algorithm>, AlgorithmError> {
@@ -241,8 +237,8 @@ impl Algorithm for Iql {
         Ok(metrics)
     }
 
-    fn policy(&self) -> Result<(Description, Tensors)> {
-        Ok((Description::Gaussian(self.shape), GaussianPolicy::tensors(&self.actor.network)?))
+    fn policy(&self) -> Result<(PolicyConfig, Tensors)> {
+        Ok((PolicyConfig::Gaussian { shape: self.shape }, GaussianPolicy::tensors(&self.actor.network)?))
     }
 
     fn state(&self) -> Result<Tensors> {

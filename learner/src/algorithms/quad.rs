@@ -17,7 +17,7 @@ use candle_nn::loss::mse;
 use config::{Eta, Guidance, Quad as Config, TargetReduce};
 use metrics::METRICS;
 use quad_policy::{
-    Description, DiffusionPolicy, DiffusionShape, Ensemble, NoisePredictor, PolicyError, Tensors, Weights,
+    Choice, DiffusionPolicy, DiffusionShape, Ensemble, NoisePredictor, PolicyConfig, PolicyError, Tensors, Weights,
     mean_and_variance,
 };
 use rand::Rng;
@@ -43,10 +43,6 @@ impl Hyperparameters for Config {
     fn summary(&self) -> String {
         let Self { samples, critics, hidden, .. } = self;
         format!("guidance {}, {samples} samples, {critics} critics, {hidden} wide", self.variant())
-    }
-
-    fn samples_candidates(&self) -> bool {
-        true
     }
 
     fn start(&self, setting: &Setting) -> std::result::Result<Box<dyn Algorithm>, AlgorithmError> {
@@ -256,9 +252,10 @@ impl Algorithm for Quad {
         self.step(step, batch, &noise)
     }
 
-    fn policy(&self) -> Result<(Description, Tensors)> {
-        let tensors = DiffusionPolicy::tensors(&self.target_actor, &self.target_critics)?;
-        Ok((Description::Diffusion(self.shape), tensors))
+    fn policy(&self) -> Result<(PolicyConfig, Tensors)> {
+        let choice = Choice::best_of(self.config.candidates); // Eq. 25
+        let tensors = DiffusionPolicy::tensors(&self.target_actor, &self.target_critics, None)?;
+        Ok((PolicyConfig::Diffusion { shape: self.shape, choice }, tensors))
     }
 
     fn state(&self) -> Result<Tensors> {

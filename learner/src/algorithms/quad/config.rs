@@ -1,6 +1,7 @@
 //! QUAD's hyper-parameters: the `[agent]` table of a preset.
 
 use crate::algorithms::algorithm::{self, AgentError, check, check_count, check_positive, check_rate};
+use quad_policy::Choice;
 use serde::Deserialize;
 
 /// What pulls the policy away from the data.
@@ -65,6 +66,8 @@ pub(super) struct Quad {
     pub samples: usize,
     /// How their values are combined.
     pub target_reduce: TargetReduce,
+    /// Actions that an evaluated policy draws in each state, N_a (Eq. 25).
+    pub candidates: u32,
     /// Behaviour-cloning strength.
     pub eta: Eta,
     /// Adam's learning rate for the actor at the first step; decays to 0 along a cosine.
@@ -96,6 +99,7 @@ impl Quad {
         check_count("critics", self.critics, 1 << 10)?;
         check_count("diffusion_steps", self.diffusion_steps, 1000)?;
         check_count("samples", self.samples, 1 << 10)?;
+        check_count("candidates", self.candidates as usize, Choice::MOST_CANDIDATES as usize)?;
         check("gamma", self.gamma, (0.0..=1.0).contains(&self.gamma), "in [0, 1]")?;
         check("rho", self.rho, self.rho >= 0.0 && self.rho.is_finite(), "at least 0")?;
         check("tau", self.tau, self.tau > 0.0, "above 0 (`inf` is allowed)")?;
