@@ -186,8 +186,7 @@ fn the_file_s_rule_chooses_unless_another_is_asked_for() {
 }
 
 #[test]
-fn a_value_function_is_there_exactly_if_the_rule_takes_one() {
+fn the_rule_nearest_takes_a_value_function() {
     let nearest = Choice { rule: Rule::Nearest, ..Choice::best_of(8) };
-    assert!(matches!(constant(nearest, 0.1, 0.0), Err(PolicyError::Missing(name)) if name.starts_with("value.")));
-    assert!(matches!(constant(Choice::best_of(8), 0.1, 1.0), Err(PolicyError::Unexpected(_))));
+    assert!(matches!(constant(nearest, 0.1, 0.0), Err(PolicyError::NoValue)));
 }

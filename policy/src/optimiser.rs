@@ -3,7 +3,7 @@
 use crate::error::PolicyError;
 use crate::gradient::Gradients;
 use crate::slices::{has_fast_body, modify, read};
-use crate::weights::{Tensors, Weights};
+use crate::weights::{Layout, Tensors, Weights};
 use candle_core::{DType, Result, Tensor};
 use quad_kernels::optimiser::{BETA1, BETA2, EPSILON, adam, norm};
 
@@ -76,10 +76,10 @@ impl Adam {
         Ok(size)
     }
 
-    /// The moments by name, like the weights they are of: `adam_m.…` and `adam_v.…`.
-    pub fn tensors(&self, weights: &Weights, name: &str) -> Result<Tensors> {
-        let mut tensors = weights.layout().split(&self.moments.get(0)?, &format!("adam_m.{name}"))?;
-        tensors.extend(weights.layout().split(&self.moments.get(1)?, &format!("adam_v.{name}"))?);
+    /// The moments by name, like the weights of this layout that they are of: `adam_m.…` and `adam_v.…`.
+    pub fn tensors(&self, layout: &Layout, name: &str) -> Result<Tensors> {
+        let mut tensors = layout.split(&self.moments.get(0)?, &format!("adam_m.{name}"))?;
+        tensors.extend(layout.split(&self.moments.get(1)?, &format!("adam_v.{name}"))?);
         Ok(tensors)
     }
 
@@ -87,14 +87,9 @@ impl Adam {
     ///
     /// # Errors
     /// A moment that is missing or does not fit.
-    pub fn load(
-        &mut self,
-        weights: &Weights,
-        tensors: &mut Tensors,
-        name: &str,
-    ) -> std::result::Result<(), PolicyError> {
-        let first = weights.layout().join(tensors, &format!("adam_m.{name}"))?;
-        let second = weights.layout().join(tensors, &format!("adam_v.{name}"))?;
+    pub fn load(&mut self, layout: &Layout, tensors: &mut Tensors, name: &str) -> std::result::Result<(), PolicyError> {
+        let first = layout.join(tensors, &format!("adam_m.{name}"))?;
+        let second = layout.join(tensors, &format!("adam_v.{name}"))?;
         self.moments = Tensor::stack(&[first, second], 0)?.to_device(self.moments.device())?;
         Ok(())
     }
