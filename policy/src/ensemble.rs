@@ -44,6 +44,11 @@ impl Ensemble {
         &mut self.weights
     }
 
+    /// The same networks with a copy of the weights as constants: a target network at its beginning.
+    pub fn copy(&self) -> Result<Self> {
+        Ok(Self::new(self.shape.clone(), self.weights.copy()?, self.precision))
+    }
+
     /// The same networks with their weights as constants, which share their memory with these.
     pub fn detach(&self) -> Self {
         let (shape, networks) = (self.shape.clone(), self.networks.clone());

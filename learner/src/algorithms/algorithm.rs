@@ -5,7 +5,7 @@ use std::sync::Arc;
 
 use candle_core::{Device, Result, Tensor};
 use quad_dataset::{Batch, Transitions};
-use quad_policy::{PolicyConfig, PolicyError, Precision, Tensors};
+use quad_policy::{MlpConfig, PolicyConfig, PolicyError, Precision, Tensors};
 use serde::de::DeserializeOwned;
 
 use super::parts::Parts;
@@ -15,11 +15,9 @@ use super::parts::Parts;
 pub struct Definition {
     /// Its name on the command line and in files.
     pub name: &'static str,
-    /// The paper that it is from.
-    pub paper: &'static str,
-    /// Its file of hyper-parameters, TOML: what all tasks share, then values per task.
+    /// The file of its values for each task, `presets/NAME.toml`.
     pub settings: &'static str,
-    /// The hyper-parameter that tells its variants apart, if there are any.
+    /// The hyper-parameter that tells its variants apart in run names and tables, if it has any.
     pub variant: Option<&'static str>,
     /// What each update measures, in the order of the values that it gives.
     pub metrics: &'static [Metric],
@@ -188,6 +186,14 @@ pub(super) fn read<T: Hyperparameters>(table: &toml::Table) -> std::result::Resu
     Ok(config)
 }
 
+/// That a network has hidden layers of reasonable widths.
+pub(super) fn check_layers(field: &'static str, layers: &MlpConfig) -> std::result::Result<(), AgentError> {
+    layers.check(field).map_err(|_| {
+        let value = format!("{:?}", layers.hidden);
+        AgentError::Range { field, value, range: "a list of the hidden layers' widths, each from 1 to 65535" }
+    })
+}
+
 /// That a hyper-parameter is in its range.
 pub(super) fn check(
     field: &'static str,
@@ -196,6 +202,11 @@ pub(super) fn check(
     range: &'static str,
 ) -> std::result::Result<(), AgentError> {
     if holds { Ok(()) } else { Err(AgentError::Range { field, value: value.to_string(), range }) }
+}
+
+/// The smaller of the critics' values, `[K, B]` → `[B]`. (A minimum would drop a NaN; zero times the sum does not.)
+pub(super) fn smaller(values: &Tensor) -> Result<Tensor> {
+    values.min(0)? + (values.sum(0)? * 0.0)?
 }
 
 /// Tensors `[]` as numbers; from a GPU in one copy, because each copy waits for the GPU.

@@ -2,6 +2,7 @@
 
 use std::ops::{Deref, RangeInclusive};
 
+use quad_policy::Choice;
 use serde::Deserialize;
 use serde::de::{Deserializer, Error};
 
@@ -56,6 +57,11 @@ checked!(
 checked!(
     /// A number of gradient steps.
     Steps(u64), |x| x > 0, "at least 1"
+);
+
+checked!(
+    /// Actions that a policy draws in each state.
+    Candidates(u32), |x| (1..=Choice::MOST_CANDIDATES).contains(&x), "a whole number from 1 to 1000"
 );
 
 const COUNTS: RangeInclusive<usize> = 1..=1024;
