@@ -41,8 +41,9 @@ impl Hyperparameters for Config {
     }
 
     fn summary(&self) -> String {
-        let Self { samples, critics, hidden, .. } = self;
-        format!("guidance {}, {samples} samples, {critics} critics, {hidden} wide", self.variant())
+        let Self { samples, candidates, critics, hidden, .. } = self;
+        let variant = self.variant();
+        format!("guidance {variant}, {samples} samples, {candidates} candidates, {critics} critics, {hidden} wide")
     }
 
     fn start(&self, setting: &Setting) -> std::result::Result<Box<dyn Algorithm>, AlgorithmError> {

@@ -116,13 +116,15 @@ impl TrainArgs {
             ("eval_interval", number(flags.eval_interval)),
             ("episodes", number(flags.episodes)),
             ("seed", number(flags.seed)),
-            ("candidates", number(flags.candidates)),
             ("precision", flags.precision.map(|precision| precision.name().into())),
         ] {
             changes.extend(value.map(|value| (key.to_owned(), value)));
         }
-        for (key, value) in [("guidance", flags.guidance.clone().map(Value::from)), ("samples", number(flags.samples))]
-        {
+        for (key, value) in [
+            ("guidance", flags.guidance.clone().map(Value::from)),
+            ("samples", number(flags.samples)),
+            ("candidates", number(flags.candidates)),
+        ] {
             let Some(value) = value else { continue };
             let agent = Table::from_iter([(key.to_owned(), value)]);
             presets::merge(&mut changes, Table::from_iter([("agent".to_owned(), agent.into())]));

@@ -11,9 +11,8 @@ use super::presets;
 use super::schedule::Schedule;
 use crate::algorithms::{self, ALGORITHMS, Definition, Hyperparameters};
 
-/// Most episodes in one evaluation, and most candidates per state: far above any use, low enough for evaluators' memory.
+/// Most episodes in one evaluation: far above any use.
 const MOST_EPISODES: u64 = 10_000;
-const MOST_CANDIDATES: u64 = 1_000;
 /// Most transitions in a batch: far above any use, too.
 const MOST_BATCH: u64 = 1 << 20;
 /// TOML's integers are 64 bits with a sign, so larger ones could not be saved with the run.
@@ -36,8 +35,6 @@ pub struct Experiment {
     pub eval_interval: u64,
     /// Episodes per evaluation.
     pub episodes: u32,
-    /// Actions sampled per state in an evaluation, N_a of Eq. 25.
-    pub candidates: u32,
     /// Seed of initial weights, batches, noise and the evaluations' episodes.
     pub seed: u64,
     /// Transitions per gradient step, B.
@@ -107,10 +104,10 @@ impl Experiment {
     /// # Errors
     /// As [`Self::hyperparameters`].
     pub fn summary(&self) -> anyhow::Result<String> {
-        let Self { steps, eval_interval, episodes, candidates, seed, batch_size, .. } = self;
+        let Self { steps, eval_interval, episodes, seed, batch_size, .. } = self;
         let evaluations = match eval_interval {
             0 => "no evaluations".to_owned(),
-            _ => format!("{episodes} episodes with {candidates} candidates every {eval_interval}"),
+            _ => format!("{episodes} episodes every {eval_interval}"),
         };
         let agent = self.hyperparameters()?.summary();
         Ok(format!("{agent}; seed {seed}, {steps} steps of batch {batch_size}; {evaluations}"))
@@ -122,18 +119,11 @@ impl Experiment {
             ("eval_interval", self.eval_interval, 0, MOST),
             ("seed", self.seed, 0, MOST),
             ("episodes", self.episodes.into(), 1, MOST_EPISODES),
-            ("candidates", self.candidates.into(), 1, MOST_CANDIDATES),
             ("batch_size", self.batch_size.into(), 1, MOST_BATCH),
         ] {
             ensure!((least..=most).contains(&value), "{field} is {value}, but must be from {least} to {most}");
         }
-        let samples = self.hyperparameters()?.samples_candidates();
-        let candidates = self.candidates;
-        ensure!(
-            samples || candidates == 1,
-            "candidates is {candidates}, but the policy of this algorithm does not sample any, so it must be 1"
-        );
-        Ok(())
+        self.hyperparameters().map(drop)
     }
 }
 

@@ -57,8 +57,6 @@ pub struct RunReport {
     pub variant: String,
     /// The hyper-parameters that matter most.
     pub agent: String,
-    /// Actions sampled per state in an evaluation.
-    pub candidates: u32,
     /// Seed.
     pub seed: u64,
     /// Gradient steps.
@@ -128,7 +126,6 @@ impl RunReport {
             preset: config.run.preset.clone(),
             variant: agent.variant(),
             agent: agent.summary(),
-            candidates: experiment.candidates,
             seed: experiment.seed,
             steps: experiment.steps,
             normalised: environment::find(&experiment.environment).is_ok(),
@@ -191,8 +188,8 @@ impl RunReport {
             table.push(row);
         }
         let mut text = format!(
-            "{}: preset {}, {}, {} candidates, {} steps, seed {}, scored in {}\n\n",
-            self.run, self.preset, self.agent, self.candidates, self.steps, self.seed, self.scored_in
+            "{}: preset {}, {}, {} steps, seed {}, scored in {}\n\n",
+            self.run, self.preset, self.agent, self.steps, self.seed, self.scored_in
         ) + &table.render(Style::Text);
         if self.evaluations.is_empty() {
             text.push_str("(no evaluation has a score yet)\n");

@@ -22,8 +22,6 @@ pub struct GroupReport {
     pub variant: String,
     /// The hyper-parameters that matter most.
     pub agent: String,
-    /// Actions sampled per state in an evaluation.
-    pub candidates: u32,
     /// Gradient steps that were asked for.
     pub steps: u64,
     /// Where they trained.
@@ -119,7 +117,6 @@ fn group(runs: &[&RunReport], differs: Vec<String>) -> GroupReport {
         preset: first.preset.clone(),
         variant: first.variant.clone(),
         agent: first.agent.clone(),
-        candidates: first.candidates,
         steps: first.steps,
         device: first.config.run.device,
         normalised: first.normalised,

@@ -4,7 +4,8 @@ use super::pool::run_awake;
 use crate::algorithms::{Algorithm, AlgorithmError, Definition, Metric, Minibatch};
 use candle_core::Device;
 use quad_dataset::Batch;
-use quad_policy::{PolicyError, check_finite, read_tensors};
+use quad_policy::{Header, PolicyError, check_finite, read_tensors};
+use quad_protocol::Origin;
 use safetensors::SafeTensors;
 use serde::{Deserialize, Serialize};
 use std::collections::HashMap;
@@ -27,15 +28,6 @@ pub struct Agent {
 struct Counters {
     algorithm: String,
     step: u64,
-}
-
-/// A policy as a file.
-#[derive(Debug)]
-pub struct PolicyFile {
-    /// What kind of policy it is, e.g. `diffusion`.
-    pub kind: &'static str,
-    /// A safetensors file that says so, too, and which shapes its networks have.
-    pub bytes: Vec<u8>,
 }
 
 /// A saved state that cannot be gone on from.
@@ -88,13 +80,14 @@ impl Agent {
         Ok(values)
     }
 
-    /// The policy as it is now.
+    /// The file of the policy as it is now, which says that it is from `origin`, at the step that is reached.
     ///
     /// # Errors
     /// A weight that is not finite.
-    pub fn policy(&self) -> Result<PolicyFile, AlgorithmError> {
-        let (description, tensors) = self.algorithm.policy()?;
-        Ok(PolicyFile { kind: description.kind(), bytes: description.to_safetensors(&tensors)? })
+    pub fn policy(&self, origin: &Origin) -> Result<Vec<u8>, AlgorithmError> {
+        let (policy, tensors) = self.algorithm.policy()?;
+        let origin = Origin { step: self.step, ..origin.clone() };
+        Ok(Header { policy, origin }.to_safetensors(&tensors)?)
     }
 
     /// Everything that decides the future of the run, as one safetensors file: the same bytes for the same state.

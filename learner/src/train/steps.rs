@@ -5,6 +5,7 @@ use std::time::{Duration, Instant};
 
 use quad_dataset::{Batch, BatchSampler, Transitions};
 use quad_policy::PolicyError;
+use quad_protocol::Origin;
 use quad_service::Beat;
 use tracing::debug;
 
@@ -38,6 +39,8 @@ pub(crate) struct Outlets<'a> {
     pub metrics: &'a TrainingMetrics,
     /// Takes rows, snapshots and checkpoints.
     pub outbox: &'a Outbox,
+    /// Where snapshots say that they are from; the step is set for each.
+    pub origin: &'a Origin,
     /// Set by the main loop to end training early.
     pub stop: &'a AtomicBool,
     /// Told after every step.
@@ -123,9 +126,9 @@ fn hand_over_policy(agent: &Agent, schedule: Schedule, outlets: &Outlets<'_>) ->
     let evaluate = schedule.is_evaluated(step);
     if evaluate || step == schedule.steps {
         debug!(step, "snapshot");
-        let policy = agent.policy().map_err(|source| TrainError::at(step, source))?;
+        let file = agent.policy(outlets.origin).map_err(|source| TrainError::at(step, source))?;
         outlets.metrics.saving_seconds.inc_by(begin.elapsed().as_secs_f64());
-        outlets.outbox.snapshot(TrainedPolicy { step, policy, evaluate }, outlets.stop, outlets.beat);
+        outlets.outbox.snapshot(TrainedPolicy { step, file, evaluate }, outlets.stop, outlets.beat);
     }
     Ok(())
 }

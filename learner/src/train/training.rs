@@ -4,8 +4,9 @@ use std::sync::Arc;
 use std::sync::atomic::AtomicBool;
 use std::time::Duration;
 
-use anyhow::Context;
+use anyhow::{Context, anyhow};
 use quad_dataset::{BatchSampler, Transitions};
+use quad_protocol::{Origin, Snapshot};
 use quad_service::{Beat, hinted};
 
 use super::agent::Agent;
@@ -19,6 +20,9 @@ use crate::run::Checkpoint;
 const DIVERGED: &str = "the same configuration would diverge again: try a smaller agent.critic_learning_rate or \
                         agent.actor_learning_rate, a smaller agent.gradient_clip, or look for outliers with \
                         `learner datasets inspect`; begin anew with --fresh";
+
+const TOO_LARGE: &str = "take smaller networks or fewer critics; or train without evaluations (--eval-interval 0) and score the \
+                         last snapshot by `evaluator score`";
 
 /// Everything that the thread takes along.
 pub(crate) struct Training {
@@ -42,9 +46,18 @@ impl Training {
     pub fn run(self, beat: &Beat) -> anyhow::Result<()> {
         let mut agent = self.agent()?;
         let experiment = &self.experiment;
+        let origin = Origin {
+            environment: experiment.environment.clone(),
+            seed: experiment.seed,
+            step: agent.step(),
+            episodes: experiment.episodes,
+        };
+        if experiment.eval_interval > 0 {
+            check_size(agent.policy(&origin)?.len())?;
+        }
         let batch_size = experiment.batch_size as usize;
         let mut sampler = BatchSampler::new(self.transitions.len(), batch_size, experiment.seed, agent.step());
-        let outlets = Outlets { metrics: &self.metrics, outbox: &self.outbox, stop: &self.stop, beat };
+        let outlets = Outlets { metrics: &self.metrics, outbox: &self.outbox, origin: &origin, stop: &self.stop, beat };
         let plan = Plan {
             schedule: experiment.schedule(),
             checkpoint_every: self.checkpoint_every,
@@ -82,4 +95,13 @@ impl Training {
         }
         Ok(agent)
     }
+}
+
+/// That evaluators can be sent a policy's file of so many bytes: they could not at the first evaluation, hours later, either.
+fn check_size(bytes: usize) -> anyhow::Result<()> {
+    let most = Snapshot::MOST_FILE;
+    if bytes <= most {
+        return Ok(());
+    }
+    Err(hinted(anyhow!("the policy's file has {bytes} bytes, and evaluators can be sent at most {most}"), TOO_LARGE))
 }

@@ -34,6 +34,7 @@ fn a_wrong_command_line_exits_with_2() {
         ("evaluator", &["collect", "--env", "hopper"]),
         ("evaluator", &["score"]),
         ("evaluator", &["score", "x", "--candidates", "1,0"]),
+        ("evaluator", &["score", "x", "--rule", "softmax"]),
     ] {
         let output = run(program, arguments);
         let text = String::from_utf8_lossy(&output.stderr);
@@ -46,7 +47,7 @@ fn an_algorithm_that_lacks_a_hyper_parameter_says_what_it_has() {
     for (preset, flags, words) in [
         ("hopper-demo", ["--guidance", "sac"], ["sac", "`dac`"]),
         ("hopper-demo-iql", ["--guidance", "dac"], ["guidance", "`learner presets NAME`"]),
-        ("hopper-demo-iql", ["--candidates", "10"], ["candidates", "must be 1"]),
+        ("hopper-demo-iql", ["--candidates", "10"], ["candidates", "`learner presets NAME`"]),
     ] {
         refused(&[&["--preset", preset, "--dataset", "x"][..], &flags].concat(), 1, &words);
     }

@@ -21,7 +21,8 @@ fn what_cannot_be_used_is_named_with_what_can() {
         ("hopper-demo", toml! { agent.samples = 0 }, "samples is 0"),
         ("hopper-demo", toml! { algorithm = "td3" }, "there are quad, iql"),
         ("hopper-demo", toml! { episodes = 0 }, "episodes is 0, but must be from 1 to 10000"),
-        ("hopper-demo-iql", toml! { candidates = 2 }, "must be 1"),
+        ("hopper-demo", toml! { agent.candidates = 1001 }, "agent.candidates is 1001"),
+        ("hopper-demo-iql", toml! { agent.candidates = 2 }, "unknown field `candidates`"),
         ("paper", toml! { environment = "hopper" }, "missing field"),
     ] {
         let error = format!("{:#}", resolve(preset, &changes).unwrap_err());
