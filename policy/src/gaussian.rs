@@ -1,6 +1,5 @@
 //! The Gaussian policy: its mean, tanh of a network of the state, is the action. Nothing is sampled.
 
-use crate::choice::Choice;
 use crate::ensemble::Ensemble;
 use crate::error::PolicyError;
 use crate::policy::{EpisodeState, Policy, check_range};
@@ -74,14 +73,6 @@ impl Policy for GaussianPolicy {
 
     fn precision(&self) -> Precision {
         Precision::F32
-    }
-
-    fn choice(&self) -> Option<Choice> {
-        None
-    }
-
-    fn choose(&mut self, _choice: Choice) -> std::result::Result<(), PolicyError> {
-        Err(PolicyError::NoCandidates)
     }
 
     fn memory(&self, states: usize) -> u64 {

@@ -118,6 +118,9 @@ fn check_header(file: &[u8]) -> Result<(), PolicyError> {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::ensemble::Ensemble;
+    use crate::weights::Weights;
+    use candle_core::{DType, Tensor};
     use std::fmt::Write;
 
     /// A file of so many tensors without numbers.
@@ -147,5 +150,37 @@ mod tests {
         for file in [&empty_tensors(10_000)[..], b"short", b""] {
             assert_eq!(refused(file), [false; 2]);
         }
+    }
+    /// The file of a Gaussian policy that is from `origin`.
+    fn gaussian(origin: &str) -> Vec<u8> {
+        let shape = GaussianShape { observation_dim: 3, action_dim: 1, hidden: 4 };
+        let layout = shape.actor().layout();
+        let values = Tensor::zeros(layout.count(), DType::F32, &Device::Cpu).unwrap();
+        let actor = Ensemble::new(shape.actor(), Weights::constant(layout, values), Precision::F32);
+        let header = Header { policy: PolicyConfig::Gaussian { shape }, origin };
+        header.to_safetensors(&GaussianPolicy::tensors(&actor).unwrap()).unwrap()
+    }
+
+    #[test]
+    fn a_file_says_what_it_is_and_where_it_is_from() {
+        let file = gaussian("\"a run\"");
+        assert!((0..30).all(|_| gaussian("\"a run\"") == file), "the same file has the same bytes");
+        let header = Header::<String>::read(&file).unwrap();
+        assert_eq!(header.origin, "\"a run\"");
+        let json = serde_json::to_string(&header.policy).unwrap();
+        assert_eq!(json, r#"{"kind":"gaussian","shape":{"observation_dim":3,"action_dim":1,"hidden":4}}"#);
+        let newer = json.replace("hidden", "width");
+        assert!(serde_json::from_str::<PolicyConfig>(&newer).is_err(), "what is not known is not ignored");
+        let tensor = Tensor::zeros(1, DType::F32, &Device::Cpu).unwrap();
+        let nameless = safetensors::serialize([("weights", tensor)], None).unwrap();
+        assert!(matches!(load_policy(&nameless, Precision::F32), Err(PolicyError::NoHeader)));
+        assert!(matches!(Header::<u64>::read(&file), Err(PolicyError::Header(_))), "another origin than was wanted");
+    }
+
+    #[test]
+    fn a_policy_says_the_precision_that_it_has() {
+        let mut policy = load_policy(&gaussian(""), Precision::Bf16).unwrap();
+        assert_eq!((policy.precision(), policy.choice()), (Precision::F32, None));
+        assert!(matches!(policy.choose(Choice::best_of(1)), Err(PolicyError::NoCandidates)));
     }
 }

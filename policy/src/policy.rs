@@ -22,7 +22,7 @@ pub struct EpisodeState {
 
 impl EpisodeState {
     /// At an episode's beginning. Its noise is the stream of the episode's seed that is apart from those of the environment.
-    pub(crate) fn new(seed: u64) -> Self {
+    pub fn new(seed: u64) -> Self {
         let mut noise = ChaCha8Rng::seed_from_u64(seed);
         noise.set_stream(POLICY_STREAM);
         Self { noise, memory: Vec::new() }
@@ -51,13 +51,17 @@ pub trait Policy: Send + Sync {
     fn precision(&self) -> Precision;
 
     /// How it chooses among the actions that it draws; none if it draws none.
-    fn choice(&self) -> Option<Choice>;
+    fn choice(&self) -> Option<Choice> {
+        None
+    }
 
     /// Lets it choose in another way.
     ///
     /// # Errors
     /// It draws no actions, it lacks a network that this takes, or a number is out of range.
-    fn choose(&mut self, choice: Choice) -> Result<(), PolicyError>;
+    fn choose(&mut self, _choice: Choice) -> Result<(), PolicyError> {
+        Err(PolicyError::NoCandidates)
+    }
 
     /// Memory beside the weights that one call of [`Self::act`] takes for so many states at most, bytes. It can be asked
     /// before it is too much.

@@ -10,7 +10,7 @@ use super::algorithm::{AgentError, Algorithm, Context, Definition, Hyperparamete
 use super::gaussian::Gaussian;
 use super::hyperparameters::{Positive, Quantile, Rate, Share};
 use super::parts::{Parts, Trained, ensemble};
-use candle_core::{DType, Result, Tensor};
+use candle_core::{DType, Result};
 use quad_policy::{AdamStep, Ensemble, EnsembleShape, Gradients, MlpConfig, PolicyConfig, Tensors, cosine_decay};
 use serde::Deserialize;
 

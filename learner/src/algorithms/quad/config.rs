@@ -3,7 +3,6 @@
 use crate::algorithms::algorithm::{AgentError, Hyperparameters, check, check_layers};
 use crate::algorithms::hyperparameters::{Candidates, Count, NotNegative, Positive, Rate, Share, Steps};
 use quad_policy::MlpConfig;
-use quad_policy::Choice;
 use serde::Deserialize;
 
 /// What pulls the policy away from the data.
