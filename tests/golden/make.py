@@ -15,6 +15,8 @@ from pathlib import Path
 import numpy as np
 from safetensors.numpy import load_file, save_file
 
+import align_iql
+import dql
 import iql
 import ivr
 import quad
@@ -35,8 +37,11 @@ FOLDERS = {
     "eql": (15, "eql", "small"),
     "xql": (16, "xql", "small"),
     "xql-extras": (17, "xql-extras", "small"),
+    "dql": (18, "dql", "small"),
+    "dql-max-backup": (19, "dql-max-backup", "small"),
+    "align-iql": (20, "align-iql", "small"),
 }
-ALGORITHMS = {variant: algorithm for algorithm in (quad, iql, ivr, xql) for variant in algorithm.VARIANTS}
+ALGORITHMS = {variant: algorithm for algorithm in (quad, iql, ivr, xql, dql, align_iql) for variant in algorithm.VARIANTS}
 
 
 def flatten(tree):
