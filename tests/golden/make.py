@@ -19,6 +19,7 @@ import align_iql
 import dql
 import iql
 import ivr
+import onestep
 import quad
 import xql
 
@@ -40,8 +41,11 @@ FOLDERS = {
     "dql": (18, "dql", "small"),
     "dql-max-backup": (19, "dql-max-backup", "small"),
     "align-iql": (20, "align-iql", "small"),
+    "onestep-behavior": (21, "onestep-behavior", "small"),
+    "onestep-critic": (22, "onestep-critic", "small"),
+    "onestep-policy": (23, "onestep-policy", "small"),
 }
-ALGORITHMS = {variant: algorithm for algorithm in (quad, iql, ivr, xql, dql, align_iql) for variant in algorithm.VARIANTS}
+ALGORITHMS = {variant: algorithm for algorithm in (quad, iql, ivr, xql, dql, align_iql, onestep) for variant in algorithm.VARIANTS}
 
 
 def flatten(tree):
