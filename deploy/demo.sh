@@ -9,7 +9,7 @@ set -euo pipefail
 cd "$(dirname "$0")/.."
 . deploy/common.sh
 
-PRESET=hopper-demo
+TASK=hopper-demo
 DATASET=data/hopper-demo.hdf5
 RUN=runs/hopper-demo
 EVALUATORS=2
@@ -45,7 +45,7 @@ trap stop EXIT
 trap 'exit 130' INT
 trap 'exit 143' TERM
 
-start_learner "$RUN" --preset $PRESET --dataset $DATASET "$@"
+start_learner "$RUN" --task $TASK --dataset $DATASET "$@"
 for ((i = 1; i <= EVALUATORS; i++)); do
   $BIN/evaluator serve --name "evaluator-$i" --connect "$endpoint" --metrics 127.0.0.1:0 >"$RUN/evaluator-$i.log" 2>&1 &
   evaluators+=($!)

@@ -24,8 +24,8 @@ seeds="0 1 2"
 [ "${1:-}" != --seeds ] || { seeds=${2:-}; shift 2; }
 if [ $# -eq 0 ] || [ -z "$seeds" ]; then usage >&2; exit 2; fi
 
-# preset FILE: the demonstration for the environment that the file's name begins with.
-preset() {
+# task FILE: the demonstration in the environment that the file's name begins with.
+task() {
   case $(basename "$1") in
     hopper*) echo hopper-demo ;;
     halfcheetah*) echo halfcheetah-demo ;;
@@ -38,14 +38,14 @@ preset() {
 
 # run FILE GUIDANCE SEED: trains with an evaluator beside it, then scores the last snapshots.
 run() {
-  local file=$1 guidance=$2 seed=$3 preset run learner endpoint evaluator snapshots
-  preset=$(preset "$file")
+  local file=$1 guidance=$2 seed=$3 task run learner endpoint evaluator snapshots
+  task=$(task "$file")
   run=runs/results/$(basename "$file" .hdf5)-$guidance-seed$seed
   [ ! -e "$run/score.json" ] || return 0
   if [ ! -e "$run/report.json" ]; then
     rm -rf "$run"
     mkdir -p "$run"
-    start_learner "$run" --preset "$preset" --dataset "$file" --guidance "$guidance" --seed "$seed" \
+    start_learner "$run" --task "$task" --dataset "$file" --agent "guidance=$guidance" --seed "$seed" \
       >"$run/learner.log" 2>&1 || { cat "$run/learner.log" >&2; return 1; }
     $BIN/evaluator serve --connect "$endpoint" --metrics 127.0.0.1:0 >"$run/evaluator.log" 2>&1 &
     evaluator=$!
@@ -61,11 +61,11 @@ run() {
   say "$run is done"
 }
 # xargs runs it in other shells.
-export -f run preset start_learner say die
+export -f run task start_learner say die
 export NAME BIN EVALUATIONS EPISODES CANDIDATES RAYON_NUM_THREADS=1
 
 for file; do
-  preset "$file" >/dev/null
+  task "$file" >/dev/null
 done
 deploy/setup.sh
 cargo build --release --locked --package quad-learner --package quad-evaluator

@@ -10,7 +10,7 @@ use crate::reward::RewardRule;
 #[derive(Debug, PartialEq, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct EnvironmentSpec {
-    /// Name used on command lines, in presets and on the wire.
+    /// Name used on command lines, in files and on the wire.
     pub name: String,
     #[serde(default)]
     simulation: Option<String>,
@@ -29,7 +29,7 @@ pub struct EnvironmentSpec {
     pub max_episode_steps: usize,
     /// Undiscounted returns that score 0 (D4RL's random policy) and 100 (D4RL's expert).
     reference_returns: (f64, f64),
-    /// How a dataset's rewards are scaled before training, unless a preset says otherwise.
+    /// How a dataset's rewards are scaled before training, unless a task or an algorithm says otherwise.
     pub reward: RewardRule,
     /// When the goal is drawn, if there is one.
     #[serde(default)]

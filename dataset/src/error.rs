@@ -161,7 +161,7 @@ impl Problem {
         let hint = match self {
             Self::OtherEnvironment { claimed, expected } => return other_environment(claimed, expected),
             Self::Width { .. } => {
-                "choose a dataset of that environment, or the preset of the environment it was recorded in"
+                "choose a dataset of that environment, or a task in the environment it was recorded in"
             }
             Self::Io(_) => "check the path and its permissions",
             Self::UnknownFormat => {
@@ -216,10 +216,10 @@ impl Problem {
 
 fn other_environment(claimed: &str, expected: &str) -> String {
     match environment::find(claimed) {
-        Ok(_) => format!("choose a preset for {claimed}, or another dataset"),
+        Ok(_) => format!("choose a task in {claimed}, or another dataset"),
         Err(_) => format!(
             "it is another simulation, so a policy that learns from it cannot be scored in {expected}; train under a name of \
-             your own, without evaluations: --preset own-data --set environment=NAME"
+             your own, without evaluations: --task own-data --set environment=NAME"
         ),
     }
 }

@@ -96,6 +96,13 @@ impl Recording {
         (0..last).filter(|&row| self.kinds[row] != RowKind::LastState && !self.ends[row])
     }
 
+    /// Whether the row after `row` is the next step of its episode, taken where this one led to.
+    pub(crate) fn goes_on(&self, row: usize) -> bool {
+        let ends = self.ends[row] || self.terminals[row] || self.kinds[row] == RowKind::LastState;
+        let is_step = self.kinds.get(row + 1).is_some_and(|kind| *kind != RowKind::LastState);
+        !ends && is_step && !self.next_observations.as_ref().is_some_and(|next| self.jumps(next, row))
+    }
+
     /// Whether `following`, the next row to learn from after `row`, goes on where that one led to.
     fn continues(&self, row: usize, following: usize) -> bool {
         following == row + 1 || !differ(self.observation(following), self.observation(row + 1))

@@ -1,4 +1,4 @@
-//! How a preset turns recorded rewards into training rewards.
+//! How recorded rewards become training rewards.
 
 use serde::{Deserialize, Serialize};
 
@@ -15,6 +15,9 @@ pub enum RewardRule {
     /// `r - 1`: IQL's rule for AntMaze. Each step before the goal costs 1.
     #[serde(rename = "subtract-1")]
     Subtract1,
+    /// `4(r - 0.5)`: Diffusion-QL's rule for AntMaze. Rewards of 0 and 1 become -2 and 2.
+    #[serde(rename = "centre-times-4")]
+    CentreTimes4,
 }
 
 /// Training rewards as a function of recorded ones: `(r - subtract) · times`.
@@ -44,6 +47,7 @@ impl RewardRule {
             }
             Self::AsIs => (0.0, 1.0),
             Self::Subtract1 => (1.0, 1.0),
+            Self::CentreTimes4 => (0.5, 4.0),
         };
         Some(Scaling { subtract, times })
     }
@@ -56,13 +60,15 @@ mod tests {
     #[test]
     fn each_name_says_what_its_rule_does_to_rewards_of_0_and_1() {
         #[derive(Deserialize)]
-        struct Preset {
+        struct Keys {
             reward: RewardRule,
         }
         // The returns are from -1 to 3.
-        for (name, of_0, of_1) in [("locomotion", 0.0, 250.0), ("as-is", 0.0, 1.0), ("subtract-1", -1.0, 0.0)] {
-            let preset: Preset = toml::from_str(&format!("reward = '{name}'")).unwrap();
-            let scaling = preset.reward.scaling(&[3.0, -1.0, 0.5]).unwrap();
+        for (name, of_0, of_1) in
+            [("locomotion", 0.0, 250.0), ("as-is", 0.0, 1.0), ("subtract-1", -1.0, 0.0), ("centre-times-4", -2.0, 2.0)]
+        {
+            let keys: Keys = toml::from_str(&format!("reward = '{name}'")).unwrap();
+            let scaling = keys.reward.scaling(&[3.0, -1.0, 0.5]).unwrap();
             assert_eq!((scaling.apply(0.0), scaling.apply(1.0)), (of_0, of_1), "{name}");
         }
     }

@@ -1,5 +1,6 @@
 //! From a source's rows to transitions (s, a, r, s', mask).
 
+use std::ops::Range;
 use std::path::Path;
 
 use crate::checks;
@@ -7,7 +8,7 @@ use crate::environment::EnvironmentSpec;
 use crate::error::{DatasetError, Problem};
 use crate::formats::Source;
 use crate::recording::Recording;
-use crate::reward::RewardRule;
+use crate::reward::{RewardRule, Scaling};
 use crate::statistics::Statistics;
 
 /// Actions are kept this far within ±1, where policies that squash can still reach them.
@@ -50,10 +51,14 @@ pub struct ReadOptions {
     pub reward: RewardRule,
 }
 
-/// Transitions to learn from.
+/// Transitions to learn from, in the order of the recording. They do not change, so threads can share them.
 ///
 /// The source's rows stay as they are; a transition is the number i of a row, and its next observation is row i + 1's,
 /// unless the format stores next observations of their own.
+///
+/// A transition is followed by the next one if its episode goes on there. An episode ends at a terminal, also at a goal after
+/// which the recording goes on; at a timeout; and where the next row does not start where the transition led to. A row
+/// that makes no transition (D4RL's timeouts) is no part of an episode, but its action is known as the last next action.
 pub struct Transitions {
     observation_dim: usize,
     action_dim: usize,
@@ -69,6 +74,8 @@ pub struct Transitions {
     terminals: Vec<bool>,
     /// Rows to learn from, in order.
     rows: Vec<u32>,
+    /// Whether the next row is the next step of the episode; N.
+    goes_on: Vec<bool>,
     statistics: Statistics,
 }
 
@@ -88,12 +95,17 @@ impl Transitions {
             return Err(error(problem));
         }
         let scaling = reward.scaling(&recording.trajectory_returns()).ok_or_else(|| error(Problem::SameReturns))?;
+        Ok(Self::new(recording, environment, scaling))
+    }
+
+    fn new(recording: Recording, environment: Option<&EnvironmentSpec>, scaling: Scaling) -> Self {
         let rows: Vec<u32> = recording.transitions().collect();
         let statistics = Statistics::new(environment, rows.len(), &recording.episodes());
+        let goes_on = (0..recording.rows()).map(|row| recording.goes_on(row)).collect();
         let Recording { observation_dim, action_dim, observations, mut actions, mut rewards, .. } = recording;
         actions.iter_mut().for_each(|action| *action = action.clamp(-ACTION_LIMIT, ACTION_LIMIT));
         rewards.iter_mut().for_each(|reward| *reward = scaling.apply(*reward));
-        Ok(Self {
+        Self {
             observation_dim,
             action_dim,
             observations,
@@ -102,8 +114,9 @@ impl Transitions {
             next_observations: recording.next_observations,
             terminals: recording.terminals,
             rows,
+            goes_on,
             statistics,
-        })
+        }
     }
 
     /// Number of transitions, at least 1.
@@ -127,6 +140,41 @@ impl Transitions {
         &self.statistics
     }
 
+    /// The number of the transition that follows this one (below [`len`](Self::len)) in its episode.
+    pub fn next(&self, index: u32) -> Option<u32> {
+        let row = self.rows[index as usize];
+        let is_next = self.rows.get(index as usize + 1) == Some(&(row + 1));
+        (is_next && self.goes_on[row as usize]).then_some(index + 1)
+    }
+
+    /// The action a' that was taken at s', of length a. Unlike [`next`](Self::next) it is also there where the next row
+    /// is a step that makes no transition, so among transitions with mask 1 it is missing only where it was not recorded.
+    pub fn next_action(&self, index: u32) -> Option<&[f32]> {
+        let row = self.rows[index as usize] as usize;
+        let next = (row + 1) * self.action_dim..(row + 2) * self.action_dim;
+        self.goes_on[row].then(|| &self.actions[next])
+    }
+
+    /// The numbers of the transitions of each episode, in order; each transition is in one of them.
+    pub fn episodes(&self) -> Vec<Range<u32>> {
+        let mut episodes = Vec::new();
+        let mut start = 0;
+        for index in 0..self.rows.len() as u32 {
+            if self.next(index).is_none() {
+                episodes.push(start..index + 1);
+                start = index + 1;
+            }
+        }
+        episodes
+    }
+
+    /// The first transition of each window of `length` transitions that follow one another: the window of i is i, i + 1, …,
+    /// which [`gather`](Self::gather) copies like any others. Episodes that are shorter have none. `length` is at least 1.
+    pub fn window_starts(&self, length: u32) -> Vec<u32> {
+        let starts = |episode: Range<u32>| episode.start..(episode.end + 1).saturating_sub(length).max(episode.start);
+        self.episodes().into_iter().flat_map(starts).collect()
+    }
+
     /// Copies the transitions of these numbers (each below [`len`](Self::len)), in this order, over what `batch` holds.
     pub fn gather(&self, indices: &[u32], batch: &mut Batch) {
         let (o, a) = (self.observation_dim, self.action_dim);
@@ -144,5 +192,100 @@ impl Transitions {
             batch.next_observations.extend_from_slice(next);
             batch.masks.push(if self.terminals[row] { 0.0 } else { 1.0 });
         }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::recording::RowKind::{self, Dropped, LastState, Transition};
+
+    /// Rows whose observation, action (in hundredths) and reward are their number.
+    fn recording(kinds: &[RowKind]) -> Recording {
+        let n = kinds.len();
+        let numbers = || (0..n).map(|row| row as f32);
+        Recording {
+            observation_dim: 1,
+            action_dim: 1,
+            observations: numbers().collect(),
+            actions: numbers().map(|row| row / 100.0).collect(),
+            rewards: numbers().collect(),
+            kinds: kinds.to_vec(),
+            terminals: vec![false; n],
+            timeouts: vec![false; n],
+            ends: vec![false; n],
+            ..Recording::default()
+        }
+    }
+
+    fn transitions(recording: Recording) -> Transitions {
+        let scaling = RewardRule::AsIs.scaling(&[]).unwrap();
+        Transitions::new(recording, None, scaling)
+    }
+
+    /// D4RL: 0 1 2(timeout) | 3 4(terminal) | 5 6(the last row).
+    fn d4rl() -> Recording {
+        let mut recording = recording(&[Transition, Transition, Dropped, Transition, Transition, Transition, Dropped]);
+        recording.timeouts[2] = true;
+        recording.terminals[4] = true;
+        recording.ends[2] = true;
+        recording.ends[4] = true;
+        recording
+    }
+
+    #[test]
+    fn episodes_end_at_timeouts_terminals_and_the_end_of_the_file() {
+        let transitions = transitions(d4rl());
+        assert_eq!(transitions.episodes(), [0..2, 2..4, 4..5]);
+        let next: Vec<_> = (0..5).map(|index| transitions.next(index)).collect();
+        assert_eq!(next, [Some(1), None, Some(3), None, None]);
+    }
+
+    #[test]
+    fn a_dropped_step_gives_its_action_to_the_transition_that_leads_to_it() {
+        let transitions = transitions(d4rl());
+        let actions: Vec<_> = (0..5).map(|index| transitions.next_action(index).map(|action| action[0])).collect();
+        assert_eq!(actions, [Some(0.01), Some(0.02), Some(0.04), None, Some(0.06)], "after a terminal there is none");
+    }
+
+    #[test]
+    fn the_last_state_of_an_episode_is_no_step() {
+        let mut recording = recording(&[Transition, Transition, LastState, Transition, LastState]);
+        recording.ends[1] = true;
+        recording.ends[3] = true;
+        let transitions = transitions(recording);
+        assert_eq!(transitions.episodes(), [0..2, 2..3]);
+        assert_eq!((transitions.next_action(0), transitions.next_action(1)), (Some(&[0.01][..]), None));
+    }
+
+    #[test]
+    fn an_episode_ends_at_the_goal_although_the_recording_goes_on() {
+        let mut recording = recording(&[Transition, Transition, Transition, Dropped]);
+        recording.goal = true;
+        recording.terminals[1] = true;
+        recording.ends[3] = true;
+        let transitions = transitions(recording);
+        assert_eq!(transitions.episodes(), [0..2, 2..3]);
+        assert!(transitions.next_action(1).is_none());
+    }
+
+    #[test]
+    fn rows_with_next_observations_of_their_own_follow_one_another_where_these_say_so() {
+        let mut recording = recording(&[Transition; 4]);
+        recording.next_observations = Some(vec![1.0, 9.0, 3.0, 4.0]);
+        let transitions = transitions(recording);
+        assert_eq!(transitions.episodes(), [0..2, 2..4]);
+        assert_eq!((transitions.next_action(1), transitions.next_action(3)), (None, None));
+    }
+
+    #[test]
+    fn windows_lie_within_episodes() {
+        let transitions = transitions(d4rl());
+        assert_eq!(transitions.window_starts(1), [0, 1, 2, 3, 4]);
+        assert_eq!(transitions.window_starts(2), [0, 2]);
+        assert!(transitions.window_starts(3).is_empty());
+        let mut batch = Batch::default();
+        transitions.gather(&Vec::from_iter(2..4), &mut batch);
+        assert_eq!((batch.observations, batch.next_observations), (vec![3.0, 4.0], vec![4.0, 5.0]));
     }
 }

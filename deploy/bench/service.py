@@ -23,11 +23,11 @@ from urllib.request import urlopen
 
 BIN = Path("target/release")
 EVALUATORS = 4
-# A hundred times as often as the preset evaluates, so that a short run shows some snapshots.
+# A hundred times as often as the task is evaluated, so that a short run shows some snapshots.
 EVAL_INTERVAL = 200
 # Of a spell, before it counts: evaluators start, or leave.
 SETTLE = 3
-PRESET = ["--preset", "hopper-medium-replay-v2", "--samples", "1"]
+TASK = ["--task", "hopper-medium-replay-v2", "--agent", "samples=1"]
 CORES = sorted(os.sched_getaffinity(0))
 
 
@@ -92,7 +92,7 @@ class Learner:
 def train(folder, dataset, seconds, pairs):
     """A learner on one thread, spells without and with evaluators in turns; what was seen of it."""
     run = Path(folder) / "run"
-    command = [BIN / "learner", "train", *PRESET, "--dataset", dataset, "--run-dir", run]
+    command = [BIN / "learner", "train", *TASK, "--dataset", dataset, "--run-dir", run]
     command += ["--steps", "1000000", "--listen", "tcp/127.0.0.1:0", "--eval-interval", str(EVAL_INTERVAL)]
     seen = {"alone": [], "together": [], "outside": [], "delays": [], "begin": []}
     with process(command, f"{run}.learner.log", CORES) as child:
@@ -124,7 +124,7 @@ def start_up(folder, dataset):
     """Seconds of a whole process that makes one step."""
     begin = time.perf_counter()
     subprocess.run(
-        [BIN / "learner", "train", *PRESET, "--dataset", dataset, "--steps", "1", "--eval-interval", "0"]
+        [BIN / "learner", "train", *TASK, "--dataset", dataset, "--steps", "1", "--eval-interval", "0"]
         + ["--run-dir", Path(folder) / f"start-{time.time_ns()}"],
         check=True,
         capture_output=True,

@@ -22,17 +22,18 @@ use std::time::Duration;
 /// Hopper's observation and action.
 const DIMS: (usize, usize) = (11, 3);
 
-/// The configurations that are measured: preset, and next actions sampled per state. deploy/bench/bench.py knows their
-/// shapes.
-const CONFIGURATIONS: [(&str, &str, Option<u32>); 4] = [
-    ("paper, 10 samples", "hopper-medium-replay-v2", Some(10)),
-    ("paper, 1 sample", "hopper-medium-replay-v2", Some(1)),
-    ("demo", "hopper-demo", Some(1)),
-    ("demo, IQL", "hopper-demo-iql", None),
+/// The configurations that are measured: task, algorithm, and next actions sampled per state. deploy/bench/bench.py knows
+/// their shapes.
+const CONFIGURATIONS: [(&str, [&str; 2], Option<u32>); 4] = [
+    ("paper, 10 samples", ["hopper-medium-replay-v2", "quad"], Some(10)),
+    ("paper, 1 sample", ["hopper-medium-replay-v2", "quad"], Some(1)),
+    ("demo", ["hopper-demo", "quad"], Some(1)),
+    ("demo, IQL", ["hopper-demo", "iql"], None),
 ];
 
-fn experiment(preset: &str, samples: Option<u32>) -> Experiment {
-    let mut experiment = resolve(preset, &Default::default()).expect("a preset");
+fn experiment([task, algorithm]: [&str; 2], samples: Option<u32>) -> Experiment {
+    let asked = [("algorithm".to_owned(), algorithm.into())].into_iter().collect();
+    let mut experiment = resolve(task, &asked).expect("a task");
     experiment.agent.extend(samples.map(|samples| ("samples".to_owned(), samples.into())));
     experiment
 }
@@ -80,8 +81,8 @@ fn updates(criterion: &mut Criterion) {
     for (group, device, precision) in groups {
         let mut group = criterion.benchmark_group(group);
         group.sample_size(20);
-        for (name, preset, samples) in CONFIGURATIONS {
-            let experiment = experiment(preset, samples);
+        for (name, which, samples) in CONFIGURATIONS {
+            let experiment = experiment(which, samples);
             let setting = setting(&experiment, precision, device);
             let algorithm = experiment.hyperparameters().and_then(|read| {
                 let started = read.start(&setting).expect("a usable configuration and device");
@@ -131,11 +132,11 @@ fn peaks(criterion: &mut Criterion) {
 
 /// What QUAD's update consists of, in its order, each by itself.
 fn parts(criterion: &mut Criterion) {
-    for (name, preset, samples) in CONFIGURATIONS {
+    for (name, which, samples) in CONFIGURATIONS {
         let Some(samples) = samples else { continue };
         let mut group = criterion.benchmark_group(name);
         group.sample_size(20).measurement_time(Duration::from_secs(2)).warm_up_time(Duration::from_millis(500));
-        parts_of(&mut group, &experiment(preset, Some(samples)), samples as usize).expect("candle works");
+        parts_of(&mut group, &experiment(which, Some(samples)), samples as usize).expect("candle works");
         group.finish();
     }
 }

@@ -1,6 +1,6 @@
 //! What a training run of a test is asked to do: small networks, few steps.
 
-/// What a test may choose of a run; the rest of its preset is fixed and small.
+/// What a test may choose of a run; the rest is fixed and small.
 #[derive(Clone, Copy)]
 pub struct Setting {
     /// Gradient steps.
@@ -34,7 +34,7 @@ impl Setting {
     pub fn to_toml(self) -> String {
         let Setting { steps, eval_interval, episodes, candidates, hidden, seed } = self;
         format!(
-            r#"base = "hopper-demo"
+            r#"task = "hopper-demo"
 steps = {steps}
 eval_interval = {eval_interval}
 episodes = {episodes}

@@ -62,7 +62,7 @@ fn another_simulation_is_learnt_from_but_not_scored_in_ours() {
         assert_eq!(recorded_environment(root.dataset()).unwrap().as_deref(), Some(id));
         let error = root.read(environment::find(ours).ok()).err().unwrap();
         assert!(error.to_string().ends_with(&format!("recorded in `{id}`, which is not `{ours}`")), "{error}");
-        assert!(error.hint().contains("--preset own-data"), "{}", error.hint());
+        assert!(error.hint().contains("--task own-data"), "{}", error.hint());
         compare_with_minari(root.0.path(), "made/up-v0", kind, None);
     }
 }

@@ -45,7 +45,7 @@ fn a_maze_of_ogbench_is_learnt_from_but_not_scored_in_one_of_ours() {
     assert!(read(None).is_ok());
     let error = read(environment::find("antmaze-medium").ok()).err().unwrap();
     assert!(error.to_string().ends_with("recorded in `OGBench`, which is not `antmaze-medium`"), "{error}");
-    assert!(error.hint().contains("--preset own-data"), "{}", error.hint());
+    assert!(error.hint().contains("--task own-data"), "{}", error.hint());
 }
 
 #[test]

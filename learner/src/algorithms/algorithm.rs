@@ -9,10 +9,14 @@ use serde::de::DeserializeOwned;
 /// What is known of an algorithm before it runs.
 #[derive(Clone, Copy, Debug)]
 pub struct Definition {
-    /// Its name on the command line and in presets.
+    /// Its name on the command line and in files.
     pub name: &'static str,
     /// What each update measures, in the order of the values that it gives.
     pub metrics: &'static [Metric],
+    /// The file of its values for each task, `presets/NAME.toml`.
+    pub settings: &'static str,
+    /// The hyper-parameter that tells its variants apart in run names and tables, if it has any.
+    pub variant: Option<&'static str>,
     /// Reads its hyper-parameters, the `[agent]` table of a preset, and checks them.
     pub read: fn(&toml::Table) -> std::result::Result<Box<dyn Hyperparameters>, AgentError>,
 }

@@ -21,7 +21,13 @@ use quad_policy::{
 use serde::Deserialize;
 
 /// What the learner has to know of it.
-pub(super) const DEFINITION: Definition = Definition { name: "iql", metrics: METRICS, read: read_config };
+pub(super) const DEFINITION: Definition = Definition {
+    name: "iql",
+    metrics: METRICS,
+    settings: include_str!("../../../presets/iql.toml"),
+    variant: None,
+    read: read_config,
+};
 
 /// Critics, of whose values the smaller counts.
 const CRITICS: usize = 2;

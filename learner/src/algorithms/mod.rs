@@ -1,7 +1,7 @@
 //! Learning algorithms, one file each, to be read beside its paper.
 //!
 //! Whatever an algorithm does, the rest of the learner sees what `algorithm` describes. A new one is a file here, a line in
-//! [`ALGORITHMS`] and a preset.
+//! [`ALGORITHMS`] and its values for each task in `presets/`.
 
 mod algorithm;
 mod iql;
@@ -11,7 +11,7 @@ mod random;
 
 pub use algorithm::{AgentError, Algorithm, AlgorithmError, Definition, Hyperparameters, Metric, Minibatch, Setting};
 
-/// All algorithms.
+/// All algorithms, the one that learns unless another is asked for first.
 pub const ALGORITHMS: [Definition; 2] = [quad::DEFINITION, iql::DEFINITION];
 
 /// The algorithm of that name.

@@ -24,7 +24,13 @@ use rand::Rng;
 use rand_distr::{Distribution, StandardNormal};
 
 /// What the learner has to know of it.
-pub const DEFINITION: Definition = Definition { name: "quad", metrics: METRICS, read };
+pub const DEFINITION: Definition = Definition {
+    name: "quad",
+    metrics: METRICS,
+    settings: include_str!("../../../presets/quad.toml"),
+    variant: Some("guidance"),
+    read,
+};
 
 fn read(table: &toml::Table) -> std::result::Result<Box<dyn Hyperparameters>, AgentError> {
     Ok(Box::new(config::read(table)?))

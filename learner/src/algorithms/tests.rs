@@ -27,16 +27,13 @@ fn setting(seed: u64, device: &Device) -> Setting {
     }
 }
 
-/// The presets of all algorithms and variants, with small networks.
+/// The demonstration by all algorithms and variants, with small networks.
 fn variants() -> Vec<(Definition, toml::Table)> {
     let mut variants = Vec::new();
-    for (preset, guidance) in [
-        ("hopper-demo", Some("quad")),
-        ("hopper-demo", Some("dac")),
-        ("hopper-demo", Some("none")),
-        ("hopper-demo-iql", None),
-    ] {
-        let mut experiment = resolve(preset, &toml::Table::new()).unwrap();
+    for (algorithm, guidance) in [("quad", Some("quad")), ("quad", Some("dac")), ("quad", Some("none")), ("iql", None)]
+    {
+        let asked = toml::Table::from_iter([("algorithm".to_owned(), algorithm.into())]);
+        let mut experiment = resolve("hopper-demo", &asked).unwrap();
         experiment.agent.insert("hidden".to_owned(), 24.into());
         if let Some(guidance) = guidance {
             experiment.agent.insert("guidance".to_owned(), guidance.into());

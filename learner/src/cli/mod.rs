@@ -9,7 +9,7 @@ use clap::{Args, Parser, Subcommand};
 use quad_dataset::{EnvironmentSpec, environment};
 use quad_service::parse_endpoint;
 
-use crate::config::presets;
+use crate::config::{hyperparameters, presets, tasks};
 
 pub use train::TrainArgs;
 
@@ -36,7 +36,7 @@ pub enum Command {
     /// Train on a dataset, publish snapshots, hand out evaluations, keep the run in a folder
     #[command(after_help = train::EXAMPLES)]
     Train(Box<TrainArgs>),
-    /// List the presets, or print one with every value that it stands for
+    /// List tasks and algorithms, or print every value that an algorithm has for a task
     Presets(PresetsArgs),
     /// Datasets by name: list them, fetch one
     #[command(subcommand)]
@@ -52,9 +52,12 @@ pub enum Command {
 /// Arguments of `learner presets`.
 #[derive(Debug, Args)]
 pub struct PresetsArgs {
-    /// Print this preset, merged with its bases, as a file of your own could have it
-    #[arg(value_name = "NAME", value_parser = parse_preset)]
+    /// Print every value for this task, or for what a file changes of one, as a file of your own could have them
+    #[arg(value_name = "TASK|FILE", value_parser = parse_preset)]
     pub preset: Option<String>,
+    /// Algorithm whose values these are [default: quad, or what the file says]
+    #[arg(long, value_name = "NAME", value_parser = parse_algorithm, requires = "preset")]
+    pub algorithm: Option<String>,
 }
 
 /// What can be done with datasets.
@@ -132,11 +135,17 @@ pub struct ReportArgs {
     pub plot: Option<PathBuf>,
 }
 
+fn parse_task(text: &str) -> Result<String, String> {
+    tasks::named(text).map(|task| task.name.clone()).map_err(|_| tasks::unknown_hint(text))
+}
+
 fn parse_preset(text: &str) -> Result<String, String> {
-    if presets::is_path(text) || presets::names().any(|name| name == text) {
-        return Ok(text.to_owned());
-    }
-    Err(presets::unknown_hint(text))
+    if presets::is_path(text) { Ok(text.to_owned()) } else { parse_task(text) }
+        .map_err(|hint| hint + "; a file of your own must end in .toml")
+}
+
+fn parse_algorithm(text: &str) -> Result<String, String> {
+    hyperparameters::algorithm(text).map(|known| known.name.to_owned()).map_err(|_| hyperparameters::unknown_hint(text))
 }
 
 /// Prints a result to stdout, where logs do not go. The reader may stop at any time, like `head` does.

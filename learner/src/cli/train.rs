@@ -8,17 +8,20 @@ use quad_policy::Precision;
 use quad_service::parse_endpoint;
 use toml::{Table, Value};
 
-use super::parse_preset;
-use crate::config::{Device, presets};
+use super::{parse_algorithm, parse_preset, parse_task};
+use crate::config::{Device, tables};
 
 pub(super) const EXAMPLES: &str = "\
 Examples:
   # One box: the learner listens, an evaluator in another terminal connects.
-  learner train --preset hopper-demo --dataset data/hopper-demo.hdf5 --listen tcp/127.0.0.1:7447
+  learner train --task hopper-demo --dataset data/hopper-demo.hdf5 --listen tcp/127.0.0.1:7447
   evaluator serve --connect tcp/127.0.0.1:7447
 
-  # Behaviour cloning with the same steps: no critic at all.
-  learner train --preset hopper-demo --dataset data/hopper-demo.hdf5 --guidance none --candidates 1
+  # Another algorithm on the same data.
+  learner train --task hopper-demo --algorithm iql --dataset data/hopper-demo.hdf5
+
+  # QUAD without guidance, which is behaviour cloning.
+  learner train --task hopper-demo --agent guidance=none --dataset data/hopper-demo.hdf5
 
   # Go on after a crash or Ctrl-C: the same command again.
 
@@ -29,15 +32,21 @@ weights, bit for bit, as one that was not.";
 /// Arguments of `learner train`.
 #[derive(Debug, Args)]
 pub struct TrainArgs {
-    /// Hyper-parameters: a preset's name (`learner presets` lists them), or the path of a file that ends in .toml
-    #[arg(long, value_name = "NAME", value_parser = parse_preset)]
-    pub preset: String,
+    /// What to learn: environment, dataset, and the algorithm's values for them (`learner presets` lists tasks)
+    #[arg(long, value_name = "NAME", value_parser = parse_task, required_unless_present = "preset")]
+    task: Option<String>,
+    /// What learns it (`learner presets` lists algorithms) [default: quad]
+    #[arg(long, value_name = "NAME", value_parser = parse_algorithm)]
+    algorithm: Option<String>,
+    /// The same as --task NAME; or a file of your own, which may name `task` and `algorithm`, and changes what it names
+    #[arg(long, value_name = "NAME|FILE.toml", value_parser = parse_preset, conflicts_with = "task")]
+    preset: Option<String>,
     /// A file (`evaluator collect` records one), a name of `learner datasets list`, fetched if it is not there yet,
-    /// or minari:ID [default: the preset's]
+    /// or minari:ID [default: the task's]
     #[arg(long, value_name = "FILE|NAME")]
     dataset: Option<String>,
     /// Folder of this run; its last part names the run. A run of the same configuration that is there already goes on
-    /// [default: runs/PRESET-VARIANT-seedSEED]
+    /// [default: runs/TASK-VARIANT-seedSEED]
     #[arg(long, value_name = "DIR")]
     pub run_dir: Option<PathBuf>,
     /// Seconds between two checkpoints, which is what a crash may cost; more where saving would take 1 % of the time
@@ -63,16 +72,19 @@ pub struct TrainArgs {
     /// Train on the CPU, or on the first Nvidia GPU, which needs a learner that deploy/cuda.sh has built
     #[arg(long, value_name = "cpu|cuda", value_enum, hide_possible_values = true, default_value_t)]
     pub device: Device,
-    /// Any other value of the preset, in TOML's notation: agent.tau=0.5, environment=my-robot; repeatable
-    #[arg(long, value_name = "KEY=VALUE", value_parser = presets::parse_assignment)]
+    /// Another value of a hyper-parameter of the algorithm, in TOML's notation: guidance=dac, tau=0.5; repeatable
+    #[arg(long, value_name = "KEY=VALUE", value_parser = tables::parse_agent_assignment)]
+    agent: Vec<Table>,
+    /// The same of any key: batch_size=64, environment=my-robot; repeatable
+    #[arg(long, value_name = "KEY=VALUE", value_parser = tables::parse_assignment)]
     set: Vec<Table>,
     #[command(flatten)]
     overrides: OverrideArgs,
 }
 
-/// Flags that take the place of a preset's value.
+/// Flags that take the place of the algorithm's value for the task.
 #[derive(Debug, Args)]
-#[command(next_help_heading = "Instead of the preset's value")]
+#[command(next_help_heading = "Instead of the algorithm's value for the task")]
 struct OverrideArgs {
     /// Gradient steps
     #[arg(long, value_name = "N", value_parser = value_parser!(i64).range(1..))]
@@ -86,46 +98,37 @@ struct OverrideArgs {
     /// Seed of initial weights, batches, noise and the evaluations' episodes
     #[arg(long, value_name = "N", value_parser = value_parser!(i64).range(0..))]
     seed: Option<i64>,
-    /// What pulls the policy away from the data: quad (Q-gradients weighted by the critics' agreement),
-    /// dac (Q-gradients as they are) or none (behaviour cloning)
-    #[arg(long, value_name = "quad|dac|none")]
-    guidance: Option<String>,
-    /// Actions sampled per next state for the critics' target
-    #[arg(long, value_name = "N", value_parser = value_parser!(i64).range(1..))]
-    samples: Option<i64>,
-    /// Actions that an evaluated policy samples per state; the critics choose the best
-    #[arg(long, value_name = "N", value_parser = value_parser!(i64).range(1..))]
-    candidates: Option<i64>,
     /// Precision of forward passes without gradient, f32 or bf16, which rounds and is faster on CPUs with AMX or AVX512-BF16
     #[arg(long, value_name = "NAME")]
     precision: Option<Precision>,
 }
 
 impl TrainArgs {
-    /// What the command line changes in the preset. Where it says a value twice, a flag of its own wins over `--set`.
+    /// What the run begins from: the name of a task, or the path of a file.
+    pub fn preset(&self) -> &str {
+        // clap sees to it that there is one of them.
+        self.task.as_deref().or(self.preset.as_deref()).unwrap_or_default()
+    }
+
+    /// What the command line changes in that. Where it says a value twice, `--agent` wins over `--set`, and a flag of its
+    /// own over both.
     pub fn changes(&self) -> Table {
         let flags = &self.overrides;
         let number = |value: Option<i64>| value.map(Value::from);
         let mut changes = Table::new();
-        for change in &self.set {
-            presets::merge(&mut changes, change.clone());
+        for change in self.set.iter().chain(&self.agent) {
+            tables::merge(&mut changes, change.clone());
         }
         for (key, value) in [
+            ("algorithm", self.algorithm.clone().map(Value::from)),
             ("dataset", self.dataset.clone().map(Value::from)),
             ("steps", number(flags.steps)),
             ("eval_interval", number(flags.eval_interval)),
             ("episodes", number(flags.episodes)),
             ("seed", number(flags.seed)),
-            ("candidates", number(flags.candidates)),
             ("precision", flags.precision.map(|precision| precision.name().into())),
         ] {
             changes.extend(value.map(|value| (key.to_owned(), value)));
-        }
-        for (key, value) in [("guidance", flags.guidance.clone().map(Value::from)), ("samples", number(flags.samples))]
-        {
-            let Some(value) = value else { continue };
-            let agent = Table::from_iter([(key.to_owned(), value)]);
-            presets::merge(&mut changes, Table::from_iter([("agent".to_owned(), agent.into())]));
         }
         changes
     }

@@ -9,8 +9,10 @@ use quad_dataset::{DatasetError, environment};
 use quad_service::{Hint, hinted};
 use tracing::{info, warn};
 
+use crate::algorithms::ALGORITHMS;
 use crate::cli::{Cli, Command, DatasetsCommand, DoctorArgs, InspectArgs, PresetsArgs, ReportArgs, VerifyArgs, print};
-use crate::config::{self, presets};
+use crate::config::hyperparameters::{self, Values};
+use crate::config::{Preset, tasks};
 use crate::data::{Source, cache};
 use crate::report::{Report, Style, Table, learning_curves};
 use crate::run::{RunDir, RunDirError, verify};
@@ -36,14 +38,29 @@ pub fn run(cli: &Cli) -> anyhow::Result<()> {
 
 fn list_presets(args: &PresetsArgs) -> anyhow::Result<()> {
     if let Some(preset) = &args.preset {
-        return print(&toml::to_string(&config::resolve(preset, &toml::Table::new())?)?);
+        return print_preset(&Preset::read(preset)?, args.algorithm.as_deref());
     }
-    let tasks = presets::tasks()?;
-    let bases = presets::names().filter(|name| tasks.iter().all(|[task, ..]| task != name));
-    let bases = Vec::from_iter(bases).join(", ");
-    let mut table = Table::new(&["preset", "environment", "dataset", "what is special"].map(|name| (name, Left)));
-    tasks.into_iter().for_each(|task| table.push(task));
-    print(&format!("{}\nBases of these, which name no environment: {bases}", table.render(Style::Text)))
+    let header = ["task", "environment", "dataset", "what it is"];
+    let mut of_tasks = Table::new(&header.map(|name| (name, Left)));
+    for task in tasks::all() {
+        let word = |key| task.word(key).unwrap_or("-");
+        of_tasks.push([&*task.name, word("environment"), word("dataset"), &task.about].map(str::to_owned));
+    }
+    let header = ["algorithm", "what it is", "its authors give values for"];
+    let mut of_algorithms = Table::new(&header.map(|name| (name, Left)));
+    for definition in &ALGORITHMS {
+        let values = Values::of(definition)?;
+        of_algorithms.push([definition.name.to_owned(), values.about, values.given.join(", ")]);
+    }
+    print(&format!("{}\n{}", of_tasks.render(Style::Text), of_algorithms.render(Style::Text)))
+}
+
+fn print_preset(preset: &Preset, algorithm: Option<&str>) -> anyhow::Result<()> {
+    let changes = algorithm.map(|name| ("algorithm".to_owned(), name.into()));
+    let experiment = preset.resolve(&changes.into_iter().collect())?;
+    let not_given = preset.task.map(|task| hyperparameters::not_given(&experiment.definition()?, task)).transpose()?;
+    let comment = not_given.flatten().map(|sentence| format!("# {sentence}\n\n")).unwrap_or_default();
+    print(&(comment + &toml::to_string(&experiment)?))
 }
 
 fn report(args: &ReportArgs) -> anyhow::Result<()> {

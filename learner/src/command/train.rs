@@ -15,7 +15,7 @@ use tokio::sync::mpsc;
 use tracing::{debug, info, warn};
 
 use crate::cli::{TrainArgs, print};
-use crate::config::{DatasetInfo, Experiment, RunConfig, RunInfo, presets, resolve};
+use crate::config::{DatasetInfo, Experiment, Preset, RunConfig, RunInfo, hyperparameters};
 use crate::data::{LocalDataset, Source};
 use crate::report::{RunReport, learning_curves};
 use crate::run::{self, Begun, Log, Past, RunDir};
@@ -30,13 +30,14 @@ const ANY_PORT: u16 = 0;
 
 /// Does it; an error is a run that did not come to its end.
 pub fn train(args: &TrainArgs) -> anyhow::Result<()> {
-    let experiment = resolve(&args.preset, &args.changes())?;
-    let named = experiment.dataset.clone().ok_or_else(|| anyhow!("preset {} names no dataset", args.preset));
+    let preset = Preset::read(args.preset())?;
+    let experiment = preset.resolve(&args.changes())?;
+    let named = experiment.dataset.clone().ok_or_else(|| anyhow!("preset {} names no dataset", preset.label));
     let source = Source::parse(&named.hint(record_hint(&experiment))?)?;
     source.check_environment(&experiment.environment)?;
     let path = match &args.run_dir {
         Some(path) => path.clone(),
-        None => default_run_dir(&args.preset, &experiment)?,
+        None => default_run_dir(&preset.label, &experiment)?,
     };
     let name = run_name(&path)?;
     let begun = run::open(&path, args.fresh)?;
@@ -49,12 +50,17 @@ pub fn train(args: &TrainArgs) -> anyhow::Result<()> {
         ReadOptions { environment: environment::find(&experiment.environment).ok(), reward: experiment.reward };
     let transitions = read_dataset(&dataset.path, &options)?;
     check_batch(&transitions, &experiment).hint("record more data, or ask for less with --set batch_size=N")?;
-    let config = run_config(args, &name, experiment, dataset, &transitions)?;
+    let config = run_config(args, &name, preset.task_name(), experiment, dataset, &transitions)?;
     if let Some(begun) = &begun {
         begun.check_same(&config)?;
     }
     info!("{}", config.dataset.summary());
     info!("{}", config.experiment.summary()?);
+    if let Some(task) = preset.task
+        && let Some(warning) = hyperparameters::not_given(&config.experiment.definition()?, task)?
+    {
+        warn!("{warning}");
+    }
     if !config.experiment.precision.is_available() {
         warn!("{}", Precision::UNAVAILABLE);
     }
@@ -223,9 +229,9 @@ fn summarise(run_dir: &RunDir) -> anyhow::Result<RunReport> {
     Ok(report)
 }
 
-fn default_run_dir(preset: &str, experiment: &Experiment) -> anyhow::Result<PathBuf> {
-    let variant = experiment.hyperparameters()?.variant();
-    Ok(Path::new("runs").join(format!("{}-{variant}-seed{}", presets::label(preset), experiment.seed)))
+fn default_run_dir(label: &str, experiment: &Experiment) -> anyhow::Result<PathBuf> {
+    let variant = experiment.variant()?;
+    Ok(Path::new("runs").join(format!("{label}-{variant}-seed{}", experiment.seed)))
 }
 
 /// The folder's name, which is also the run's place in Zenoh's key space.
@@ -239,6 +245,7 @@ fn run_name(path: &Path) -> anyhow::Result<Name> {
 fn run_config(
     args: &TrainArgs,
     name: &Name,
+    task: &str,
     experiment: Experiment,
     dataset: LocalDataset,
     transitions: &Transitions,
@@ -248,7 +255,7 @@ fn run_config(
         run: RunInfo {
             name: name.to_string(),
             started: now()?,
-            preset: presets::label(&args.preset),
+            task: task.to_owned(),
             version: env!("CARGO_PKG_VERSION").to_owned(),
             device: args.device,
         },

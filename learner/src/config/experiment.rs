@@ -1,15 +1,16 @@
-//! From a preset and changes to one experiment, every value of which is checked.
+//! One experiment, every value of which is checked.
 
-use anyhow::{Context, anyhow, ensure};
-use quad_dataset::{RewardRule, environment};
+use anyhow::{Context, ensure};
+use quad_dataset::RewardRule;
 use quad_policy::Precision;
 use quad_service::Hint;
 use serde::{Deserialize, Serialize};
 use toml::{Table, Value};
 
-use super::presets;
+use super::hyperparameters;
+use super::presets::Preset;
 use super::schedule::Schedule;
-use crate::algorithms::{self, ALGORITHMS, Definition, Hyperparameters};
+use crate::algorithms::{Definition, Hyperparameters};
 
 /// Most episodes in one evaluation, and most candidates per state: far above any use, low enough for evaluators' memory.
 const MOST_EPISODES: u64 = 10_000;
@@ -19,7 +20,7 @@ const MOST_BATCH: u64 = 1 << 20;
 /// TOML's integers are 64 bits with a sign, so larger ones could not be saved with the run.
 const MOST: u64 = i64::MAX as u64;
 
-/// Everything that decides the outcome of a run, apart from the contents of the dataset: a preset, resolved.
+/// Everything that decides the outcome of a run, apart from the contents of the dataset.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Experiment {
@@ -28,7 +29,7 @@ pub struct Experiment {
     /// What it learns from: a name, or a file. [`DatasetInfo`](super::DatasetInfo) says what was found there.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub dataset: Option<String>,
-    /// How rewards are scaled before training; a preset that does not say takes the environment's rule.
+    /// How rewards are scaled before training; a file that does not say takes the environment's rule.
     pub reward: RewardRule,
     /// Gradient steps.
     pub steps: u64,
@@ -52,29 +53,16 @@ pub struct Experiment {
 }
 
 /// For a key that is too few or too many, or of a wrong type. What serde says of it lists the keys that there are.
-const KEYS: &str =
-    "`learner presets NAME` prints every key of a preset; on the command line those below [agent] are agent.KEY";
+pub(super) const KEYS: &str = "`learner presets TASK` prints every key; on the command line --set KEY=VALUE changes one, and \
+                               --agent KEY=VALUE one below [agent]";
 
-/// Reads a preset (an embedded name, or a path that ends in `.toml`), lays changes over it, checks every range.
+/// Reads a preset (the name of a task, or a path that ends in `.toml`), lays changes over it, checks every range. The
+/// changes may name another `algorithm` than the preset.
 ///
 /// # Errors
 /// There is no such preset, or something in it or in the changes cannot be used.
 pub fn resolve(preset: &str, changes: &Table) -> anyhow::Result<Experiment> {
-    let mut table = presets::load(preset)?;
-    presets::merge(&mut table, changes.clone());
-    let Some(environment) = table.get("environment") else {
-        return Err(anyhow!("preset {preset} names no environment: it is a base of other presets"))
-            .hint("`learner presets` lists the presets that can be trained");
-    };
-    if !table.contains_key("reward") {
-        let known = environment.as_str().and_then(|name| environment::find(name).ok());
-        let rule = known.map_or(RewardRule::AsIs, |spec| spec.reward);
-        table.insert("reward".to_owned(), Value::try_from(rule)?);
-    }
-    let experiment: Experiment =
-        table.try_into().with_context(|| format!("preset {preset} cannot be used")).hint(KEYS)?;
-    experiment.validate()?;
-    Ok(experiment)
+    Preset::read(preset)?.resolve(changes)
 }
 
 impl Experiment {
@@ -83,15 +71,23 @@ impl Experiment {
     /// # Errors
     /// There is none of that name.
     pub fn definition(&self) -> anyhow::Result<Definition> {
-        let known = || ALGORITHMS.map(|known| known.name).join(", ");
-        let unknown = || anyhow!("there is no algorithm named {:?}; there are {}", self.algorithm, known());
-        algorithms::named(&self.algorithm).ok_or_else(unknown)
+        hyperparameters::algorithm(&self.algorithm)
+    }
+
+    /// What tells variants of the algorithm apart in the names of runs: a hyper-parameter's value, or the algorithm's name.
+    ///
+    /// # Errors
+    /// As [`Self::definition`].
+    pub fn variant(&self) -> anyhow::Result<&str> {
+        let key = self.definition()?.variant;
+        let value = key.and_then(|key| self.agent.get(key)).and_then(Value::as_str);
+        Ok(value.unwrap_or(&self.algorithm))
     }
 
     /// The algorithm's hyper-parameters.
     ///
     /// # Errors
-    /// They are not usable, which is found when a preset is resolved.
+    /// They are not usable, which is found when an experiment is resolved.
     pub fn hyperparameters(&self) -> anyhow::Result<Box<dyn Hyperparameters>> {
         let read = (self.definition()?.read)(&self.agent);
         read.with_context(|| format!("algorithm {}", self.algorithm)).hint(KEYS)
@@ -116,7 +112,7 @@ impl Experiment {
         Ok(format!("{agent}; seed {seed}, {steps} steps of batch {batch_size}; {evaluations}"))
     }
 
-    fn validate(&self) -> anyhow::Result<()> {
+    pub(super) fn validate(&self) -> anyhow::Result<()> {
         for (field, value, least, most) in [
             ("steps", self.steps, 1, MOST),
             ("eval_interval", self.eval_interval, 0, MOST),

@@ -29,8 +29,9 @@ pub struct RunInfo {
     /// it is not the number of a learner's start on the wire, which has that name, too.
     #[serde(rename = "incarnation")]
     pub started: u64,
-    /// Preset that was asked for.
-    pub preset: String,
+    /// Task that was asked for; of a user's file that names none, the file's name. Older runs call it their preset.
+    #[serde(alias = "preset")]
+    pub task: String,
     /// Version of the learner.
     pub version: String,
     /// Where it trains; runs from before there was a choice do not say.

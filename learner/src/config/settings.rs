@@ -5,8 +5,8 @@ use std::collections::BTreeMap;
 use serde::Serialize;
 
 use super::experiment::Experiment;
-use super::presets;
 use super::run_config::RunConfig;
+use super::tables;
 
 /// Values by dotted key.
 pub type Settings = BTreeMap<String, String>;
@@ -35,7 +35,7 @@ pub fn of_experiment(experiment: &Experiment) -> Settings {
 fn flat(value: &impl Serialize) -> Settings {
     // Everything here was read from TOML, so it can be written.
     let table = toml::Table::try_from(value).unwrap_or_default();
-    presets::keys(&table).into_iter().map(|(key, value)| (key, value.to_string())).collect()
+    tables::keys(&table).into_iter().map(|(key, value)| (key, value.to_string())).collect()
 }
 
 /// The keys at which two settings differ, in alphabetical order for each of them.

@@ -69,7 +69,7 @@ impl Source {
                 entry.name,
                 entry.environment
             ))
-            .hint("choose a preset of the dataset's environment, or another --dataset"),
+            .hint("choose a task in the dataset's environment, or another --dataset"),
             _ => Ok(()),
         }
     }

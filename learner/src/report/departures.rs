@@ -1,20 +1,22 @@
-//! In which ways runs of one of the paper's presets are not what the paper ran.
+//! In which ways runs of one of the paper's tasks are not what the authors of their algorithm ran.
 
 use std::collections::BTreeSet;
 
 use quad_dataset::catalogue::{self, Checksum};
 
-use super::published::SEEDS;
+use super::published::{self, SEEDS};
 use super::run::RunReport;
 use crate::config::settings::{self, Settings, differences};
-use crate::config::{self, Experiment};
+use crate::config::{self, Experiment, hyperparameters, tasks};
 
 /// Of runs that differ in their seed alone. `scored_in` is the precision of their scores.
 pub fn departures(runs: &[&RunReport], scored_in: &str) -> Vec<String> {
     let Some(run) = runs.first() else { return Vec::new() };
-    let Ok(paper) = config::resolve(&run.preset, &toml::Table::new()) else { return Vec::new() };
-    let mut departures = Vec::new();
     let ours = &run.config.experiment;
+    let Ok(task) = tasks::named(&run.task) else { return Vec::new() };
+    let Ok(paper) = as_published(run) else { return Vec::new() };
+    let mut departures = Vec::new();
+    departures.extend(ours.definition().and_then(|known| hyperparameters::not_given(&known, task)).ok().flatten());
     if !is_trained_on(run, paper.dataset.as_deref()) {
         let name = |dataset: &Option<String>| dataset.clone().unwrap_or_else(|| "not named".to_owned());
         departures.push(format!("dataset is {}, not {}", name(&ours.dataset), name(&paper.dataset)));
@@ -35,6 +37,18 @@ pub fn departures(runs: &[&RunReport], scored_in: &str) -> Vec<String> {
         departures.push(format!("{} of {SEEDS} seeds", runs.len()));
     }
     departures
+}
+
+/// The values of the task for the algorithm, and for the variant of it that the paper has a row of.
+fn as_published(run: &RunReport) -> anyhow::Result<Experiment> {
+    let mut asked = toml::Table::from_iter([("algorithm".to_owned(), run.algorithm.as_str().into())]);
+    let variant = run.config.experiment.definition()?.variant;
+    let is_published = !published::methods(&run.algorithm, &run.variant).is_empty();
+    if let Some(key) = variant.filter(|_| is_published) {
+        let agent = toml::Table::from_iter([(key.to_owned(), run.variant.as_str().into())]);
+        asked.insert("agent".to_owned(), agent.into());
+    }
+    config::resolve(&run.task, &asked)
 }
 
 fn without_seed(experiment: &Experiment) -> Settings {

@@ -32,7 +32,7 @@ pub struct Printed {
 #[serde(deny_unknown_fields)]
 struct Tables {
     method: Vec<Method>,
-    /// By preset and method: the mean, and where there is one the deviation.
+    /// By task and method: the mean, and where there is one the deviation.
     scores: BTreeMap<String, BTreeMap<String, Vec<f64>>>,
 }
 
@@ -41,21 +41,32 @@ struct Tables {
 struct Method {
     name: String,
     source: String,
+    /// Ours of that method, and its variant.
+    algorithm: Option<String>,
+    variant: Option<String>,
 }
 
 #[allow(clippy::expect_used)] // The tables are part of the program; the test here reads them.
 static TABLES: LazyLock<Tables> =
     LazyLock::new(|| toml::from_str(include_str!("../../published.toml")).expect("the embedded tables are valid"));
 
-/// What is published for the task of a preset, the paper's own method first; nothing for other presets.
-pub fn scores(preset: &str) -> Vec<Published> {
-    let scores = TABLES.scores.get(preset);
+/// What is published for a task, the paper's own method first; nothing for tasks that are not the paper's.
+pub fn scores(task: &str) -> Vec<Published> {
+    let scores = TABLES.scores.get(task);
     let published = |method: &'static Method| {
         let figures = scores?.get(&method.name)?;
         let score = Printed { mean: *figures.first()?, std: figures.get(1).copied() };
         Some(Published { method: &method.name, score, source: &method.source })
     };
     TABLES.method.iter().filter_map(published).collect()
+}
+
+/// What the paper calls a variant of an algorithm: several names where it has several rows, none where it has none.
+pub fn methods(algorithm: &str, variant: &str) -> Vec<&'static str> {
+    let is_it = |method: &&Method| {
+        method.algorithm.as_deref() == Some(algorithm) && method.variant.as_deref().is_none_or(|known| known == variant)
+    };
+    TABLES.method.iter().filter(is_it).map(|method| &*method.name).collect()
 }
 
 #[cfg(test)]

@@ -51,8 +51,10 @@ pub struct RunReport {
     pub dir: PathBuf,
     /// Its name.
     pub run: String,
-    /// The preset it started from.
-    pub preset: String,
+    /// What it learns; of a user's file that names no task, the file's name.
+    pub task: String,
+    /// Its algorithm.
+    pub algorithm: String,
     /// The variant of the algorithm: `quad`, `dac` or `none` for QUAD's kinds of guidance, or another algorithm's name.
     pub variant: String,
     /// The hyper-parameters that matter most.
@@ -94,10 +96,11 @@ impl RunReport {
         let (dir, config) = RunDir::open(path)?;
         let agent = config.experiment.hyperparameters();
         let agent = agent.with_context(|| format!("config.toml in {} cannot be used", path.display()))?;
-        Ok(Self::new(path, config, &*agent, &dir.read_scores()?))
+        let variant = config.experiment.variant()?.to_owned();
+        Ok(Self::new(path, config, &*agent, variant, &dir.read_scores()?))
     }
 
-    fn new(path: &Path, config: RunConfig, agent: &dyn Hyperparameters, lines: &[ScoreLine]) -> Self {
+    fn new(path: &Path, config: RunConfig, agent: &dyn Hyperparameters, variant: String, lines: &[ScoreLine]) -> Self {
         let experiment = &config.experiment;
         let mut by_step: BTreeMap<u64, BTreeMap<u64, &ScoreLine>> = BTreeMap::new();
         for line in lines {
@@ -125,8 +128,9 @@ impl RunReport {
         Self {
             dir: path.to_owned(),
             run: config.run.name.clone(),
-            preset: config.run.preset.clone(),
-            variant: agent.variant(),
+            task: config.run.task.clone(),
+            algorithm: experiment.algorithm.clone(),
+            variant,
             agent: agent.summary(),
             candidates: experiment.candidates,
             seed: experiment.seed,
@@ -191,8 +195,8 @@ impl RunReport {
             table.push(row);
         }
         let mut text = format!(
-            "{}: preset {}, {}, {} candidates, {} steps, seed {}, scored in {}\n\n",
-            self.run, self.preset, self.agent, self.candidates, self.steps, self.seed, self.scored_in
+            "{}: task {}, {}, {} candidates, {} steps, seed {}, scored in {}\n\n",
+            self.run, self.task, self.agent, self.candidates, self.steps, self.seed, self.scored_in
         ) + &table.render(Style::Text);
         if self.evaluations.is_empty() {
             text.push_str("(no evaluation has a score yet)\n");

@@ -12,16 +12,20 @@ use super::spread::Spread;
 use crate::config::Device;
 use crate::config::settings::{self, Settings, differences};
 
-/// Runs that differ in their seed alone: in preset, data, device and every hyper-parameter they agree. The precision in which
+/// Runs that differ in their seed alone: in task, data, device and every hyper-parameter they agree. The precision in which
 /// evaluators scored them may differ; it is named.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct GroupReport {
-    /// The preset.
-    pub preset: String,
+    /// What they learn.
+    pub task: String,
+    /// Their algorithm.
+    pub algorithm: String,
     /// The variant of the algorithm: `quad`, `dac` or `none` for QUAD's kinds of guidance, or another algorithm's name.
     pub variant: String,
     /// The hyper-parameters that matter most.
     pub agent: String,
+    /// What the paper calls this variant of the algorithm, if it has a row of it.
+    pub methods: Vec<&'static str>,
     /// Actions sampled per state in an evaluation.
     pub candidates: u32,
     /// Gradient steps that were asked for.
@@ -46,9 +50,9 @@ pub struct GroupReport {
     pub unfinished: Vec<String>,
     /// Runs that are not counted, each with the reason.
     pub left_out: Vec<String>,
-    /// The settings in which other runs of the preset differ from these.
+    /// The settings in which other runs of the task and algorithm differ from these.
     pub differs: Vec<String>,
-    /// How these runs depart from the paper's protocol; empty for a preset that is no task of the paper.
+    /// How these runs depart from the paper's protocol; empty where the task is none of the paper's.
     pub departures: Vec<String>,
     /// What is published for the task.
     pub published: Vec<Published>,
@@ -64,6 +68,15 @@ impl GroupReport {
         format!("{seeds} seed{plural}{goals}, {steps} on {device}, scored in {scored_in}")
     }
 
+    /// The variant, and what the paper calls it where it has another name.
+    pub fn named(&self) -> String {
+        let is_other = |method: &&str| !method.eq_ignore_ascii_case(&self.variant);
+        match self.methods.iter().any(is_other) {
+            true => format!("{} ({})", self.variant, self.methods.join(", ")),
+            false => self.variant.clone(),
+        }
+    }
+
     /// How many gradient steps, and that a run has not come to the end of them if that is so.
     pub fn steps_in_words(&self) -> String {
         let part = if self.unfinished.is_empty() { "" } else { " (not complete)" };
@@ -77,14 +90,16 @@ pub fn groups(runs: &[RunReport]) -> Vec<GroupReport> {
     for run in runs {
         let mut settings = settings::of_run(&run.config);
         settings.remove("seed");
-        match groups.iter_mut().find(|(known, members)| members[0].preset == run.preset && *known == settings) {
+        match groups.iter_mut().find(|(known, members)| members[0].task == run.task && *known == settings) {
             Some((_, members)) => members.push(run),
             None => groups.push((settings, vec![run])),
         }
     }
     let differs = |index: usize| {
         let (own, members) = &groups[index];
-        let siblings = groups.iter().filter(|(_, others)| others[0].preset == members[0].preset);
+        let is_sibling =
+            |other: &RunReport| (&other.task, &other.algorithm) == (&members[0].task, &members[0].algorithm);
+        let siblings = groups.iter().filter(|(_, others)| is_sibling(others[0]));
         let keys: BTreeSet<&String> = siblings.flat_map(|(other, _)| differences(own, other)).collect();
         let value = |key: &String| own.get(key).map_or_else(|| format!("no {key}"), |value| format!("{key} = {value}"));
         keys.into_iter().map(value).collect()
@@ -111,14 +126,16 @@ fn group(runs: &[&RunReport], differs: Vec<String>) -> GroupReport {
     };
     let first = runs[0];
     let scored_in = joined(counted.iter().flat_map(|run| &run.precisions));
-    let published = published::scores(&first.preset);
+    let published = published::scores(&first.task);
     let environment = environment::find(&first.config.experiment.environment).ok();
     let has_one_goal = environment.is_some_and(|environment| environment.goal == Some(Goal::EachInstance));
     let unfinished = counted.iter().filter(|run| !run.is_complete());
     GroupReport {
-        preset: first.preset.clone(),
+        task: first.task.clone(),
+        algorithm: first.algorithm.clone(),
         variant: first.variant.clone(),
         agent: first.agent.clone(),
+        methods: published::methods(&first.algorithm, &first.variant),
         candidates: first.candidates,
         steps: first.steps,
         device: first.config.run.device,

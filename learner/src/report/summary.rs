@@ -48,7 +48,7 @@ impl Report {
 
     fn over_seeds(&self, style: Style) -> String {
         let mut table = Table::new(&[
-            ("preset", Left),
+            ("task", Left),
             ("algorithm", Left),
             ("candidates", Right),
             ("trained for", Right),
@@ -57,13 +57,13 @@ impl Report {
             ("last 3", Right),
             ("last 5", Right),
             ("last 50000 steps", Right),
-            ("what differs from other runs of the preset", Left),
+            ("what differs from other runs of the task and algorithm", Left),
         ]);
         let cell = |value: Option<Spread>| value.map_or_else(|| "-".to_owned(), Spread::text_of_both);
         for g in &self.groups {
             let measure = if g.normalised { "" } else { " (returns)" };
             table.push([
-                g.preset.clone(),
+                g.task.clone(),
                 g.agent.clone(),
                 g.candidates.to_string(),
                 g.steps_in_words(),
@@ -86,19 +86,19 @@ impl Report {
 
     /// For each task of the paper: what these runs score, what is published, and how the protocols differ.
     fn beside_the_paper(&self, style: Style) -> Vec<String> {
-        let mut presets: Vec<&str> = Vec::new();
+        let mut tasks: Vec<&str> = Vec::new();
         for group in self.groups.iter().filter(|group| !group.published.is_empty()) {
-            if !presets.contains(&&*group.preset) {
-                presets.push(&group.preset);
+            if !tasks.contains(&&*group.task) {
+                tasks.push(&group.task);
             }
         }
-        presets.into_iter().map(|preset| self.task(preset, style)).collect()
+        tasks.into_iter().map(|task| self.task(task, style)).collect()
     }
 
-    fn task(&self, preset: &str, style: Style) -> String {
-        let groups = || self.groups.iter().filter(|group| group.preset == preset);
+    fn task(&self, task: &str, style: Style) -> String {
+        let groups = || self.groups.iter().filter(|group| group.task == task);
         let mut table = Table::new(&[
-            (preset, Left),
+            (task, Left),
             ("score", Right),
             ("± by n", Right),
             ("± by n - 1", Right),
@@ -110,7 +110,7 @@ impl Report {
         );
         let number = |value: Option<f64>| value.map(|value| format!("{value:.2}")).unwrap_or_default();
         for g in groups() {
-            let ours = format!("ours: {}, {} candidates", g.variant, g.candidates);
+            let ours = format!("ours: {}, {} candidates", g.named(), g.candidates);
             let mut row = |score: Option<Spread>, what: &str| {
                 let [mean, by_n, by_one_less] =
                     [score.map(|s| s.mean), score.and_then(|s| s.population_std), score.and_then(|s| s.std)];

@@ -1,4 +1,4 @@
-//! The embedded presets beside the paper's tables, written a second time.
+//! Tasks and algorithms' values for them beside the paper's tables, written a second time.
 
 use quad_dataset::environment;
 use toml::{Table, Value};
@@ -40,7 +40,7 @@ const TABLE_4: [Row; 15] = [
 ];
 
 #[test]
-fn each_row_of_tables_3_and_4_is_a_preset() {
+fn quad_has_the_values_of_tables_3_and_4_for_each_row() {
     for (name, environment, tau, threshold, eta, rho) in TABLE_4 {
         let row = preset(name);
         assert!(environment::find(environment).is_ok());
@@ -86,57 +86,95 @@ fn each_row_of_tables_3_and_4_is_a_preset() {
     }
 }
 
+/// Of IQL's paper and code: Rret and 0.7, 3 in locomotion; r - 1 and 0.9, 10 in mazes.
 #[test]
-fn every_file_of_the_folder_is_listed_and_can_be_printed_or_is_a_base() {
-    let list = printed(&["presets"]);
-    let (tasks, bases) = list.split_once("\n\nBases of these").unwrap();
-    let tasks: Vec<&str> = tasks.lines().skip(1).collect();
-    let folder = std::fs::read_dir(concat!(env!("CARGO_MANIFEST_DIR"), "/../presets")).unwrap();
-    let files = folder.map(|file| file.unwrap().path().file_stem().unwrap().to_str().unwrap().to_owned());
-    let mut tasks_of_the_folder = 0;
-    for name in files {
-        let is_task = tasks.iter().any(|line| line.starts_with(&format!("{name} ")));
-        tasks_of_the_folder += usize::from(is_task);
-        assert!(is_task || bases.contains(&name), "{name} is missing in\n{list}");
-        assert_eq!(learner(&["presets", &name]).status.success(), is_task, "{name}");
+fn iql_has_its_authors_values_for_each_row() {
+    for (name, environment, ..) in TABLE_4 {
+        let row: Table = printed(&["presets", name, "--algorithm", "iql"]).parse().unwrap();
+        let maze = name.starts_with("antmaze");
+        for (key, word) in [
+            ("environment", environment),
+            ("dataset", name),
+            ("reward", if maze { "subtract-1" } else { "locomotion" }),
+            ("algorithm", "iql"),
+        ] {
+            assert_eq!(value(&row, key), Some(word.into()), "{name}: {key}");
+        }
+        for (key, expected) in [
+            ("agent.expectile", if maze { 0.9 } else { 0.7 }),
+            ("agent.temperature", if maze { 10.0 } else { 3.0 }),
+            ("agent.actor_learning_rate", 3e-4),
+            ("agent.critic_learning_rate", 3e-4),
+            ("agent.value_learning_rate", 3e-4),
+            ("agent.ema_rate", 0.005),
+            ("agent.gamma", 0.99),
+            ("batch_size", 256.0),
+            ("steps", 1_000_000.0),
+            ("eval_interval", if maze { 100_000.0 } else { 5_000.0 }),
+            ("episodes", if maze { 100.0 } else { 10.0 }),
+        ] {
+            assert_eq!(number(&row, key), Some(expected), "{name}: {key}");
+        }
     }
-    assert_eq!((tasks_of_the_folder, tasks.len()), (22, 22));
+}
+
+#[test]
+fn tasks_and_algorithms_are_listed_with_what_their_authors_give() {
+    let list = printed(&["presets"]);
+    let (tasks, algorithms) = list.split_once("\n\n").unwrap();
+    let tasks: Vec<&str> = tasks.lines().skip(1).collect();
+    assert_eq!(tasks.len(), 21, "{list}");
     for row in [
-        "antmaze-large-play-v0 antmaze-large-v0 antmaze-large-play-v0 paper-antmaze-large: rho 1.1, tau 1.0",
-        "own-data own - data of your own: the paper's sizes, no evaluation",
+        "antmaze-large-play-v0 antmaze-large-v0 antmaze-large-play-v0",
+        "own-data own - data of your own, without evaluation",
     ] {
         let words = |line: &str| line.split_whitespace().map(str::to_owned).collect::<Vec<_>>();
         assert!(tasks.iter().any(|line| words(line) == words(row)), "{row} is missing in\n{list}");
     }
+    let folder = std::fs::read_dir(concat!(env!("CARGO_MANIFEST_DIR"), "/../presets")).unwrap();
+    let files = folder.map(|file| file.unwrap().path().file_stem().unwrap().to_str().unwrap().to_owned());
+    for name in files.filter(|name| name != "tasks") {
+        assert!(algorithms.lines().any(|line| line.starts_with(&format!("{name} "))), "{name} is missing in\n{list}");
+    }
+    assert!(algorithms.contains("*-v0, *-v2"), "{list}");
 }
 
 #[test]
 fn data_of_ones_own_is_not_evaluated_and_not_scaled() {
-    let own = preset("own-data");
-    assert_eq!((value(&own, "reward"), number(&own, "eval_interval")), (Some("as-is".into()), Some(0.0)));
+    for algorithm in ["quad", "iql"] {
+        let own: Table = printed(&["presets", "own-data", "--algorithm", algorithm]).parse().unwrap();
+        assert_eq!((value(&own, "reward"), number(&own, "eval_interval")), (Some("as-is".into()), Some(0.0)));
+    }
 }
 
 #[test]
-fn a_file_changes_its_base_and_takes_its_environments_reward_rule() {
+fn a_file_changes_its_task_and_takes_its_environments_reward_rule() {
     let folder = tempfile::tempdir().unwrap();
     let path = folder.path().join("mine.toml");
     let path = path.to_str().unwrap();
-    std::fs::write(path, "base = \"hopper-demo\"\nsteps = 7\n").unwrap();
+    let error = || String::from_utf8(learner(&["presets", path]).stderr).unwrap();
+    std::fs::write(path, "task = \"hopper-demo\"\nsteps = 7\n").unwrap();
     let mut expected = preset("hopper-demo");
     expected.insert("steps".into(), 7.into());
     assert_eq!(preset(path), expected);
 
-    std::fs::write(path, "base = \"paper\"\nenvironment = \"my-robot\"\nagent.rho = 1.0\nagent.tau = 1.0\n").unwrap();
-    let error = String::from_utf8(learner(&["presets", path]).stderr).unwrap();
-    assert!(error.contains("missing field") && error.contains("hint: "), "{error}");
-    let whole = std::fs::read_to_string(path).unwrap() + "agent.target_reduce = \"mean\"\nagent.eta.initial = 1.0\n";
+    std::fs::write(path, "task = \"hopper-demo\"\nalgorithm = \"iql\"\n").unwrap();
+    assert_eq!(number(&preset(path), "agent.expectile"), Some(0.7));
+    let quad: Table = printed(&["presets", path, "--algorithm", "quad"]).parse().unwrap();
+    assert_eq!(quad, preset("hopper-demo"), "the command line's algorithm counts");
+
     for (environment, rule) in [("my-robot", "as-is"), ("walker2d", "locomotion")] {
-        std::fs::write(path, whole.replace("my-robot", environment)).unwrap();
+        std::fs::write(path, format!("environment = \"{environment}\"\n")).unwrap();
         assert_eq!(value(&preset(path), "reward"), Some(rule.into()));
     }
-    for (base, words) in [("hoper-demo", "did you mean hopper-demo"), ("nowhere/x.toml", "nowhere/x.toml")] {
-        std::fs::write(path, format!("base = \"{base}\"\n")).unwrap();
-        let error = String::from_utf8(learner(&["presets", path]).stderr).unwrap();
-        assert!(error.contains(words), "{error}");
+    for (text, words) in [
+        ("steps = 1", "names neither a task nor an environment"),
+        ("task = \"hoper-demo\"", "did you mean hopper-demo"),
+        ("task = 3", "no task named 3"),
+        ("task = \"hopper-demo\"\nalgorithm = \"qad\"", "did you mean quad"),
+        ("base = \"hopper-demo\"", "names neither a task nor an environment"),
+    ] {
+        std::fs::write(path, text).unwrap();
+        assert!(error().contains(words) && error().contains("hint: "), "{}", error());
     }
 }

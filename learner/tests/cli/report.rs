@@ -70,10 +70,10 @@ fn small(seed: u64, shift: f64) -> Run {
     run
 }
 
-/// Four runs of one of the paper's presets, with a score of each evaluation up to `last`.
-fn paper(preset: &str, last: u64, score: impl Fn(u64) -> f64) -> Vec<Run> {
+/// Four runs of one of the paper's tasks, with a score of each evaluation up to `last`.
+fn paper(task: &str, last: u64, score: impl Fn(u64) -> f64) -> Vec<Run> {
     let run = |seed| {
-        let mut run = Run::new(preset, seed);
+        let mut run = Run::new(task, seed);
         for step in (20_000..=last).step_by(20_000) {
             (0..10).for_each(|episode| run.score(step, episode, score(step) + seed as f64, "00"));
         }
@@ -215,6 +215,32 @@ fn what_is_not_the_papers_protocol_is_called_so() {
     assert_eq!(departures(&mixed), ["scored in bf16 and f32, not in f32"]);
     mixed.iter_mut().flat_map(|run| &mut run.scores).for_each(|line| line["precision"] = json!("bf16-amx"));
     assert_eq!(departures(&mixed), ["scored in bf16, not in f32"]);
+}
+
+/// DAC and IQL have rows of their own in the paper's tables; behaviour cloning has none.
+#[test]
+fn another_algorithm_is_compared_with_its_own_authors_values() {
+    let guided = |guidance: &str| {
+        let runs = paper(HOPPER, 2_000_000, |_| 50.0);
+        Vec::from_iter(runs.into_iter().map(|run| run.set(&[("experiment.agent.guidance", guidance.into())])))
+    };
+    let reported = report(&guided("dac"));
+    assert_eq!(reported.group()["departures"], json!([]), "{}", reported.text);
+    reported.has_row(&["ours: dac (DAC-Rep, DAC)", " 51.50 "]);
+    let reported = report(&guided("none"));
+    assert_eq!(reported.group()["departures"], json!(["agent.guidance is \"none\", not \"quad\""]));
+
+    let mut iql = Run::by("iql", HOPPER, 0).set(&[("experiment.agent.expectile", 0.8.into())]);
+    (0..10).for_each(|episode| iql.score(5_000, episode, 50.0, "00"));
+    let reported = report(&[iql, paper(HOPPER, 100_000, |_| 50.0).remove(0)]);
+    let [iql, quad] = &reported.json["groups"].as_array().unwrap()[..] else { panic!("{}", reported.text) };
+    assert_eq!((&iql["methods"], &iql["departures"][0]), (&json!(["IQL"]), &json!("agent.expectile is 0.8, not 0.7")));
+    assert_eq!(
+        (&iql["differs"], &quad["differs"]),
+        (&json!([]), &json!([])),
+        "of other algorithms nothing is expected"
+    );
+    reported.has_row(&["ours: iql, 1 candidates"]);
 }
 
 #[test]

@@ -11,15 +11,21 @@ use crate::printed;
 /// A run whose files can be changed before they are written.
 #[derive(Clone)]
 pub struct Run {
-    /// The run's `config.toml`, as a learner of before there was a choice of the device wrote it.
+    /// The run's `config.toml`, as a learner wrote it that had presets in place of tasks, and no choice of the device.
     pub config: Table,
     /// The lines of its `scores.jsonl`.
     pub scores: Vec<Value>,
 }
 
 impl Run {
-    pub fn new(preset: &str, seed: u64) -> Self {
-        let mut experiment: Table = printed(&["presets", preset]).parse().unwrap();
+    /// By QUAD.
+    pub fn new(task: &str, seed: u64) -> Self {
+        Self::by("quad", task, seed)
+    }
+
+    /// By another algorithm.
+    pub fn by(algorithm: &str, task: &str, seed: u64) -> Self {
+        let mut experiment: Table = printed(&["presets", task, "--algorithm", algorithm]).parse().unwrap();
         experiment.insert("seed".into(), (seed as i64).into());
         let run = toml::toml! { name = "r" incarnation = 1 version = "0" };
         let dataset = toml::toml! {
@@ -35,7 +41,7 @@ impl Run {
         config.extend(
             [("run", run), ("dataset", dataset), ("experiment", experiment)].map(|(k, t)| (k.into(), t.into())),
         );
-        config["run"].as_table_mut().unwrap().insert("preset".into(), preset.into());
+        config["run"].as_table_mut().unwrap().insert("preset".into(), task.into());
         Self { config, scores: Vec::new() }
     }
 

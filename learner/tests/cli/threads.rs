@@ -21,8 +21,8 @@ fn the_threads_of_a_learner_are_those_of_the_table() {
     let (dataset, run) = (folder.path().join("tiny.hdf5"), folder.path().join("run"));
     write_dataset(&dataset);
     let mut learner = Command::new(env!("CARGO_BIN_EXE_learner"))
-        .args(["train", "--preset", "hopper-demo", "--steps", "100000000", "--eval-interval", "50000000"])
-        .args(["--set", "batch_size=4", "--set", "agent.hidden=8", "--listen", "tcp/127.0.0.1:0", "--dataset"])
+        .args(["train", "--task", "hopper-demo", "--steps", "100000000", "--eval-interval", "50000000"])
+        .args(["--set", "batch_size=4", "--agent", "hidden=8", "--listen", "tcp/127.0.0.1:0", "--dataset"])
         .args([&dataset, Path::new("--run-dir"), &run])
         .stderr(Stdio::null())
         .spawn()

@@ -4,7 +4,7 @@ use super::*;
 use clap::CommandFactory;
 
 pub(super) fn parse(arguments: &[&str]) -> Result<Cli, clap::Error> {
-    Cli::try_parse_from(["learner", "train", "--preset", "hopper-demo", "--dataset", "d.hdf5"].iter().chain(arguments))
+    Cli::try_parse_from(["learner", "train", "--task", "hopper-demo", "--dataset", "d.hdf5"].iter().chain(arguments))
 }
 
 #[test]
@@ -14,10 +14,12 @@ fn definition_is_consistent() {
 
 #[test]
 fn wrong_command_lines_exit_with_2() {
-    let wrong: [&[&str]; 10] = [
+    let wrong: [&[&str]; 12] = [
         &["--audit", "0.5"],
         &["--steps", "0"],
-        &["--candidates", "0"],
+        &["--agent", "tau"],
+        &["--algorithm", "td3"],
+        &["--preset", "hopper-demo"],
         &["--seed", "9223372036854775808"],
         &["--set", "agent.tau"],
         &["--listen", "127.0.0.1:7447"],
@@ -29,6 +31,11 @@ fn wrong_command_lines_exit_with_2() {
     for flags in wrong {
         assert_eq!(parse(flags).unwrap_err().exit_code(), 2, "{flags:?}");
     }
-    let unknown = Cli::try_parse_from(["learner", "train", "--preset", "walker", "--dataset", "d"]).unwrap_err();
-    assert!(unknown.to_string().contains("walker2d-demo"), "{unknown}");
+    for (flag, misspelt, meant) in
+        [("--task", "walker", "walker2d-demo"), ("--preset", "walker", "walker2d-demo"), ("--algorithm", "qad", "quad")]
+    {
+        let unknown = Cli::try_parse_from(["learner", "train", flag, misspelt, "--dataset", "d"]).unwrap_err();
+        assert!(unknown.to_string().contains(&format!("did you mean {meant}")), "{unknown}");
+    }
+    assert!(Cli::try_parse_from(["learner", "train"]).unwrap_err().to_string().contains("--task"));
 }

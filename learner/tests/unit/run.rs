@@ -13,7 +13,7 @@ pub(crate) fn config(name: &str, seed: u64) -> RunConfig {
         run: RunInfo {
             name: name.into(),
             started: 1,
-            preset: "hopper-demo".into(),
+            task: "hopper-demo".into(),
             version: "0.1.0".into(),
             device: Device::Cpu,
         },

@@ -32,7 +32,7 @@ fn a_dataset_that_cannot_be_trained_on() {
     for (dataset, flags, sentence, hint) in [
         (write("notes.hdf5", b"my notes"), &[][..], "notes.hdf5: neither an HDF5 file", "docs/data.md"),
         (write("half.hdf5", half), &[], "half.hdf5: cut short", "fetch or copy it again"),
-        (walker, &[], "recorded in `walker2d`, which is not `hopper`", "choose a preset for walker2d"),
+        (walker, &[], "recorded in `walker2d`, which is not `hopper`", "choose a task in walker2d"),
         (scratch.dataset(), &["--set", "batch_size=5000"], "fewer than a batch of 5000", "batch_size"),
     ] {
         let output = train(&scratch, &dataset, &run_dir, flags);

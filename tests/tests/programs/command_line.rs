@@ -24,9 +24,9 @@ fn a_wrong_command_line_exits_with_2() {
     for (program, arguments) in [
         ("learner", &[][..]),
         ("learner", &["train"]),
-        ("learner", &["train", "--preset", "hopper-demo", "--dataset", "x", "--samples", "0"]),
-        ("learner", &["train", "--preset", "hopper-demo", "--dataset", "x", "--set", "agent.tau"]),
-        ("learner", &["presets", "no-such-preset"]),
+        ("learner", &["train", "--task", "hopper-demo", "--dataset", "x", "--algorithm", "td3"]),
+        ("learner", &["train", "--task", "hopper-demo", "--dataset", "x", "--agent", "tau"]),
+        ("learner", &["presets", "no-such-task"]),
         ("evaluator", &[]),
         ("evaluator", &["serve", "--name", "not a name"]),
         ("evaluator", &["serve", "--metrics", "everywhere"]),
@@ -43,12 +43,13 @@ fn a_wrong_command_line_exits_with_2() {
 
 #[test]
 fn an_algorithm_that_lacks_a_hyper_parameter_says_what_it_has() {
-    for (preset, flags, words) in [
-        ("hopper-demo", ["--guidance", "sac"], ["sac", "`dac`"]),
-        ("hopper-demo-iql", ["--guidance", "dac"], ["guidance", "`learner presets NAME`"]),
-        ("hopper-demo-iql", ["--candidates", "10"], ["candidates", "must be 1"]),
+    for (algorithm, value, words) in [
+        ("quad", "guidance=sac", ["sac", "`dac`"]),
+        ("iql", "guidance=dac", ["guidance", "`learner presets TASK`"]),
+        ("iql", "candidates=10", ["candidates", "`expectile`"]),
     ] {
-        refused(&[&["--preset", preset, "--dataset", "x"][..], &flags].concat(), 1, &words);
+        let flags = ["--task", "hopper-demo", "--dataset", "x", "--algorithm", algorithm, "--agent", value];
+        refused(&flags, 1, &words);
     }
 }
 
@@ -56,11 +57,13 @@ fn an_algorithm_that_lacks_a_hyper_parameter_says_what_it_has() {
 fn a_wrong_name_is_answered_with_the_right_ones() {
     let folder = tempfile::tempdir().unwrap();
     let own = folder.path().join("own.toml");
-    std::fs::write(&own, "base = \"hopper-demo\"\nbatchsize = 3\n").unwrap();
+    std::fs::write(&own, "task = \"hopper-demo\"\nbatchsize = 3\n").unwrap();
     for (arguments, code, words) in [
-        (&["--preset", "walker2d-medium-reply-v2"][..], 2, &["walker2d-medium-replay-v2"][..]),
-        (&["--preset", "hopper-demo", "--set", "agent.tua=0.5"], 1, &["`tua`", "`tau`", "hint:"]),
-        (&["--preset", "hopper-demo", "--set", "tau=0.5"], 1, &["`tau`", "hint:", "agent.KEY"]),
+        (&["--task", "walker2d-medium-reply-v2"][..], 2, &["walker2d-medium-replay-v2"][..]),
+        (&["--preset", "hopper-demo-iql"], 2, &["did you mean hopper-demo"]),
+        (&["--task", "hopper-demo", "--algorithm", "quads"], 2, &["did you mean quad"]),
+        (&["--task", "hopper-demo", "--agent", "tua=0.5"], 1, &["`tua`", "`tau`", "hint:"]),
+        (&["--task", "hopper-demo", "--set", "tau=0.5"], 1, &["`tau`", "hint:", "--agent KEY=VALUE"]),
         (&["--preset", own.to_str().unwrap()], 1, &["`batchsize`", "`batch_size`", "hint:"]),
     ] {
         refused(&[&["--dataset", "x"], arguments].concat(), code, words);
@@ -69,9 +72,8 @@ fn a_wrong_name_is_answered_with_the_right_ones() {
 
 #[test]
 fn what_is_missing_is_said() {
-    refused(&["--preset", "paper"], 1, &["hint:", "paper names no environment", "`learner presets`"]);
-    refused(&["--preset", "hopper-demo"], 1, &["hint:", "hopper-demo names no dataset", "--dataset FILE"]);
-    let missing = ["--preset", "hopper-demo", "--dataset", "/tmp/missing.hdf5", "--run-dir", "/tmp/missing-run"];
+    refused(&["--task", "hopper-demo"], 1, &["hint:", "hopper-demo names no dataset", "--dataset FILE"]);
+    let missing = ["--task", "hopper-demo", "--dataset", "/tmp/missing.hdf5", "--run-dir", "/tmp/missing-run"];
     refused(&missing, 1, &["hint:", "/tmp/missing.hdf5"]);
 }
 

@@ -82,8 +82,7 @@ fn the_list_says_what_there_is_and_what_is_here() {
 fn what_makes_no_sense_is_refused_before_anything_is_fetched() {
     let folder = tempfile::tempdir().unwrap();
     let server = FileServer::start("", Vec::new());
-    let train =
-        |preset, dataset| learner(folder.path(), &server.url, &["train", "--preset", preset, "--dataset", dataset]);
+    let train = |task, dataset| learner(folder.path(), &server.url, &["train", "--task", task, "--dataset", dataset]);
     let fetch = |cache: &Path, dataset| learner(cache, &server.url, &["datasets", "fetch", dataset]);
     for (output, words) in [
         (train("hopper-demo", "hopper-medium-reply-v2"), "hopper-medium-replay-v2"),

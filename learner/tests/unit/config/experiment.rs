@@ -4,7 +4,7 @@ use super::*;
 use toml::toml;
 
 #[test]
-fn changes_override_the_preset() {
+fn changes_override_the_values_of_the_task() {
     let preset = resolve("hopper-demo", &Table::new()).unwrap();
     let resolved = resolve("hopper-demo", &toml! { steps = 5 agent.guidance = "none" agent.tau = 1 }).unwrap();
     assert_eq!((resolved.steps, resolved.eval_interval), (5, preset.eval_interval));
@@ -19,10 +19,11 @@ fn what_cannot_be_used_is_named_with_what_can() {
         ("hopper-demo", toml! { agent.eta.treshold = 1.0 }, "`threshold`"),
         ("hopper-demo", toml! { agent.guidance = "sac" }, "`quad`, `dac`, `none`"),
         ("hopper-demo", toml! { agent.samples = 0 }, "samples is 0"),
-        ("hopper-demo", toml! { algorithm = "td3" }, "there are quad, iql"),
+        ("hopper-demo", toml! { algorithm = "td3" }, "no algorithm named td3"),
         ("hopper-demo", toml! { episodes = 0 }, "episodes is 0, but must be from 1 to 10000"),
-        ("hopper-demo-iql", toml! { candidates = 2 }, "must be 1"),
-        ("paper", toml! { environment = "hopper" }, "missing field"),
+        ("hopper-demo", toml! { algorithm = "iql" candidates = 2 }, "must be 1"),
+        ("hopper-demo", toml! { algorithm = "iql" agent.tau = 2 }, "unknown field `tau`"),
+        ("hoper-demo", toml! { steps = 1 }, "no task named hoper-demo"),
     ] {
         let error = format!("{:#}", resolve(preset, &changes).unwrap_err());
         assert!(error.contains(words), "{error}");

@@ -1,7 +1,7 @@
 //! Tests of `data/source.rs`.
 
 use super::*;
-use crate::config::{presets, resolve};
+use crate::config::{resolve, tasks};
 
 #[test]
 fn a_word_is_a_name_a_path_or_neither() {
@@ -16,8 +16,8 @@ fn a_word_is_a_name_a_path_or_neither() {
 }
 
 #[test]
-fn the_presets_datasets_are_known_and_of_their_environments() {
-    let resolved = presets::names().filter_map(|name| resolve(name, &toml::Table::new()).ok());
+fn the_tasks_datasets_are_known_and_of_their_environments() {
+    let resolved = tasks::all().iter().map(|task| resolve(&task.name, &toml::Table::new()).unwrap());
     let named: Vec<_> = resolved.filter(|experiment| experiment.dataset.is_some()).collect();
     assert_eq!(named.len(), 15, "the rows of the paper's table");
     for experiment in named {

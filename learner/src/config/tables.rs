@@ -1,0 +1,51 @@
+//! What TOML tables are to presets and settings: laid over one another, flattened, and written on a command line.
+
+use toml::{Table, Value};
+
+/// Lays `changes` over `table`: tables key by key, anything else in place of what was there. An integer that takes a
+/// number's place becomes one, so that 1 and 1.0 are the same setting.
+pub fn merge(table: &mut Table, changes: Table) {
+    for (key, change) in changes {
+        match (table.get_mut(&key), change) {
+            (Some(Value::Table(below)), Value::Table(change)) => merge(below, change),
+            (Some(Value::Float(below)), Value::Integer(change)) => *below = change as f64,
+            (_, change) => drop(table.insert(key, change)),
+        }
+    }
+}
+
+/// Reads `agent.tau=0.5`: a dotted key and a value in TOML's notation, where a word needs no quotes.
+///
+/// # Errors
+/// A sentence for the user who typed it.
+pub fn parse_assignment(text: &str) -> Result<Table, String> {
+    let (key, value) = text.split_once('=').ok_or("write KEY=VALUE, for example agent.tau=0.5")?;
+    let quoted = || format!("{key} = {}", Value::String(value.trim().to_owned()));
+    text.parse().or_else(|_| quoted().parse()).map_err(|_| format!("{key:?} is no key like agent.tau"))
+}
+
+/// Reads `tau=0.5`, an assignment in the table of an algorithm's hyper-parameters.
+///
+/// # Errors
+/// As [`parse_assignment`].
+pub fn parse_agent_assignment(text: &str) -> Result<Table, String> {
+    parse_assignment(&format!("agent.{text}"))
+}
+
+/// The values of a table and of the tables in it, with dotted keys.
+pub fn keys(table: &Table) -> Vec<(String, &Value)> {
+    let mut all = Vec::new();
+    for (key, value) in table {
+        match value {
+            Value::Table(inner) => {
+                all.extend(keys(inner).into_iter().map(|(rest, value)| (format!("{key}.{rest}"), value)));
+            }
+            value => all.push((key.clone(), value)),
+        }
+    }
+    all
+}
+
+#[cfg(test)]
+#[path = "../../tests/unit/config/tables.rs"]
+mod tests;
