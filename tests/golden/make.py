@@ -15,8 +15,11 @@ from pathlib import Path
 import numpy as np
 from safetensors.numpy import load_file, save_file
 
+import align_iql
+import dql
 import iql
 import ivr
+import onestep
 import quad
 import xql
 
@@ -35,8 +38,14 @@ FOLDERS = {
     "eql": (15, "eql", "small"),
     "xql": (16, "xql", "small"),
     "xql-extras": (17, "xql-extras", "small"),
+    "dql": (18, "dql", "small"),
+    "dql-max-backup": (19, "dql-max-backup", "small"),
+    "align-iql": (20, "align-iql", "small"),
+    "onestep-behavior": (21, "onestep-behavior", "small"),
+    "onestep-critic": (22, "onestep-critic", "small"),
+    "onestep-policy": (23, "onestep-policy", "small"),
 }
-ALGORITHMS = {variant: algorithm for algorithm in (quad, iql, ivr, xql) for variant in algorithm.VARIANTS}
+ALGORITHMS = {variant: algorithm for algorithm in (quad, iql, ivr, xql, dql, align_iql, onestep) for variant in algorithm.VARIANTS}
 
 
 def flatten(tree):
