@@ -7,16 +7,18 @@ use candle_core::{Result, Tensor};
 use criterion::measurement::WallTime;
 use criterion::{BenchmarkGroup, Criterion, criterion_group, criterion_main};
 use gemm::{Parallelism, gemm};
-use quad_dataset::Batch;
-use quad_kernels::activation::{mish_in_place, mish_slope};
-use quad_learner::algorithms::Setting;
-use quad_learner::algorithms::optimiser::{Adam, AdamStep, follow};
+use quad_dataset::{Arrays, Transitions};
+use quad_kernels::activation::{Activation, activate, activate_with_slope};
+use quad_learner::algorithms::Context;
 use quad_learner::config::{Device, Experiment, resolve};
 use quad_learner::train::agent::Agent;
-use quad_policy::{DiffusionShape, Ensemble, Layout, NoisePredictor, Precision, Weights};
+use quad_policy::{
+    Adam, AdamStep, DiffusionShape, Ensemble, Gradients, Layout, NoisePredictor, Precision, Reverse, Weights,
+};
 use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 use rayon::prelude::*;
+use std::sync::Arc;
 use std::time::Duration;
 
 /// Hopper's observation and action.
@@ -38,10 +40,9 @@ fn experiment([task, algorithm]: [&str; 2], samples: Option<u32>) -> Experiment 
     experiment
 }
 
-fn setting(experiment: &Experiment, precision: Precision, device: Device) -> Setting {
-    Setting {
-        observation_dim: DIMS.0,
-        action_dim: DIMS.1,
+fn context(experiment: &Experiment, precision: Precision, device: Device) -> Context {
+    Context {
+        transitions: Arc::new(transitions(experiment.batch_size as usize)),
         batch_size: experiment.batch_size as usize,
         total_steps: 1_000_000,
         seed: 0,
@@ -60,15 +61,18 @@ fn tensor(shape: &[usize]) -> Tensor {
     Tensor::from_vec(numbers, shape, &candle_core::Device::Cpu).expect("a tensor")
 }
 
-fn batch(size: usize) -> Batch {
-    Batch {
-        observations: numbers(size * DIMS.0),
-        actions: numbers(size * DIMS.1),
-        rewards: numbers(size),
-        next_observations: numbers(size * DIMS.0),
-        masks: vec![1.0; size],
-        size,
-    }
+fn transitions(count: usize) -> Transitions {
+    let arrays = Arrays {
+        observation_dim: DIMS.0,
+        action_dim: DIMS.1,
+        observations: numbers(count * DIMS.0),
+        actions: numbers(count * DIMS.1),
+        rewards: numbers(count),
+        next_observations: numbers(count * DIMS.0),
+        terminals: vec![false; count],
+        timeouts: vec![true; count],
+    };
+    Transitions::of(arrays).expect("numbers that can be learnt from")
 }
 
 fn updates(criterion: &mut Criterion) {
@@ -83,14 +87,11 @@ fn updates(criterion: &mut Criterion) {
         group.sample_size(20);
         for (name, which, samples) in CONFIGURATIONS {
             let experiment = experiment(which, samples);
-            let setting = setting(&experiment, precision, device);
-            let algorithm = experiment.hyperparameters().and_then(|read| {
-                let started = read.start(&setting).expect("a usable configuration and device");
-                Ok(Agent::new(experiment.definition()?, started, setting.device.clone()))
-            });
-            let mut agent = algorithm.expect("a resolved experiment");
-            let batch = batch(setting.batch_size);
-            group.bench_function(name, |bencher| bencher.iter(|| agent.update(&batch).expect("a step")));
+            let context = context(&experiment, precision, device);
+            let items: Vec<u32> = (0..experiment.batch_size).collect();
+            let definition = experiment.definition().expect("a resolved experiment");
+            let mut agent = Agent::new(definition, &experiment.agent, context).expect("a usable configuration and device");
+            group.bench_function(name, |bencher| bencher.iter(|| agent.update(&items).expect("a step")));
         }
         group.finish();
     }
@@ -116,15 +117,19 @@ fn peaks(criterion: &mut Criterion) {
         }
     };
     group.bench_function("product", |bencher| bencher.iter(|| tiles.par_iter_mut().for_each(product)));
+    let zero = vec![0.0; width];
     let mish = |(x, _, out): &mut (Vec<f32>, Vec<f32>, Vec<f32>)| {
         for _ in 0..REPEAT {
             out.copy_from_slice(x);
-            mish_in_place(out);
+            activate(Activation::Mish, out, &zero);
         }
     };
     group.bench_function("mish", |bencher| bencher.iter(|| tiles.par_iter_mut().for_each(mish)));
     let slope = |(x, w, out): &mut (Vec<f32>, Vec<f32>, Vec<f32>)| {
-        (0..REPEAT).for_each(|_| mish_slope(x, out, &mut w[..rows * width]));
+        for _ in 0..REPEAT {
+            out.copy_from_slice(x);
+            activate_with_slope(Activation::Mish, out, &zero, &mut w[..rows * width]);
+        }
     };
     group.bench_function("mish and slope", |bencher| bencher.iter(|| tiles.par_iter_mut().for_each(slope)));
     group.finish();
@@ -150,8 +155,17 @@ fn parts_of(group: &mut BenchmarkGroup<'_, WallTime>, experiment: &Experiment, s
     let count = |name: &str| experiment.agent[name].as_integer().expect("a whole number") as usize;
     let (b, k, steps) = (experiment.batch_size as usize, count("critics"), count("diffusion_steps"));
     let (observation_dim, action_dim) = DIMS;
-    let shape =
-        DiffusionShape { observation_dim, action_dim, hidden: count("hidden"), critics: k, diffusion_steps: steps };
+    let layers = |name: &str| experiment.agent[name].clone().try_into().expect("hidden layers");
+    let shape = DiffusionShape {
+        observation_dim,
+        action_dim,
+        actor: layers("actor"),
+        critic: layers("critic"),
+        value: None,
+        critics: k,
+        diffusion_steps: steps,
+        reverse: Reverse::ClipClean,
+    };
     let weights = |layout: Layout| {
         let values = Weights::initial(&layout, &mut ChaCha8Rng::seed_from_u64(0), &candle_core::Device::Cpu)?;
         Weights::trainable(layout, &values)
@@ -168,30 +182,34 @@ fn parts_of(group: &mut BenchmarkGroup<'_, WallTime>, experiment: &Experiment, s
     bench(group, "sampled next actions", || target_actor.sample(&observations, &noise));
     let next = target_actor.sample(&observations, &noise)?;
     bench(group, "target critics", || target_critics.values(&observations, &next));
-    let regress = |critics: &Ensemble| critics.squared_error(&observations, &actions, &targets)?.backward();
-    // The gradient is asked for as the optimiser does, which also readies its memory for the next pass.
-    bench(group, "critic step", || critics.weights().gradient(&regress(&critics)?));
+    let regress = |critics: &Ensemble| {
+        Gradients::of(&critics.squared_error(&observations, &actions, &targets)?)?.with_respect_to(critics.weights())
+    };
+    bench(group, "critic step", || regress(&critics));
     let step = AdamStep { rate: 1e-9, clip: Some(1.0), count: 1 };
-    let gradient = critics.weights().gradient(&regress(&critics)?)?.copy()?;
+    let gradient = regress(&critics)?.copy()?;
     bench(group, "critic optimiser", || critic_adam.descend(critics.weights_mut(), &gradient, step));
-    bench(group, "critic EMA", || follow(target_critics.weights_mut(), critics.weights(), 0.005));
+    bench(group, "critic EMA", || target_critics.weights_mut().follow(critics.weights(), 0.005));
     bench(group, "Q-gradients' scale", || target_critics.values(&observations, &actions));
     bench(group, "Q-gradients", || target_critics.action_gradients(&observations, &actions));
     let t = Tensor::from_iter((0..b).map(|i| (i % steps + 1) as u32), observations.device())?;
-    let clone = |actor: &NoisePredictor| actor.predict(&observations, &actions, &t)?.sqr()?.mean_all()?.backward();
+    let clone = |actor: &NoisePredictor| {
+        let loss = actor.predict(&observations, &actions, &t)?.sqr()?.mean_all()?;
+        Gradients::of(&loss)?.with_respect_to(actor.weights())
+    };
     let threshold = experiment.agent["eta"].get("threshold").is_some();
     bench(group, "actor step", || {
-        let gradient = actor.weights().gradient(&clone(&actor)?)?;
+        let gradient = clone(&actor)?;
         // Again for η, with the new weights.
         if threshold {
-            actor.frozen().predict(&observations, &actions, &t)?;
+            actor.detach().predict(&observations, &actions, &t)?;
         }
         Ok(gradient)
     });
-    let gradient = actor.weights().gradient(&clone(&actor)?)?.copy()?;
+    let gradient = clone(&actor)?.copy()?;
     bench(group, "actor optimiser and EMA", || {
         actor_adam.descend(actor.weights_mut(), &gradient, step)?;
-        follow(target_actor.weights_mut(), actor.weights(), 0.005)
+        target_actor.weights_mut().follow(actor.weights(), 0.005)
     });
     Ok(())
 }

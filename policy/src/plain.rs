@@ -21,7 +21,8 @@ fn mish(x: &Tensor) -> Result<Tensor> {
 fn activate(f: Activation, x: &Tensor) -> Result<Tensor> {
     match f {
         Activation::Mish => mish(x),
-        Activation::Relu => x.relu(),
+        // A maximum would drop a NaN; zero times x lets none get lost.
+        Activation::Relu => x.relu()? + (x * 0.0)?,
         Activation::Silu => x.silu(),
         Activation::Tanh => x.tanh(),
     }

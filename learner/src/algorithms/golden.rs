@@ -3,9 +3,13 @@
 #[path = "../../../tests/golden/golden.rs"]
 mod reader;
 
-use super::algorithm::{Metric, Minibatch, Setting};
+use std::sync::Arc;
+
+use super::algorithm::{Algorithm, Context, Definition, Metric, Minibatch};
+use super::parts::Parts;
 use candle_core::{Device, Tensor};
-use quad_policy::{Precision, Tensors};
+use quad_dataset::{Arrays, Transitions};
+use quad_policy::{Header, Precision, Tensors, load_policy};
 pub(super) use reader::{Golden, fresh, goldens, make};
 
 /// Where updates are tested: on the CPU, and on a GPU with the feature `cuda`. Without a GPU that share is skipped,
@@ -38,11 +42,30 @@ pub(super) fn check_update(golden: &Golden, metrics: &[Metric], values: &[f32], 
     }
 }
 
-/// The setting of a golden folder.
-pub(super) fn golden_setting(golden: &Golden, device: &Device) -> Setting {
-    Setting {
+/// Loads the state of a golden folder, all of it.
+pub(super) fn load(golden: &Golden, parts: Parts<'_>) {
+    let mut state = golden.state.clone();
+    parts.load(&mut state).unwrap();
+    assert!(state.is_empty(), "tensors that are not read: {:?}", state.keys());
+}
+
+/// The context of a golden folder, whose transitions are those of its batch.
+pub(super) fn context(golden: &Golden, device: &Device) -> Context {
+    let numbers = |name: &str| golden.input(name, &Device::Cpu).flatten_all().unwrap().to_vec1::<f32>().unwrap();
+    let terminals: Vec<bool> = numbers("masks").iter().map(|mask| *mask == 0.0).collect();
+    let arrays = Arrays {
         observation_dim: golden.count("/observation_dim"),
         action_dim: golden.count("/action_dim"),
+        observations: numbers("observations"),
+        actions: numbers("actions"),
+        rewards: numbers("rewards"),
+        next_observations: numbers("next_observations"),
+        // None leads to the next: they are rows at random.
+        timeouts: vec![true; terminals.len()],
+        terminals,
+    };
+    Context {
+        transitions: Arc::new(Transitions::of(arrays).unwrap()),
         batch_size: golden.count("/batch_size"),
         total_steps: golden.count("/total_steps") as u64,
         seed: 0,
@@ -52,18 +75,40 @@ pub(super) fn golden_setting(golden: &Golden, device: &Device) -> Setting {
 }
 
 /// The hyper-parameters of a golden folder.
-pub(super) fn golden_table(golden: &Golden) -> toml::Table {
+pub(super) fn table(golden: &Golden) -> toml::Table {
     toml::Table::try_from(&golden.config["agent"]).unwrap()
 }
 
 /// The batch of a golden folder.
-pub(super) fn golden_batch(golden: &Golden, device: &Device) -> Minibatch {
-    let input = |name: &str| golden.input(name, device);
-    Minibatch {
-        observations: input("observations"),
-        actions: input("actions"),
-        rewards: input("rewards"),
-        next_observations: input("next_observations"),
-        masks: input("masks"),
+pub(super) fn batch(golden: &Golden, context: &Context) -> Minibatch {
+    context.batch(&items(golden)).unwrap()
+}
+
+/// The numbers of its items.
+pub(super) fn items(golden: &Golden) -> Vec<u32> {
+    (0..golden.count("/batch_size") as u32).collect()
+}
+
+/// Tests an update without random numbers of an algorithm against its golden folders.
+pub(super) fn check_definition(definition: &Definition, goldens: Vec<Golden>) {
+    for (golden, device) in goldens.iter().flat_map(|golden| devices().into_iter().map(move |device| (golden, device))) {
+        let mut algorithm = (definition.start)(&table(golden), context(golden, &device)).unwrap();
+        load(golden, algorithm.parts());
+        check_actions(golden, &*algorithm);
+        let values = algorithm.update(golden.count("/step") as u64, &items(golden)).unwrap();
+        check_update(golden, definition.metrics, &values, algorithm.parts().save().unwrap());
     }
+}
+
+/// Checks that a policy that draws nothing acts as a golden folder expects.
+pub(super) fn check_actions(golden: &Golden, algorithm: &dyn Algorithm) {
+    let (policy, tensors) = algorithm.policy().unwrap();
+    let file = Header { policy, origin: () }.to_safetensors(&tensors).unwrap();
+    let policy = load_policy(&file, Precision::F32).unwrap();
+    let observations = golden.input("select_observations", &Device::Cpu);
+    let mut states: Vec<_> = (0..observations.dim(0).unwrap() as u64).map(|seed| policy.begin(seed)).collect();
+    let observations: Vec<f32> = observations.flatten_all().unwrap().to_vec1().unwrap();
+    let mut actions = vec![0.0; states.len() * policy.action_dim()];
+    policy.act(&observations, &mut states, &mut actions).unwrap();
+    golden.close("select.actions", &Tensor::new(actions, &Device::Cpu).unwrap());
 }

@@ -66,6 +66,24 @@ impl<'a> Parts<'a> {
         Ok(tensors)
     }
 
+    /// The names of all networks.
+    #[cfg(test)]
+    pub fn networks(self) -> Vec<&'static str> {
+        let is_network = |part: &Part<'_>| matches!(part, Part::Weights(_));
+        self.0.into_iter().filter(|(_, part)| is_network(part)).map(|(name, _)| name).collect()
+    }
+
+    /// Makes the weights of a network NaN.
+    #[cfg(test)]
+    #[allow(clippy::unwrap_used)]
+    pub fn spoil(self, name: &str) {
+        for (of, part) in self.0 {
+            if let (true, Part::Weights(weights)) = (of == name, part) {
+                weights.change(|values| values.slice_set(&(values * f64::NAN)?, 0, 0)).unwrap();
+            }
+        }
+    }
+
     /// Takes each part's tensors out of `tensors`.
     ///
     /// # Errors
@@ -136,11 +154,6 @@ impl<N: Network> Trained<N> {
         self.adam.step(self.network.weights_mut(), gradients, step)
     }
 
-    /// An optimiser that begins anew.
-    pub fn restart(&mut self) -> Result<()> {
-        self.adam = Adam::new(self.network.weights())?;
-        Ok(())
-    }
 }
 
 /// The trainable weights that network number `network` of a run begins with.

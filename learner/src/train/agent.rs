@@ -1,6 +1,8 @@
 //! An algorithm at work in a run: counts its updates, hands over its policy, and saves and loads its whole state.
 
 use super::pool::run_awake;
+#[cfg(test)]
+use crate::algorithms::Parts;
 use crate::algorithms::{Algorithm, AlgorithmError, Context, Definition, Metric};
 use candle_core::Device;
 use quad_policy::{Header, PolicyError, check_finite, read_tensors};
@@ -56,6 +58,12 @@ impl Agent {
     pub fn new(definition: Definition, table: &toml::Table, context: Context) -> Result<Self, AlgorithmError> {
         let device = context.device.clone();
         Ok(Self { definition, algorithm: (definition.start)(table, context)?, device, step: 0 })
+    }
+
+    /// The algorithm's state.
+    #[cfg(test)]
+    pub(crate) fn parts(&mut self) -> Parts<'_> {
+        self.algorithm.parts()
     }
 
     /// How many items updates draw from.

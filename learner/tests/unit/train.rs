@@ -15,7 +15,7 @@ use super::outbox::{Outbox, Work};
 use super::results::{self, Outcome};
 use super::steps::{Outlets, Plan, TrainError, train};
 use super::{Registrar, Training, TrainingMetrics};
-use crate::algorithms::{Setting, named};
+use crate::algorithms::{Context, named};
 use crate::config::{Schedule, resolve};
 use crate::run::Checkpoint;
 
@@ -61,7 +61,11 @@ fn transitions() -> Transitions {
 fn small(algorithm: &str) -> toml::Table {
     let asked = toml::Table::from_iter([("algorithm".to_owned(), algorithm.into())]);
     let mut table = resolve("hopper-demo", &asked).unwrap().agent;
-    table.insert("hidden".to_owned(), 8.into());
+    for name in ["actor", "critic", "value"] {
+        if let Some(layers) = table.get_mut(name) {
+            layers["hidden"] = vec![8, 8].into();
+        }
+    }
     table
 }
 
@@ -87,10 +91,8 @@ fn run_of(
     table: &toml::Table,
     stop: bool,
 ) -> Result {
-    let transitions = transitions();
-    let setting = Setting {
-        observation_dim: 11,
-        action_dim: 3,
+    let context = Context {
+        transitions: Arc::new(transitions()),
         batch_size: 4,
         total_steps,
         seed: 0,
@@ -98,12 +100,11 @@ fn run_of(
         device: Device::Cpu,
     };
     let definition = named(algorithm).unwrap();
-    let start = (definition.read)(table).unwrap().start(&setting).unwrap();
-    let mut agent = Agent::new(definition, start, Device::Cpu);
+    let mut agent = Agent::new(definition, table, context).unwrap();
     if let Some(checkpoint) = from {
         agent.load(&checkpoint.state).unwrap();
     }
-    let mut sampler = BatchSampler::new(transitions.len(), setting.batch_size, 0, agent.step());
+    let mut sampler = BatchSampler::new(agent.items(), 4, 0, agent.step());
     let make = Registrar { registry: prometheus::Registry::new() };
     let metrics = TrainingMetrics::new(&make, plan.schedule.steps, definition.metrics).unwrap();
     let outbox = Outbox::default();
@@ -111,7 +112,7 @@ fn run_of(
     let (stop, beat) = (&AtomicBool::new(stop), &beat());
     let outlets = Outlets { metrics: &metrics, outbox: &outbox, origin: &origin, stop, beat };
     // Nothing takes what it hands over, as with a disk that hangs: training must end all the same.
-    let outcome = train(&mut agent, &transitions, &mut sampler, plan, &outlets);
+    let outcome = train(&mut agent, &mut sampler, plan, &outlets);
     let mut result = Result { outcome, snapshots: Vec::new(), checkpoint: None, rows: Vec::new(), metrics };
     outbox.close();
     while let Some(work) = outbox.next(beat) {
@@ -217,7 +218,11 @@ fn divergence_is_an_error_that_says_where_and_what() {
 #[test]
 fn a_policy_that_is_too_large_to_send_is_refused_at_the_start() {
     // Two networks with two layers of 2048 × 2048 numbers each: 64 MiB, and a little more.
-    let large = toml::toml! { steps = 1 batch_size = 1 agent = { hidden = 2048, critics = 1, samples = 1 } };
+    let large = toml::toml! {
+        steps = 1
+        batch_size = 1
+        agent = { actor.hidden = [2048, 2048, 2048], critic.hidden = [2048, 2048, 2048], critics = 1, samples = 1 }
+    };
     for (eval_interval, refused) in [(1, true), (0, false)] {
         let mut experiment = resolve("hopper-demo", &large).unwrap();
         experiment.eval_interval = eval_interval;
@@ -226,7 +231,7 @@ fn a_policy_that_is_too_large_to_send_is_refused_at_the_start() {
         let training = Training {
             experiment,
             device: crate::config::Device::Cpu,
-            transitions: transitions(),
+            transitions: Arc::new(transitions()),
             checkpoint: None,
             checkpoint_every: Duration::ZERO,
             seconds_before: 0.0,

@@ -1,20 +1,15 @@
 //! Tests: the update against an independent implementation (docs/golden.md).
 
 use super::*;
-use crate::algorithms::golden::{
-    Golden, check_update, devices, fresh, golden_batch, golden_setting, golden_table, goldens,
-};
+use crate::algorithms::golden::{Golden, batch, check_update, context, devices, fresh, goldens, load, table};
+use crate::algorithms::hyperparameters::{NotNegative, Positive};
+use candle_core::Device;
 
 fn start(golden: &Golden, device: &Device) -> Quad {
-    let config: Config = config::read(&golden_table(golden)).unwrap();
-    let mut quad = Quad::new(config, golden_setting(golden, device)).unwrap();
-    let mut state = golden.state.clone();
+    let mut quad = Quad::new(read(&table(golden)).unwrap(), context(golden, device)).unwrap();
+    load(golden, quad.parts());
     // Below 0: not set yet.
-    if state["nu_squared"].to_vec1::<f32>().unwrap()[0] < 0.0 {
-        state.remove("nu_squared");
-    }
-    quad.load(&mut state).unwrap();
-    assert!(state.is_empty(), "tensors that are not read: {:?}", state.keys());
+    quad.nu_squared = quad.nu_squared.filter(|nu_squared| nu_squared.to_scalar::<f32>().unwrap() >= 0.0);
     quad
 }
 
@@ -31,10 +26,10 @@ fn noise(golden: &Golden, device: &Device) -> Noise {
 
 fn check(golden: &Golden, device: &Device) {
     let mut quad = start(golden, device);
-    let (batch, noise) = (golden_batch(golden, device), noise(golden, device));
+    let (batch, noise) = (batch(golden, &quad.context), noise(golden, device));
     let eta: f32 = quad.eta.to_scalar().unwrap();
     let values = quad.step(golden.count("/step") as u64, &batch, &noise).unwrap();
-    check_update(golden, METRICS, &values, quad.state().unwrap());
+    check_update(golden, METRICS, &values, quad.parts().save().unwrap());
     let value = |name: &str| values[METRICS.iter().position(|metric| metric.name == name).unwrap()];
     let guidance_loss = value("actor_loss") - eta * value("bc_loss");
     // A difference of two larger numbers, so relative to these.
@@ -71,10 +66,16 @@ fn eta_moves_by_at_most_its_rate_and_stays_within_its_bounds() {
     let golden = goldens("quad").into_iter().find(|golden| golden.config["agent"]["guidance"] == "quad").unwrap();
     // ε ten times as large makes a BC loss near 100, which is far above or far below the threshold.
     let moved = |threshold: f32, minimum: f32, maximum: f32| {
-        let (batch, mut noise) = (golden_batch(&golden, &Device::Cpu), noise(&golden, &Device::Cpu));
+        let (batch, mut noise) = (batch(&golden, &context(&golden, &Device::Cpu)), noise(&golden, &Device::Cpu));
         noise.epsilon = (noise.epsilon * 10.0).unwrap();
         let mut quad = start(&golden, &Device::Cpu);
-        quad.config.eta = Eta { initial: 1.0, threshold: Some(threshold), rate: 0.25, minimum, maximum };
+        quad.config.eta = Eta {
+            initial: NotNegative(1.0),
+            threshold: Some(Positive(threshold)),
+            rate: NotNegative(0.25),
+            minimum: NotNegative(minimum),
+            maximum: NotNegative(maximum),
+        };
         quad.eta = Tensor::new(1f32, &Device::Cpu).unwrap();
         quad.step(0, &batch, &noise).unwrap();
         quad.eta.to_scalar::<f32>().unwrap()
@@ -102,9 +103,9 @@ fn the_noise_of_a_step_is_repeatable_and_no_other_steps() {
 fn every_denoising_step_is_drawn_equally_often() {
     let golden = goldens("quad").remove(0);
     let quad = start(&golden, &Device::Cpu);
-    let mut counts = vec![0; quad.config.diffusion_steps];
+    let mut counts = vec![0; *quad.config.diffusion_steps];
     (0..1000).for_each(|step| quad.noise(step).unwrap().t.iter().for_each(|t| counts[*t as usize - 1] += 1));
-    let expected = 1000 * quad.setting.batch_size / counts.len();
+    let expected = 1000 * quad.context.batch_size / counts.len();
     // Six standard deviations of a binomial count.
     let room = 6.0 * (expected as f64).sqrt();
     assert!(counts.iter().all(|count| (f64::from(*count) - expected as f64).abs() < room), "{counts:?}");
@@ -123,7 +124,7 @@ fn golden_parts() {
     for golden in goldens("quad") {
         let device = Device::Cpu;
         let mut quad = start(&golden, &device);
-        let (batch, noise) = (golden_batch(&golden, &device), noise(&golden, &device));
+        let (batch, noise) = (batch(&golden, &quad.context), noise(&golden, &device));
         let next = quad.target_actor.sample(&batch.next_observations, &noise.next).unwrap();
         golden.close("next_actions", &next);
         golden.close("targets", &quad.targets(&batch, &noise).unwrap());
@@ -132,20 +133,20 @@ fn golden_parts() {
         }
         // Guidance comes from the target critics as the update has just moved them.
         quad.target_critics.weights_mut().load(&mut golden.expected.clone(), "target_critic.").unwrap();
-        let (signal, deviation) = quad.actor.schedule().noising(&noise.t, quad.shape.action_dim, &device).unwrap();
+        let (signal, deviation) = quad.actor.network.schedule().noising(&noise.t, quad.shape.action_dim, &device).unwrap();
         let noisy = ((&batch.actions * signal).unwrap() + (&noise.epsilon * deviation).unwrap()).unwrap();
         golden.close("noisy_actions", &noisy);
         let gradients = quad.target_critics.action_gradients(&batch.observations, &noisy).unwrap();
         golden.close("critic_action_gradients", &gradients);
         let t = Tensor::new(noise.t.as_slice(), &device).unwrap();
-        let predicted = quad.actor.predict(&batch.observations, &noisy, &t).unwrap().detach();
-        let advice = quad.advice(&batch, &noisy, &predicted).unwrap();
+        let predicted = quad.actor.network.predict(&batch.observations, &noisy, &t).unwrap().detach();
+        let guide = quad.guide(&batch, &noisy, &predicted).unwrap();
         let mean = gradients.mean(0).unwrap().broadcast_div(&golden.expected["q_scale"]).unwrap();
         let difference =
-            (&advice.gradient - &mean).unwrap().abs().unwrap().max_all().unwrap().to_scalar::<f32>().unwrap();
+            (&guide.gradient - &mean).unwrap().abs().unwrap().max_all().unwrap().to_scalar::<f32>().unwrap();
         assert!(difference < 1e-4 * mean.abs().unwrap().max_all().unwrap().to_scalar::<f32>().unwrap());
-        golden.close("nu_squared", &advice.nu_squared);
-        golden.close("lambda", &advice.lambda);
+        golden.close("nu_squared", &guide.nu_squared);
+        golden.close("lambda", &guide.lambda);
     }
 }
 
@@ -154,8 +155,8 @@ fn an_infinite_temperature_is_dac() {
     let golden = goldens("quad").into_iter().find(|golden| golden.config["agent"]["guidance"] == "quad").unwrap();
     let [quad, dac] = [Guidance::Quad, Guidance::Dac].map(|guidance| {
         let mut quad = start(&golden, &Device::Cpu);
-        (quad.config.guidance, quad.config.tau, quad.config.delta) = (guidance, f32::INFINITY, 1e-30);
-        let (batch, noise) = (golden_batch(&golden, &Device::Cpu), noise(&golden, &Device::Cpu));
+        (quad.config.guidance, quad.config.tau, quad.config.delta) = (guidance, f32::INFINITY, Positive(1e-30));
+        let (batch, noise) = (batch(&golden, &context(&golden, &Device::Cpu)), noise(&golden, &Device::Cpu));
         quad.step(0, &batch, &noise).unwrap()
     });
     assert_eq!(quad, dac);
