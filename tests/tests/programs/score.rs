@@ -9,7 +9,7 @@ use quad_tests::learner::{Learner, Score};
 use quad_tests::process::binary;
 use quad_tests::setting::Setting;
 use quad_tests::system::Scratch;
-use serde_json::Value;
+use serde_json::{Value, json};
 
 const SETTING: Setting = Setting { steps: 40, eval_interval: 20, episodes: 7, candidates: 3, hidden: 16, seed: 5 };
 
@@ -27,7 +27,7 @@ fn score(threads: &str, snapshots: &[&Path], flags: &[&str]) -> Output {
     command.env("RAYON_NUM_THREADS", threads).arg("score").args(snapshots).args(flags).output().unwrap()
 }
 
-fn json(output: &Output) -> Vec<Value> {
+fn read(output: &Output) -> Vec<Value> {
     assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
     serde_json::from_slice(&output.stdout).unwrap()
 }
@@ -48,7 +48,7 @@ fn a_snapshot_gets_the_scores_that_its_run_has() {
         let steps = SETTING.evaluated_steps();
         let snapshots: Vec<_> = steps.iter().map(|&step| learner.snapshot(step)).collect();
         let snapshots: Vec<&Path> = snapshots.iter().map(AsRef::as_ref).collect();
-        let scored = json(&score("2", &snapshots, &["--precision", precision, "--json"]));
+        let scored = read(&score("2", &snapshots, &["--precision", precision, "--json"]));
         assert_eq!(scored.len(), steps.len());
         for ((scored, &step), snapshot) in scored.iter().zip(&steps).zip(snapshots) {
             let of_run: Vec<_> = learner.scores().into_iter().filter(|score| score.key().0 == step).collect();
@@ -57,6 +57,7 @@ fn a_snapshot_gets_the_scores_that_its_run_has() {
             same("weights", of_run[0].text("weights"));
             same("precision", of_run[0].text("precision"));
             assert_eq!(scored["step"], step);
+            assert_eq!(scored["choice"], json!({ "candidates": SETTING.candidates, "value": "mean", "rule": "best" }));
             let bits = |score: &Score, field| score.number(field).to_bits();
             let mut of_run: Vec<_> = of_run
                 .iter()
@@ -102,6 +103,18 @@ fn what_cannot_be_scored_is_said_in_a_sentence() {
         let told = text.contains(words) && text.contains(path.to_str().unwrap()) && text.contains("hint:");
         assert!(told && output.stdout.is_empty(), "{path:?}: {text}");
     }
-    let scored = json(&score("1", &[&moon], &["--env", "hopper", "--episodes", "2", "--json"]));
+    let scored = read(&score("1", &[&moon], &["--env", "hopper", "--episodes", "2", "--json"]));
     assert_eq!(episodes(&scored[0]).len(), 2);
+
+    let nearest = score("1", &[&whole], &["--rule", "nearest"]);
+    let text = String::from_utf8_lossy(&nearest.stderr);
+    assert!(text.contains("value function") && text.contains("hint: score it without"), "{text}");
+    let flags = ["--episodes", "2", "--candidates", "1,3", "--rule", "softmax:0.5", "--value", "min", "--json"];
+    let (softmax, best) =
+        (read(&score("1", &[&whole], &flags)), read(&score("1", &[&whole], &["--episodes", "2", "--json"])));
+    let rule = json!({ "softmax": { "temperature": 0.5 } });
+    let choice = |candidates: u32| json!({ "candidates": candidates, "value": "min", "rule": rule });
+    assert_eq!([&softmax[0]["choice"], &softmax[1]["choice"]], [&choice(1), &choice(3)]);
+    let all = [&softmax[0], &softmax[1], &best[0]].map(episodes);
+    assert!(all[0] != all[1] && all[1] != all[2], "each chooses in its own way: {all:?}");
 }
