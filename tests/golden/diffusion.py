@@ -1,25 +1,31 @@
-"""QUAD's noise predictor and its diffusion. Arrays over t have T + 1 entries, so that index t is step t; ᾱ_0 = 1."""
+"""The noise predictor, and QUAD's diffusion. Arrays over t have T + 1 entries, so that index t is step t; ᾱ_0 = 1."""
 
 import math
 
 import jax.numpy as jnp
 import numpy as np
 
-from networks import compiled, mlp
+from networks import compiled, mlp, random_network, shape
 
 TIME_FEATURES, TIME_EMBEDDING = 16, 32
 
 
-def predict_noise(actor, states, noisy_actions, t):
+def predict_noise(actor, states, noisy_actions, t, activation):
     """ε_θ(s, a^t, t), shapes [..., o], [..., a], [...]."""
     frequencies = jnp.exp(-jnp.arange(8) * math.log(10_000) / 7)
     angles = t[..., None] * frequencies
     features = jnp.concatenate([jnp.cos(angles), jnp.sin(angles)], -1)
-    time = mlp(actor, "time.", 2, features)
-    return mlp(actor, "trunk.", 4, jnp.concatenate([states, noisy_actions, time], -1))
+    time = mlp(actor, "time.", activation, features)
+    return mlp(actor, "trunk.", activation, jnp.concatenate([states, noisy_actions, time], -1))
 
 
 fast_noise = compiled(predict_noise)
+
+
+def random_predictor(rng, observation_dim, action_dim, trunk):
+    time = random_network(rng, TIME_FEATURES, shape([TIME_EMBEDDING]), TIME_EMBEDDING, prefix="time.")
+    inputs = observation_dim + action_dim + TIME_EMBEDDING
+    return time | random_network(rng, inputs, trunk, action_dim, prefix="trunk.")
 
 
 def schedule(steps):
@@ -28,10 +34,10 @@ def schedule(steps):
     return beta, np.cumprod(1 - beta)
 
 
-def denoise(actor, states, noisy_actions, t, steps):
+def denoise(actor, states, noisy_actions, t, steps, activation):
     """x0 and the mean of one reverse step at the whole number t, without its noise."""
     beta, alpha_bar = schedule(steps)
-    epsilon = fast_noise(actor, states, noisy_actions, np.full(states.shape[:-1], t))
+    epsilon = fast_noise(actor, states, noisy_actions, np.full(states.shape[:-1], t), activation)
     x0 = (noisy_actions - math.sqrt(1 - alpha_bar[t]) * epsilon) / math.sqrt(alpha_bar[t])
     x0 = np.clip(x0, -1, 1)
     of_x0 = math.sqrt(alpha_bar[t - 1]) * float(beta[t])
@@ -39,14 +45,19 @@ def denoise(actor, states, noisy_actions, t, steps):
     return x0, (of_x0 * x0 + of_noisy * noisy_actions) / float(1 - alpha_bar[t])
 
 
-def sample(actor, states, noise):
+def repeated(states, noise):
+    """States [n, o], once for each sample that noise [T, n, samples, a] makes."""
+    return np.broadcast_to(states[:, None], noise.shape[1:-1] + states.shape[-1:])
+
+
+def sample(actor, states, noise, activation):
     """Actions for states [n, o] with noise [T, n, samples, a]; also the states, once for each action."""
     steps = len(noise)
     beta, _ = schedule(steps)
-    states = np.broadcast_to(states[:, None], noise.shape[1:-1] + states.shape[-1:])
+    states = repeated(states, noise)
     actions = noise[0]
     for t in range(steps, 0, -1):
-        _, actions = denoise(actor, states, actions, t, steps)
+        _, actions = denoise(actor, states, actions, t, steps, activation)
         if t > 1:
             actions = actions + math.sqrt(beta[t]) * noise[steps - t + 1]
     return actions, states

@@ -15,8 +15,13 @@ from pathlib import Path
 import numpy as np
 from safetensors.numpy import load_file, save_file
 
+import align_iql
+import dql
 import iql
+import ivr
+import onestep
 import quad
+import xql
 
 HERE = Path(__file__).parent
 
@@ -29,8 +34,18 @@ FOLDERS = {
     "one-sample": (5, "one-sample", "narrow"),
     "ten-critics": (6, "ten-critics", "narrow"),
     "iql": (13, "iql", "small"),
+    "sql": (14, "sql", "small"),
+    "eql": (15, "eql", "small"),
+    "xql": (16, "xql", "small"),
+    "xql-extras": (17, "xql-extras", "small"),
+    "dql": (18, "dql", "small"),
+    "dql-max-backup": (19, "dql-max-backup", "small"),
+    "align-iql": (20, "align-iql", "small"),
+    "onestep-behavior": (21, "onestep-behavior", "small"),
+    "onestep-critic": (22, "onestep-critic", "small"),
+    "onestep-policy": (23, "onestep-policy", "small"),
 }
-ALGORITHMS = {variant: algorithm for algorithm in (quad, iql) for variant in algorithm.VARIANTS}
+ALGORITHMS = {variant: algorithm for algorithm in (quad, iql, ivr, xql, dql, align_iql, onestep) for variant in algorithm.VARIANTS}
 
 
 def flatten(tree):
@@ -56,7 +71,7 @@ def shaken(tensors, rng):
     return {
         name: shaken(x, rng) if isinstance(x, dict) else x * (1 + 1e-6 * rng.normal(size=x.shape))
         for name, x in tensors.items()
-        if name != "t"
+        if isinstance(x, dict) or not np.issubdtype(x.dtype, np.integer)
     }
 
 
@@ -65,7 +80,7 @@ def is_stable(algorithm, config, state, inputs, expected):
     rng, wanted = np.random.default_rng(0), flatten(expected)
     for _ in range(3):
         others = shaken(state, rng), inputs | shaken(inputs, rng)
-        found = flatten(algorithm.update(config, *others)[0] | algorithm.act(*others))
+        found = flatten(algorithm.update(config, *others)[0] | algorithm.act(config, *others))
         if any(distance(found[name], x) > 6e-5 for name, x in wanted.items()):
             return False
     return True

@@ -4,8 +4,10 @@ Networks and their gradients are JAX in float64; everything else is NumPy. Param
 as in the files, kernels [in, out].
 """
 
+import inspect
 import math
 import os
+import re
 
 os.environ.setdefault("JAX_PLATFORMS", "cpu")
 
@@ -21,33 +23,48 @@ ADAM = {"beta1": 0.9, "beta2": 0.999, "epsilon": 1e-8}
 
 
 def compiled(function):
-    """The function, compiled once for each shape of its arguments; it gives NumPy arrays."""
-    fast = jax.jit(function)
+    """The function, compiled once for each shape of its arguments and each activation; it gives NumPy arrays."""
+    activations = [name for name in inspect.signature(function).parameters if name.endswith("activation")]
+    fast = jax.jit(function, static_argnames=activations)
     return lambda *arguments: jax.tree.map(np.asarray, fast(*arguments))
 
 
-# Networks.
+# Networks. An activation goes by its name; layers, and whether they are normalised, follow from the parameters' names.
 
 
 def mish(x):
     return x * jnp.tanh(jnp.logaddexp(x, 0.0))
 
 
-def mlp(parameters, prefix, layers, x):
-    for i in range(layers):
+ACTIVATIONS = {"mish": mish, "relu": jax.nn.relu, "silu": jax.nn.silu, "tanh": jnp.tanh}
+
+
+def normalised(x):
+    """Mean 0 and variance 1 over the last axis."""
+    return (x - x.mean(-1, keepdims=True)) / jnp.sqrt(x.var(-1, keepdims=True) + 1e-6)
+
+
+def mlp(parameters, prefix, activation, x):
+    last = sum(bool(re.fullmatch(rf"{prefix}\d+\.kernel", name)) for name in parameters) - 1
+    for i in range(last + 1):
         x = x @ parameters[f"{prefix}{i}.kernel"] + parameters[f"{prefix}{i}.bias"]
-        x = mish(x) if i < layers - 1 else x
+        if f"{prefix}{i}.scale" in parameters:
+            x = parameters[f"{prefix}{i}.scale"] * normalised(x) + parameters[f"{prefix}{i}.shift"]
+        x = ACTIVATIONS[activation](x) if i < last else x
     return x
 
 
-def ensemble(networks, x):
+def ensemble(networks, x, activation):
     """The outputs of all members of an ensemble of MLPs for the same inputs [..., in], as [K, ..., out]."""
-    return jax.vmap(lambda network: mlp(network, "", 4, x))(networks)
+    return jax.vmap(lambda network: mlp(network, "", activation, x))(networks)
 
 
-def values(critics, states, actions):
+def values(critics, states, actions, activation):
     """Q_k(s, a) of the whole ensemble, [K, ...]."""
-    return ensemble(critics, jnp.concatenate([states, actions], -1))[..., 0]
+    return ensemble(critics, jnp.concatenate([states, actions], -1), activation)[..., 0]
+
+
+fast_values = compiled(values)
 
 
 # Optimisation.
@@ -64,18 +81,24 @@ def decayed(rate, config):
     return rate * 0.5 * (1 + math.cos(math.pi * config["step"] / config["total_steps"]))
 
 
-def adam_step(state, name, gradients, rate, step):
-    """What Adam makes of the network called name and of its moments, in the update with this number, from 0."""
+def adam_step(state, name, gradients, rate, step, weight_decay=0.0):
+    """What Adam (AdamW, with weight decay) makes of the network called name and of its moments; steps count from 0."""
     beta1, beta2 = ADAM["beta1"], ADAM["beta2"]
     m = {n: beta1 * x + (1 - beta1) * gradients[n] for n, x in state[f"adam_m.{name}"].items()}
     v = {n: beta2 * x + (1 - beta2) * gradients[n] ** 2 for n, x in state[f"adam_v.{name}"].items()}
     unbias1, unbias2 = 1 / (1 - beta1 ** (step + 1)), 1 / (1 - beta2 ** (step + 1))
     moves = {n: rate * m[n] * unbias1 / (np.sqrt(v[n] * unbias2) + ADAM["epsilon"]) for n in m}
-    return {name: {n: x - moves[n] for n, x in state[name].items()}, f"adam_m.{name}": m, f"adam_v.{name}": v}
+    moved = {n: x * (1 - rate * weight_decay) - moves[n] for n, x in state[name].items()}
+    return {name: moved, f"adam_m.{name}": m, f"adam_v.{name}": v}
 
 
 def follow(target, online, rate):
     return {name: (1 - rate) * target[name] + rate * online[name] for name in target}
+
+
+def shape(hidden, activation="mish", norm=False):
+    """A network's shape, as configurations describe it."""
+    return {"hidden": hidden, "activation": activation, "norm": norm}
 
 
 # Random numbers, rounded to float32 before anything is computed from them: both sides start from the same values.
@@ -85,19 +108,30 @@ def single(x):
     return np.asarray(x, np.float32).astype(np.float64)
 
 
-def layers(widths, members=None, prefix=""):
-    """Shapes of an MLP's kernels, those of an ensemble with its count of members in front."""
+def random_network(rng, inputs, shape, outputs, members=None, prefix=""):
+    """An MLP of a shape as in configurations; an ensemble's parameters have its count of members in front."""
     front = () if members is None else (members,)
-    return {f"{prefix}{i}": (*front, *pair) for i, pair in enumerate(zip(widths, widths[1:], strict=False))}
-
-
-def random_network(rng, shapes):
+    widths = [inputs, *shape["hidden"], outputs]
     network = {}
-    for name, (*members, rows, columns) in shapes.items():
+    for i, (rows, columns) in enumerate(zip(widths, widths[1:], strict=False)):
         limit = math.sqrt(6 / (rows + columns))
-        network[f"{name}.kernel"] = single(rng.uniform(-limit, limit, (*members, rows, columns)))
-        network[f"{name}.bias"] = single(rng.uniform(-0.1, 0.1, (*members, columns)))
+        network[f"{prefix}{i}.kernel"] = single(rng.uniform(-limit, limit, (*front, rows, columns)))
+        network[f"{prefix}{i}.bias"] = single(rng.uniform(-0.1, 0.1, (*front, columns)))
+        if shape["norm"] and i < len(shape["hidden"]):
+            network[f"{prefix}{i}.scale"] = single(rng.uniform(0.5, 1.5, (*front, columns)))
+            network[f"{prefix}{i}.shift"] = single(rng.uniform(-0.3, 0.3, (*front, columns)))
     return network
+
+
+def random_batch(rng, config):
+    o, a, b = config["observation_dim"], config["action_dim"], config["batch_size"]
+    return {
+        "observations": single(rng.normal(size=(b, o))),
+        "actions": single(rng.uniform(-0.99999, 0.99999, (b, a))),
+        "rewards": single(rng.normal(size=b)),
+        "next_observations": single(rng.normal(size=(b, o))),
+        "masks": (np.arange(b) % 4 != 3).astype(np.float64),
+    }
 
 
 def near(rng, network):

@@ -6,19 +6,21 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from diffusion import TIME_EMBEDDING, TIME_FEATURES, denoise, fast_noise, predict_noise, sample, schedule
+from diffusion import denoise, fast_noise, predict_noise, random_predictor, sample, schedule
 from networks import (
     ADAM,
     adam_step,
     clip_by_norm,
     compiled,
     decayed,
+    fast_values,
     follow,
-    layers,
     mlp,
     near,
+    random_batch,
     random_moments,
     random_network,
+    shape,
     single,
     values,
 )
@@ -40,6 +42,7 @@ AGENT = {
     "nu_ema_rate": 0.1,
     "actor_ema_every": 5,
     "actor_ema_start": 1000,
+    "candidates": 10,
 }
 # Small and odd, so that no row is a whole number of vector registers.
 SIZES = {
@@ -72,45 +75,44 @@ def make_config(variant, size):
     sizes = SIZES[size].copy()
     batch_size = sizes.pop("batch_size")
     sizes.pop("select")
+    hidden = [sizes.pop("hidden")] * 3
     return {
         "algorithm": "quad",
         "observation_dim": 11,
         "action_dim": 3,
         "batch_size": batch_size,
-        "candidates": 10,
         "total_steps": 2000,
         "step": VARIANTS[variant].step,
         "adam": ADAM,
-        "agent": AGENT | sizes | VARIANTS[variant].agent,
+        "agent": {"actor": shape(hidden), "critic": shape(hidden)} | AGENT | sizes | VARIANTS[variant].agent,
     }
 
 
 # Losses and their gradients.
 
 
-def critic_loss(critics, states, actions, targets):
-    return jnp.mean((values(critics, states, actions) - targets) ** 2)
+def critic_loss(critics, states, actions, targets, activation):
+    return jnp.mean((values(critics, states, actions, activation) - targets) ** 2)
 
 
-def actor_loss(actor, states, noisy_actions, t, epsilon, eta, weight, gradient):
+def actor_loss(actor, states, noisy_actions, t, epsilon, eta, weight, gradient, activation):
     """Eq. 19, given weight λ·w(t) [B, 1] and the normalised gradient ḡ [B, a]; also its two terms."""
-    predicted = predict_noise(actor, states, noisy_actions, t)
+    predicted = predict_noise(actor, states, noisy_actions, t, activation)
     bc = jnp.mean((epsilon - predicted) ** 2)
     guidance = jnp.mean(weight * predicted * gradient)
     return eta * bc + guidance, (bc, guidance)
 
 
 @compiled
-def action_gradients(critics, states, actions):
+def action_gradients(critics, states, actions, activation):
     """∂Q_k/∂a for each critic and row, [K, B, a]; rows do not depend on one another, so their sum will do."""
 
     def total(critic, actions):
-        return mlp(critic, "", 4, jnp.concatenate([states, actions], -1)).sum()
+        return mlp(critic, "", activation, jnp.concatenate([states, actions], -1)).sum()
 
     return jax.vmap(jax.grad(total, 1), (0, None))(critics, actions)
 
 
-fast_values = compiled(values)
 critic_gradient = compiled(jax.value_and_grad(critic_loss))
 actor_gradient = compiled(jax.value_and_grad(actor_loss, has_aux=True))
 
@@ -121,8 +123,11 @@ actor_gradient = compiled(jax.value_and_grad(actor_loss, has_aux=True))
 def target_values(config, state, inputs):
     """Next actions [B, S, a] and the bootstrapped targets y [B], Eq. 20."""
     agent = config["agent"]
-    next_actions, next_states = sample(state["target_actor"], inputs["next_observations"], inputs["next_noise"])
-    q = fast_values(state["target_critic"], next_states, next_actions)  # [K, B, S]
+    activation = agent["actor"]["activation"]
+    next_actions, next_states = sample(
+        state["target_actor"], inputs["next_observations"], inputs["next_noise"], activation
+    )
+    q = fast_values(state["target_critic"], next_states, next_actions, agent["critic"]["activation"])  # [K, B, S]
     q = q.max(-1) if agent["target_reduce"] == "max" else q.mean(-1)  # each critic's own, [K, B]
     lcb = q.mean(0) - agent["rho"] * q.std(0)
     return next_actions, inputs["rewards"] + agent["gamma"] * inputs["masks"] * lcb
@@ -134,10 +139,11 @@ def guide(config, state, inputs, noisy, target_critic):
     if agent["guidance"] == "none":
         nothing = {"nu_squared": state["nu_squared"], "lambda_mean": 0.0, "delta_share": 0.0}
         return np.zeros(len(s)), np.zeros_like(a), nothing, np.zeros(len(s))
-    gradients = action_gradients(target_critic, s, noisy)
-    q_scale = np.abs(fast_values(target_critic, s, a)).mean() + 1e-6
+    activation = agent["critic"]["activation"]
+    gradients = action_gradients(target_critic, s, noisy, activation)
+    q_scale = np.abs(fast_values(target_critic, s, a, activation)).mean() + 1e-6
     g = gradients / q_scale
-    predicted = fast_noise(state["actor"], s, noisy, inputs["t"])
+    predicted = fast_noise(state["actor"], s, noisy, inputs["t"], agent["actor"]["activation"])
     u = predicted / (np.linalg.norm(predicted, axis=-1, keepdims=True) + 1e-8)
     alignment = (u * g).sum(-1)  # [K, B]
     sigma_squared = alignment.var(0)
@@ -163,7 +169,7 @@ def update(config, state, inputs):
     out |= {"next_actions": next_actions, "targets": targets, "q_mean": targets.mean()}
 
     # Critics, and their targets.
-    loss, gradients = critic_gradient(state["critic"], s, a, targets)
+    loss, gradients = critic_gradient(state["critic"], s, a, targets, agent["critic"]["activation"])
     gradients, norm = clip_by_norm(gradients, agent["gradient_clip"])
     out |= adam_step(state, "critic", gradients, decayed(agent["critic_learning_rate"], config), step)
     out |= {"critic_loss": loss, "critic_gradient_norm": norm}
@@ -177,6 +183,7 @@ def update(config, state, inputs):
 
     # Actor, Eq. 19.
     arguments = (s, noisy, t, epsilon, state["eta"][0], weights[:, None] * noise_level, mean_gradient)
+    arguments += (agent["actor"]["activation"],)
     (loss, (bc, guidance)), gradients = actor_gradient(state["actor"], *arguments)
     gradients, norm = clip_by_norm(gradients, agent["gradient_clip"])
     out |= adam_step(state, "actor", gradients, decayed(agent["actor_learning_rate"], config), step)
@@ -197,15 +204,16 @@ def update(config, state, inputs):
     return out, {"share_of_delta": share_of_delta, "difference": difference, "unbounded_eta": eta}
 
 
-def act(state, inputs):
+def act(config, state, inputs):
     """Eq. 25, and single reverse steps, with the target networks as they are before the update."""
-    noise = inputs["select_noise"]
-    candidates, states = sample(state["target_actor"], inputs["select_observations"], noise)
-    q = fast_values(state["target_critic"], states, candidates).mean(0)
+    noise, actor = inputs["select_noise"], state["target_actor"]
+    actors, critics = (config["agent"][name]["activation"] for name in ("actor", "critic"))
+    candidates, states = sample(actor, inputs["select_observations"], noise, actors)
+    q = fast_values(state["target_critic"], states, candidates, critics).mean(0)
     index = q.argmax(-1)
     steps = len(noise)
     reverse = [
-        denoise(state["target_actor"], inputs["observations"], inputs["denoise_actions"][t - 1], t, steps)
+        denoise(actor, inputs["observations"], inputs["denoise_actions"][t - 1], t, steps, actors)
         for t in range(1, steps + 1)
     ]
     return {
@@ -222,12 +230,9 @@ def act(state, inputs):
 
 def random_state(config, rng):
     agent, o, a = config["agent"], config["observation_dim"], config["action_dim"]
-    hidden = [agent["hidden"]] * 3
-    actor = layers([TIME_FEATURES, TIME_EMBEDDING, TIME_EMBEDDING], prefix="time.")
-    actor |= layers([o + a + TIME_EMBEDDING, *hidden, a], prefix="trunk.")
     state = {
-        "actor": random_network(rng, actor),
-        "critic": random_network(rng, layers([o + a, *hidden, 1], agent["critics"])),
+        "actor": random_predictor(rng, o, a, agent["actor"]),
+        "critic": random_network(rng, o + a, agent["critic"], 1, agent["critics"]),
     }
     for name in "actor", "critic":
         state[f"target_{name}"] = near(rng, state[name])
@@ -240,12 +245,7 @@ def random_state(config, rng):
 def random_inputs(config, rng, size, state):
     agent, o, a = config["agent"], config["observation_dim"], config["action_dim"]
     steps, b, n = agent["diffusion_steps"], config["batch_size"], SIZES[size]["select"]
-    inputs = {
-        "observations": single(rng.normal(size=(b, o))),
-        "actions": single(rng.uniform(-0.99999, 0.99999, (b, a))),
-        "rewards": single(rng.normal(size=b)),
-        "next_observations": single(rng.normal(size=(b, o))),
-        "masks": (np.arange(b) % 4 != 3).astype(np.float64),
+    inputs = random_batch(rng, config) | {
         "next_noise": single(rng.normal(size=(steps, b, agent["samples"], a))),
         "t": rng.permutation(np.arange(b) % steps + 1),
         "epsilon": single(rng.normal(size=(b, a))),
@@ -253,11 +253,11 @@ def random_inputs(config, rng, size, state):
         "select_observations": single(rng.normal(size=(n, o))),
     }
     # A choice between candidates of nearly equal value would depend on rounding: draw such states' noise again.
-    noise = np.zeros((steps, n, config["candidates"], a))
+    noise = np.zeros((steps, n, agent["candidates"], a))
     close = np.full(n, True)
     while close.any():
         noise[:, close] = single(rng.normal(size=noise[:, close].shape))
-        q = np.sort(act(state, inputs | {"select_noise": noise})["select.q"])
+        q = np.sort(act(config, state, inputs | {"select_noise": noise})["select.q"])
         close = q[:, -1] - q[:, -2] < 1e-3
     return inputs | {"select_noise": noise}
 
@@ -284,4 +284,4 @@ def draw(config, variant, size, rng):
         expected, came = update(config, state, inputs)
     if not eta_is_free(config, came):
         return None
-    return state, inputs, expected | act(state, inputs)
+    return state, inputs, expected | act(config, state, inputs)

@@ -38,11 +38,11 @@ impl Setting {
 steps = {steps}
 eval_interval = {eval_interval}
 episodes = {episodes}
-candidates = {candidates}
 seed = {seed}
 batch_size = 16
 
 [agent]
+candidates = {candidates}
 hidden = {hidden}
 critics = 2
 diffusion_steps = 2

@@ -26,8 +26,6 @@ pub struct GroupReport {
     pub agent: String,
     /// What the paper calls this variant of the algorithm, if it has a row of it.
     pub methods: Vec<&'static str>,
-    /// Actions sampled per state in an evaluation.
-    pub candidates: u32,
     /// Gradient steps that were asked for.
     pub steps: u64,
     /// Where they trained.
@@ -136,7 +134,6 @@ fn group(runs: &[&RunReport], differs: Vec<String>) -> GroupReport {
         variant: first.variant.clone(),
         agent: first.agent.clone(),
         methods: published::methods(&first.algorithm, &first.variant),
-        candidates: first.candidates,
         steps: first.steps,
         device: first.config.run.device,
         normalised: first.normalised,

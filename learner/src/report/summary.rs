@@ -50,7 +50,6 @@ impl Report {
         let mut table = Table::new(&[
             ("task", Left),
             ("algorithm", Left),
-            ("candidates", Right),
             ("trained for", Right),
             ("seeds", Right),
             ("scored in", Left),
@@ -65,7 +64,6 @@ impl Report {
             table.push([
                 g.task.clone(),
                 g.agent.clone(),
-                g.candidates.to_string(),
                 g.steps_in_words(),
                 g.seeds.len().to_string() + &g.goals.map(|goals| format!(", {goals} goals")).unwrap_or_default(),
                 format!("{}{measure}", g.scored_in),
@@ -110,7 +108,7 @@ impl Report {
         );
         let number = |value: Option<f64>| value.map(|value| format!("{value:.2}")).unwrap_or_default();
         for g in groups() {
-            let ours = format!("ours: {}, {} candidates", g.named(), g.candidates);
+            let ours = format!("ours: {}", g.named());
             let mut row = |score: Option<Spread>, what: &str| {
                 let [mean, by_n, by_one_less] =
                     [score.map(|s| s.mean), score.and_then(|s| s.population_std), score.and_then(|s| s.std)];

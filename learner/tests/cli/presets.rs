@@ -71,12 +71,12 @@ fn quad_has_the_values_of_tables_3_and_4_for_each_row() {
             ("agent.eta.rate", Some(0.001)),
             ("agent.ema_rate", Some(0.005)),
             ("agent.actor_ema_every", Some(5.0)),
+            ("agent.candidates", Some(10.0)),
             ("agent.samples", Some(10.0)), // DAC's, as are the next three
             ("agent.gamma", Some(0.99)),
             ("agent.eta.minimum", Some(0.001)),
             ("agent.eta.maximum", Some(100.0)),
             ("batch_size", Some(256.0)),
-            ("candidates", Some(10.0)),
             ("steps", Some(2_000_000.0)),
             ("eval_interval", Some(20_000.0)),
             ("episodes", Some(10.0)),
