@@ -56,6 +56,11 @@ fn quad_has_the_values_of_tables_3_and_4_for_each_row() {
         ] {
             assert_eq!(value(&row, key), Some(word.into()), "{name}: {key}");
         }
+        for network in ["actor", "critic"] {
+            // B.1: three layers.
+            let expected = toml::toml! { hidden = [256, 256, 256] activation = "mish" };
+            assert_eq!(value(&row, &format!("agent.{network}")), Some(expected.into()), "{name}: {network}");
+        }
         let rate = if name.starts_with("antmaze-large") { 1e-3 } else { 3e-4 };
         for (key, expected) in [
             ("agent.tau", Some(tau)),
@@ -65,7 +70,6 @@ fn quad_has_the_values_of_tables_3_and_4_for_each_row() {
             ("agent.eta.initial", eta.or(Some(1.0))),
             ("agent.diffusion_steps", Some(5.0)),
             ("agent.critics", Some(10.0)),
-            ("agent.hidden", Some(256.0)),
             ("agent.actor_learning_rate", Some(rate)),
             ("agent.critic_learning_rate", Some(rate)),
             ("agent.eta.rate", Some(0.001)),
