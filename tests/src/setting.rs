@@ -43,7 +43,8 @@ batch_size = 16
 
 [agent]
 candidates = {candidates}
-hidden = {hidden}
+actor.hidden = [{hidden}, {hidden}, {hidden}]
+critic.hidden = [{hidden}, {hidden}, {hidden}]
 critics = 2
 diffusion_steps = 2
 actor_ema_start = 10

@@ -87,7 +87,8 @@ impl Experiment {
     /// As [`Self::definition`].
     pub fn method(&self) -> anyhow::Result<String> {
         let key = self.definition()?.variant;
-        let named = |key: &str| self.agent.get(key).map(|value| format!(", {key} {}", value.to_string().trim_matches('"')));
+        let named =
+            |key: &str| self.agent.get(key).map(|value| format!(", {key} {}", value.to_string().trim_matches('"')));
         let variant = key.and_then(named).unwrap_or_default();
         let candidates = self.agent.get("candidates").map(|count| format!(", {count} candidates")).unwrap_or_default();
         Ok(format!("{}{variant}{candidates}", self.algorithm))

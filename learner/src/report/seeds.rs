@@ -66,12 +66,12 @@ impl GroupReport {
         format!("{seeds} seed{plural}{goals}, {steps} on {device}, scored in {scored_in}")
     }
 
-    /// The variant, and what the paper calls it where it has another name.
+    /// The algorithm, and what the paper calls this variant of it where it has another name.
     pub fn named(&self) -> String {
         let is_other = |method: &&str| !method.eq_ignore_ascii_case(&self.variant);
         match self.methods.iter().any(is_other) {
-            true => format!("{} ({})", self.variant, self.methods.join(", ")),
-            false => self.variant.clone(),
+            true => format!("{} ({})", self.agent, self.methods.join(", ")),
+            false => self.agent.clone(),
         }
     }
 
