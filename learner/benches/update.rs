@@ -90,7 +90,8 @@ fn updates(criterion: &mut Criterion) {
             let context = context(&experiment, precision, device);
             let items: Vec<u32> = (0..experiment.batch_size).collect();
             let definition = experiment.definition().expect("a resolved experiment");
-            let mut agent = Agent::new(definition, &experiment.agent, context).expect("a usable configuration and device");
+            let mut agent =
+                Agent::new(definition, &experiment.agent, context).expect("a usable configuration and device");
             group.bench_function(name, |bencher| bencher.iter(|| agent.update(&items).expect("a step")));
         }
         group.finish();

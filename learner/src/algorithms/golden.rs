@@ -91,7 +91,8 @@ pub(super) fn items(golden: &Golden) -> Vec<u32> {
 
 /// Tests an update without random numbers of an algorithm against its golden folders.
 pub(super) fn check_definition(definition: &Definition, goldens: Vec<Golden>) {
-    for (golden, device) in goldens.iter().flat_map(|golden| devices().into_iter().map(move |device| (golden, device))) {
+    for (golden, device) in goldens.iter().flat_map(|golden| devices().into_iter().map(move |device| (golden, device)))
+    {
         let mut algorithm = (definition.start)(&table(golden), context(golden, &device)).unwrap();
         load(golden, algorithm.parts());
         check_actions(golden, &*algorithm);

@@ -6,7 +6,9 @@
 #[allow(clippy::unwrap_used)]
 mod golden;
 
-use super::algorithm::{AgentError, Algorithm, Context, Definition, Hyperparameters, Metric, check_layers, numbers, read, smaller};
+use super::algorithm::{
+    AgentError, Algorithm, Context, Definition, Hyperparameters, Metric, check_layers, numbers, read, smaller,
+};
 use super::gaussian::Gaussian;
 use super::hyperparameters::{Positive, Quantile, Rate, Share};
 use super::parts::{Parts, Trained, ensemble};

@@ -153,7 +153,6 @@ impl<N: Network> Trained<N> {
     pub fn descend(&mut self, gradients: &Gradients, step: AdamStep) -> Result<Tensor> {
         self.adam.step(self.network.weights_mut(), gradients, step)
     }
-
 }
 
 /// The trainable weights that network number `network` of a run begins with.

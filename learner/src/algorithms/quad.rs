@@ -15,8 +15,8 @@ use candle_nn::loss::mse;
 use config::{Eta, Guidance, Quad as Config, TargetReduce};
 use metrics::METRICS;
 use quad_policy::{
-    AdamStep, Choice, DiffusionPolicy, DiffusionShape, Ensemble, Gradients, NoisePredictor, PolicyConfig, Reverse, Tensors,
-    cosine_decay, mean_and_variance,
+    AdamStep, Choice, DiffusionPolicy, DiffusionShape, Ensemble, Gradients, NoisePredictor, PolicyConfig, Reverse,
+    Tensors, cosine_decay, mean_and_variance,
 };
 use rand::Rng;
 use rand_distr::{Distribution, StandardNormal};

@@ -161,7 +161,8 @@ fn every_weight_that_is_trained_gets_a_finite_gradient_that_is_not_zero() {
         }
         for (name, moment) in algorithm.parts().save().unwrap().iter().filter(|(name, _)| name.starts_with("adam_m")) {
             let moment: Vec<f32> = moment.flatten_all().unwrap().to_vec1().unwrap();
-            let good = moment.iter().all(|x| x.is_finite()) && moment.iter().filter(|x| **x == 0.0).count() * 2 < moment.len();
+            let good =
+                moment.iter().all(|x| x.is_finite()) && moment.iter().filter(|x| **x == 0.0).count() * 2 < moment.len();
             assert!(good, "{}: {name} has a gradient that is 0 or not finite", definition.name);
         }
     }
@@ -193,7 +194,11 @@ fn a_nan_is_never_dropped() {
             let mut agent = agent(definition, &table, &context(0, &Device::Cpu));
             agent.parts().spoil(name);
             let values = train(&mut agent, 8);
-            assert!(values.iter().flatten().any(|value| value.is_nan()), "{}: a NaN in {name} is lost", definition.name);
+            assert!(
+                values.iter().flatten().any(|value| value.is_nan()),
+                "{}: a NaN in {name} is lost",
+                definition.name
+            );
             assert!(agent.save().is_err(), "{}: a broken state is saved", definition.name);
         }
     }

@@ -133,7 +133,8 @@ fn golden_parts() {
         }
         // Guidance comes from the target critics as the update has just moved them.
         quad.target_critics.weights_mut().load(&mut golden.expected.clone(), "target_critic.").unwrap();
-        let (signal, deviation) = quad.actor.network.schedule().noising(&noise.t, quad.shape.action_dim, &device).unwrap();
+        let (signal, deviation) =
+            quad.actor.network.schedule().noising(&noise.t, quad.shape.action_dim, &device).unwrap();
         let noisy = ((&batch.actions * signal).unwrap() + (&noise.epsilon * deviation).unwrap()).unwrap();
         golden.close("noisy_actions", &noisy);
         let gradients = quad.target_critics.action_gradients(&batch.observations, &noisy).unwrap();
