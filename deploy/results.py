@@ -45,7 +45,7 @@ def main(runs):
         means = defaultdict(list)  # by candidates: a number for each snapshot
         for scored in json.loads((run / "score.json").read_text()):
             episodes = [episode["score"] for episode in scored["episodes"]]
-            means[scored["candidates"]].append(statistics.fmean(episodes))
+            means[scored["choice"]["candidates"]].append(statistics.fmean(episodes))
             settings.add(f"{len(episodes)} episodes each in {scored['precision']}")
         for candidates, of_snapshots in means.items():
             scores[file, guidance, candidates].append(statistics.fmean(of_snapshots))

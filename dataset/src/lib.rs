@@ -42,5 +42,5 @@ pub use reward::RewardRule;
 pub use sampler::BatchSampler;
 pub use statistics::Statistics;
 pub use task::Task;
-pub use transitions::{Batch, ReadOptions, Transitions};
+pub use transitions::{Arrays, Batch, ReadOptions, Transitions};
 pub use writer::{D4rlWriter, Metadata};

@@ -3,8 +3,6 @@
 use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 
-use crate::transitions::{Batch, Transitions};
-
 /// Keeps these draws apart from other uses of the run's seed.
 const PURPOSE: u64 = u64::from_be_bytes(*b"batches ");
 
@@ -43,15 +41,12 @@ impl BatchSampler {
         sampler
     }
 
-    /// Fills `batch` with the next `batch_size` transitions.
-    ///
-    /// # Panics
-    /// If `transitions` are fewer than the sampler was made for.
-    pub fn next(&mut self, transitions: &Transitions, batch: &mut Batch) {
+    /// The numbers of the next `batch_size` items.
+    pub fn next_items(&mut self) -> &[u32] {
         for i in 0..self.indices.len() {
             self.indices[i] = self.draw();
         }
-        transitions.gather(&self.indices, batch);
+        &self.indices
     }
 
     fn start_pass(&mut self) {

@@ -34,7 +34,8 @@ def main():
     arguments = parser.parse_args()
 
     config = quad.make_config("quad", "hopper")
-    steps, candidates, a = config["agent"]["diffusion_steps"], config["candidates"], config["action_dim"]
+    agent, a = config["agent"], config["action_dim"]
+    steps, candidates = agent["diffusion_steps"], agent["candidates"]
     state = quad.random_state(config, np.random.default_rng(0))
     actor, critics = single((state["target_actor"], state["target_critic"]))
 

@@ -9,15 +9,15 @@ use quad_dataset::environment::find;
 use quad_evaluator::sim::Rollout;
 use quad_evaluator::sim::{make, simulated};
 use quad_policy::{
-    ActionNoise, Description, DiffusionPolicy, DiffusionShape, Ensemble, Layout, NoisePredictor, Policy, Precision,
-    Weights, load_policy,
+    Choice, DiffusionPolicy, DiffusionShape, Ensemble, EpisodeState, Header, Layout, NoisePredictor, Policy,
+    PolicyConfig, Precision, Weights, load_policy,
 };
 use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 use std::hint::black_box;
 
 const EPISODES: usize = 10;
-const CANDIDATES: usize = 10;
+const CANDIDATES: u32 = 10;
 /// Steps from the episodes' beginning, few enough that none falls over.
 const STEPS: usize = 4;
 const PAPER: DiffusionShape =
@@ -32,9 +32,10 @@ fn policy(precision: Precision) -> Box<dyn Policy> {
     };
     let actor = NoisePredictor::new(PAPER.actor(), weights(PAPER.actor().layout()), Precision::F32);
     let critics = Ensemble::new(PAPER.critics(), weights(PAPER.critics().layout()), Precision::F32);
-    let tensors = DiffusionPolicy::tensors(&actor, &critics).expect("tensors");
-    let bytes = Description::Diffusion(PAPER).to_safetensors(&tensors).expect("finite weights");
-    load_policy(&bytes, precision).expect("what was just written")
+    let tensors = DiffusionPolicy::tensors(&actor, &critics, None).expect("tensors");
+    let policy = PolicyConfig::Diffusion { shape: PAPER, choice: Choice::best_of(CANDIDATES) };
+    let file = Header { policy, origin: () }.to_safetensors(&tensors).expect("finite weights");
+    load_policy(&file, precision).expect("what was just written")
 }
 
 /// Four steps of ten episodes; a policy call and a control period each.
@@ -46,12 +47,15 @@ fn steps(criterion: &mut Criterion) {
         let policy = policy(precision);
         group.bench_function(format!("{STEPS} steps, {name}"), |bencher| {
             bencher.iter_batched_ref(
-                || Rollout::new(spec, 0, &seeds, ActionNoise::new).expect("MuJoCo compiles the embedded model"),
+                || {
+                    Rollout::new(spec, 0, &seeds, |seed| policy.begin(seed))
+                        .expect("MuJoCo compiles the embedded model")
+                },
                 |rollout| {
                     rayon::scope(|_| {
                         for _ in 0..STEPS {
-                            let act = |observations: &[f32], noise: &mut [ActionNoise], actions: &mut [f32]| {
-                                policy.act(observations, CANDIDATES, noise, actions)
+                            let act = |observations: &[f32], states: &mut [EpisodeState], actions: &mut [f32]| {
+                                policy.act(observations, states, actions)
                             };
                             rollout.step(act).expect("the policy's numbers are finite");
                         }
@@ -70,13 +74,13 @@ fn select(criterion: &mut Criterion) {
     let mut random = ChaCha8Rng::seed_from_u64(1);
     let observations: Vec<f32> =
         (0..EPISODES * PAPER.observation_dim).map(|_| random.random_range(-1.0..1.0)).collect();
-    let mut noise: Vec<ActionNoise> = (0..EPISODES as u64).map(ActionNoise::new).collect();
     let mut actions = vec![0.0; EPISODES * PAPER.action_dim];
     let mut group = criterion.benchmark_group("select");
     for (name, precision) in [("f32", Precision::F32), ("bf16", Precision::Bf16)] {
         let policy = policy(precision);
+        let mut states: Vec<EpisodeState> = (0..EPISODES as u64).map(|seed| policy.begin(seed)).collect();
         group.bench_function(name, |bencher| {
-            bencher.iter(|| rayon::scope(|_| policy.act(&observations, CANDIDATES, &mut noise, &mut actions)));
+            bencher.iter(|| rayon::scope(|_| policy.act(&observations, &mut states, &mut actions)));
             black_box(&actions);
         });
     }

@@ -1,4 +1,4 @@
-//! What a policy says that its actions take is what they take: an evaluator refuses jobs by it.
+//! The memory that a policy says its actions take is what they take: an evaluator refuses jobs by it.
 #![allow(clippy::unwrap_used, clippy::expect_used)]
 
 use std::alloc::{GlobalAlloc, Layout as Block, System};
@@ -6,8 +6,8 @@ use std::sync::atomic::{AtomicUsize, Ordering::Relaxed};
 
 use candle_core::{Device, Tensor};
 use quad_policy::{
-    ActionNoise, Description, DiffusionPolicy, DiffusionShape, Ensemble, GaussianPolicy, GaussianShape, Layout,
-    NoisePredictor, Policy, Precision, Weights, load_policy,
+    Choice, DiffusionPolicy, DiffusionShape, Ensemble, GaussianPolicy, GaussianShape, Header, Layout, NoisePredictor,
+    Policy, PolicyConfig, Precision, Rule, Tensors, Weights, load_policy,
 };
 
 /// What is not counted, such as the embedding of each denoising step: little of what an evaluator gives, bytes.
@@ -40,35 +40,43 @@ fn zeros(layout: Layout) -> Weights {
     Weights::constant(layout, values)
 }
 
-fn diffusion(hidden: usize, critics: usize, diffusion_steps: usize) -> Box<dyn Policy> {
+fn loaded(policy: PolicyConfig, tensors: &Tensors) -> Box<dyn Policy> {
+    load_policy(&Header { policy, origin: () }.to_safetensors(tensors).unwrap(), Precision::F32).unwrap()
+}
+
+fn diffusion(hidden: usize, critics: usize, diffusion_steps: usize, choice: Choice) -> Box<dyn Policy> {
     let shape = DiffusionShape { observation_dim: 11, action_dim: 3, hidden, critics, diffusion_steps };
     let actor = NoisePredictor::new(shape.actor(), zeros(shape.actor().layout()), Precision::F32);
     let critics = Ensemble::new(shape.critics(), zeros(shape.critics().layout()), Precision::F32);
-    let tensors = DiffusionPolicy::tensors(&actor, &critics).unwrap();
-    load_policy(&Description::Diffusion(shape).to_safetensors(&tensors).unwrap(), Precision::F32).unwrap()
+    let value = Ensemble::new(shape.value(), zeros(shape.value().layout()), Precision::F32);
+    let value = Some(&value).filter(|_| choice.needs_value());
+    let tensors = DiffusionPolicy::tensors(&actor, &critics, value).unwrap();
+    loaded(PolicyConfig::Diffusion { shape, choice }, &tensors)
 }
 
 fn gaussian(hidden: usize) -> Box<dyn Policy> {
     let shape = GaussianShape { observation_dim: 11, action_dim: 3, hidden };
     let actor = Ensemble::new(shape.actor(), zeros(shape.actor().layout()), Precision::F32);
-    let tensors = GaussianPolicy::tensors(&actor).unwrap();
-    load_policy(&Description::Gaussian(shape).to_safetensors(&tensors).unwrap(), Precision::F32).unwrap()
+    loaded(PolicyConfig::Gaussian { shape }, &GaussianPolicy::tensors(&actor).unwrap())
 }
 
 #[test]
 fn actions_take_no_more_memory_than_was_said() {
-    let cases: [(&str, Box<dyn Policy>, usize, usize); 5] = [
-        ("the paper's", diffusion(256, 10, 5), 10, 50),
-        ("many critics", diffusion(1, 4096, 1), 64, 32),
-        ("many steps", diffusion(4, 1, 1000), 256, 8),
-        ("many candidates", diffusion(8, 2, 5), 1, 65_536),
-        ("a Gaussian", gaussian(256), 256, 1),
+    let best_of = Choice::best_of;
+    let nearest = Choice { rule: Rule::Nearest, ..best_of(1000) };
+    let cases: [(&str, Box<dyn Policy>, usize); 6] = [
+        ("the paper's", diffusion(256, 10, 5, best_of(50)), 10),
+        ("many critics", diffusion(1, 4096, 1, best_of(32)), 64),
+        ("many steps", diffusion(4, 1, 1000, best_of(8)), 256),
+        ("many candidates", diffusion(8, 2, 5, best_of(1000)), 64),
+        ("a value function", diffusion(8, 2, 5, nearest), 256),
+        ("a Gaussian", gaussian(256), 256),
     ];
-    for (name, policy, states, candidates) in cases {
-        let said = policy.cost(states, candidates).bytes as usize;
-        let mut noise: Vec<_> = (0..states as u64).map(ActionNoise::new).collect();
-        let (observations, mut actions) = (vec![0.5; states * 11], vec![0.0; states * 3]);
-        let mut act = || policy.act(&observations, candidates, &mut noise, &mut actions).unwrap();
+    for (name, policy, n) in cases {
+        let said = policy.memory(n) as usize;
+        let mut states: Vec<_> = (0..n as u64).map(|seed| policy.begin(seed)).collect();
+        let (observations, mut actions) = (vec![0.5; n * 11], vec![0.0; n * 3]);
+        let mut act = || policy.act(&observations, &mut states, &mut actions).unwrap();
         // What threads keep for themselves is there then.
         act();
         let before = NOW.load(Relaxed);

@@ -7,6 +7,7 @@ use std::convert::Infallible;
 use quad_dataset::environment::{EnvironmentSpec, find};
 use quad_evaluator::sim::{EpisodeOutcome, Rollout};
 use quad_evaluator::sim::{make, simulated};
+use quad_policy::{EpisodeState, Policy, PolicyError, Precision};
 use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 
@@ -108,6 +109,59 @@ fn in_every_environment_an_episode_depends_on_its_seed_alone() {
             assert!(trajectory.len() > 5 * spec.observation_dim, "{}", spec.name);
             assert_eq!(trajectories(spec, &[seed])[&seed], *trajectory, "{}, seed {seed}", spec.name);
         }
+    }
+}
+
+/// Remembers how often it acted in an episode, and acts by that: after some steps it lets the hopper fall.
+struct Counter;
+
+impl Policy for Counter {
+    fn observation_dim(&self) -> usize {
+        11
+    }
+
+    fn action_dim(&self) -> usize {
+        3
+    }
+
+    fn precision(&self) -> Precision {
+        Precision::F32
+    }
+
+    fn memory(&self, _: usize) -> u64 {
+        0
+    }
+
+    fn begin(&self, seed: u64) -> EpisodeState {
+        let mut state = EpisodeState::new(seed);
+        state.memory = vec![0.0, seed as f32];
+        state
+    }
+
+    fn act(&self, _: &[f32], states: &mut [EpisodeState], actions: &mut [f32]) -> Result<(), PolicyError> {
+        for (state, action) in states.iter_mut().zip(actions.chunks_exact_mut(3)) {
+            let [count, seed] = state.memory[..] else { panic!("its own two numbers") };
+            state.memory[0] = count + 1.0;
+            action.fill((seed + count / 5.0).sin());
+        }
+        Ok(())
+    }
+}
+
+#[test]
+fn what_a_policy_remembers_is_its_episode_s_own_and_begins_anew() {
+    let run = |seeds: &[u64]| {
+        let mut rollout = Rollout::new(find("hopper").unwrap(), 0, seeds, |seed| Counter.begin(seed)).unwrap();
+        while !rollout.is_done() {
+            rollout.step(|observations, states, actions| Counter.act(observations, states, actions)).unwrap();
+        }
+        rollout.into_outcomes()
+    };
+    let together = run(&[1, 2, 3, 4, 5, 6]);
+    let lengths: std::collections::HashSet<u32> = together.iter().map(|outcome| outcome.length).collect();
+    assert!(lengths.len() > 1, "episodes of one length only prove nothing about leaving the batch");
+    for outcome in together {
+        assert_eq!(run(&[outcome.seed])[0], EpisodeOutcome { index: 0, ..outcome });
     }
 }
 

@@ -8,7 +8,8 @@ use criterion::measurement::WallTime;
 use criterion::{BenchmarkGroup, BenchmarkId, Criterion, Throughput, criterion_group, criterion_main};
 use gemm::{Parallelism, gemm};
 use quad_kernels::Buffer;
-use quad_kernels::activation::{bias_mish, bias_mish_slope, mish_in_place, mish_slope};
+use quad_kernels::activation::Activation::Mish;
+use quad_kernels::activation::{activate, activate_with_slope};
 use quad_kernels::product::{Rounded, outer, product, product_transposed};
 use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
@@ -196,11 +197,9 @@ fn activations(criterion: &mut Criterion) {
         });
     };
     bench("copy", &mut |_| ());
-    bench("mish_in_place", &mut mish_in_place);
     bench("mish by std's exp", &mut mish_by_std);
-    bench("bias_mish", &mut |y| bias_mish(y, bias));
-    bench("bias_mish_slope", &mut |y| bias_mish_slope(y, bias, slope));
-    group.bench_function("mish_slope", |bencher| bencher.iter(|| mish_slope(x, y, slope)));
+    bench("mish", &mut |y| activate(Mish, y, bias));
+    bench("mish_slope", &mut |y| activate_with_slope(Mish, y, bias, slope));
     group.finish();
 }
 

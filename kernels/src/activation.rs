@@ -1,6 +1,7 @@
-//! Vectorised loops over activations: Mish and its derivative with one exponential.
+//! Vectorised loops over activations and their derivatives, each with one exponential.
 
 use crate::vectorised::vectorised;
+use serde::{Deserialize, Serialize};
 
 /// Below this, Mish and its slope are taken to be what they are here: some -2e-14, nothing beside numbers of order 1. Followed
 /// further down, gradients behind such a unit would become subnormal numbers, with which a CPU is ten times slower.
@@ -49,42 +50,88 @@ pub(crate) fn mish_and_slope(x: f32) -> (f32, f32) {
     (x * t, (4.0 * bounded * r) * (e * (e + 1.0) * r) + t)
 }
 
-vectorised! {
-    /// `x = mish(x)`.
-    pub fn mish_in_place(x: &mut [f32]) {
-        for x in x {
-            *x = mish(*x);
+/// What stands between the layers of a network.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum Activation {
+    /// x·tanh(ln(1 + e^x)).
+    #[default]
+    Mish,
+    /// max(x, 0).
+    Relu,
+    /// x/(1 + e^-x), also called swish.
+    Silu,
+    /// tanh(x).
+    Tanh,
+}
+
+/// The bound keeps e^2x, and with it tanh, finite; beyond it tanh is ±1 to the last bit of f32.
+const TANH_FLAT: f32 = 9.5;
+
+#[inline(always)]
+pub(crate) fn tanh_and_slope(x: f32) -> (f32, f32) {
+    let e = exp(2.0 * x.clamp(-TANH_FLAT, TANH_FLAT));
+    let y = (e - 1.0) / (e + 1.0);
+    (y, 1.0 - y * y)
+}
+
+#[inline(always)]
+pub(crate) fn silu_and_slope(x: f32) -> (f32, f32) {
+    let e = exp(x.clamp(MISH_ZERO, MISH_LINEAR));
+    let s = e / (e + 1.0);
+    let x = x.clamp(MISH_ZERO, f32::INFINITY);
+    (x * s, s * (x * (1.0 - s) + 1.0))
+}
+
+#[inline(always)]
+pub(crate) fn relu(x: f32) -> f32 {
+    // Not `max`, which would drop a NaN.
+    if x < 0.0 { 0.0 } else { x }
+}
+
+#[inline(always)]
+fn relu_and_slope(x: f32) -> (f32, f32) {
+    (relu(x), if x > 0.0 { 1.0 } else { 0.0 })
+}
+
+#[inline(always)]
+fn rows(x: &mut [f32], bias: &[f32], f: impl Fn(f32) -> f32) {
+    for row in x.chunks_exact_mut(bias.len()) {
+        for (x, b) in row.iter_mut().zip(bias) {
+            *x = f(*x + b);
+        }
+    }
+}
+
+#[inline(always)]
+fn rows_with_slope(x: &mut [f32], bias: &[f32], slope: &mut [f32], f: impl Fn(f32) -> (f32, f32)) {
+    for (row, slope) in x.chunks_exact_mut(bias.len()).zip(slope.chunks_exact_mut(bias.len())) {
+        for ((x, b), slope) in row.iter_mut().zip(bias).zip(slope) {
+            (*x, *slope) = f(*x + b);
         }
     }
 }
 
 vectorised! {
-    /// `y = mish(x)`, `slope = mish'(x)`.
-    pub fn mish_slope(x: &[f32], y: &mut [f32], slope: &mut [f32]) {
-        for ((x, y), slope) in x.iter().zip(y).zip(slope) {
-            (*y, *slope) = mish_and_slope(*x);
+    /// `x = f(x + bias)`, row by row.
+    pub fn activate(f: Activation, x: &mut [f32], bias: &[f32]) {
+        match f {
+            Activation::Mish => rows(x, bias, mish),
+            Activation::Relu => rows(x, bias, relu),
+            Activation::Silu => rows(x, bias, |x| silu_and_slope(x).0),
+            Activation::Tanh => rows(x, bias, |x| tanh_and_slope(x).0),
         }
     }
 }
 
 vectorised! {
-    /// `x = mish(x + bias)`, row by row.
-    pub fn bias_mish(x: &mut [f32], bias: &[f32]) {
-        for row in x.chunks_exact_mut(bias.len()) {
-            for (x, b) in row.iter_mut().zip(bias) {
-                *x = mish(*x + b);
-            }
-        }
-    }
-}
-
-vectorised! {
-    /// `x = mish(x + bias)`, `slope = mish'(x + bias)`, row by row.
-    pub fn bias_mish_slope(x: &mut [f32], bias: &[f32], slope: &mut [f32]) {
-        for (row, slope) in x.chunks_exact_mut(bias.len()).zip(slope.chunks_exact_mut(bias.len())) {
-            for ((x, b), slope) in row.iter_mut().zip(bias).zip(slope) {
-                (*x, *slope) = mish_and_slope(*x + b);
-            }
+    /// `x = f(x + bias)`, `slope = f'(x + bias)`, row by row.
+    pub fn activate_with_slope(f: Activation, x: &mut [f32], bias: &[f32], slope: &mut [f32]) {
+        match f {
+            Activation::Mish => rows_with_slope(x, bias, slope, mish_and_slope),
+            Activation::Relu => rows_with_slope(x, bias, slope, relu_and_slope),
+            Activation::Silu => rows_with_slope(x, bias, slope, silu_and_slope),
+            Activation::Tanh => rows_with_slope(x, bias, slope, tanh_and_slope),
         }
     }
 }
@@ -121,42 +168,59 @@ pub(crate) mod tests {
         (x * t, t + x * (1.0 - t * t) / (1.0 + (-x).exp()))
     }
 
-    #[test]
-    fn mish_matches_its_definition() {
-        for i in -4000..=4000 {
-            let x = i as f32 * 0.025;
-            let (mut y, mut slope) = ([0.0], [0.0]);
-            mish_slope(&[x], &mut y, &mut slope);
-            let (y64, slope64) = mish_f64(f64::from(x));
-            assert!((f64::from(y[0]) - y64).abs() <= 1e-6 * y64.abs() + 1e-12, "mish({x}) = {} for {y64}", y[0]);
-            assert!((f64::from(slope[0]) - slope64).abs() <= 2e-6 * slope64.abs() + 1e-6, "mish'({x})");
+    /// Any activation and its derivative in double precision.
+    fn exact(f: Activation, x: f64) -> (f64, f64) {
+        let sigmoid = 1.0 / (1.0 + (-x).exp());
+        match f {
+            Activation::Mish => mish_f64(x),
+            Activation::Relu => (x.max(0.0), f64::from(x > 0.0)),
+            Activation::Silu => (x * sigmoid, sigmoid * (1.0 + x * (1.0 - sigmoid))),
+            Activation::Tanh => (x.tanh(), 1.0 - x.tanh().powi(2)),
         }
     }
 
+    const ALL: [Activation; 4] = [Activation::Mish, Activation::Relu, Activation::Silu, Activation::Tanh];
+
+    fn at(f: Activation, x: f32) -> (f32, f32) {
+        let (mut y, mut plain, mut slope) = ([x], [x], [0.0]);
+        activate_with_slope(f, &mut y, &[0.0], &mut slope);
+        activate(f, &mut plain, &[0.0]);
+        assert!((y[0] - plain[0]).abs() <= 1e-6 * y[0].abs() || x.is_nan(), "{f:?}({x})");
+        (y[0], slope[0])
+    }
+
     #[test]
-    fn mish_is_finite_everywhere() {
-        for x in [-f32::MAX, -1e30, -100.0, -0.0, 0.0, 88.0, 89.0, 1e4, 1e30] {
-            let (mut y, mut slope) = ([0.0], [0.0]);
-            mish_slope(&[x], &mut y, &mut slope);
-            assert!(y[0].is_finite() && slope[0].is_finite(), "at {x}: {} {}", y[0], slope[0]);
+    fn activations_match_their_definitions() {
+        for (f, i) in ALL.into_iter().flat_map(|f| (-4000..=4000).map(move |i| (f, i))) {
+            let x = i as f32 * 0.025;
+            let ((y, slope), (y64, slope64)) = (at(f, x), exact(f, f64::from(x)));
+            assert!((f64::from(y) - y64).abs() <= 1e-6 * y64.abs() + 2e-7, "{f:?}({x}) = {y} for {y64}");
+            assert!((f64::from(slope) - slope64).abs() <= 2e-6 * slope64.abs() + 1e-6, "{f:?}'({x})");
+        }
+        let mish = at(Activation::Mish, -30.0).0;
+        assert!((f64::from(mish) / exact(Activation::Mish, -30.0).0 - 1.0).abs() < 1e-6, "relatively, too: {mish}");
+    }
+
+    #[test]
+    fn activations_are_finite_everywhere() {
+        for (f, x) in ALL.into_iter().flat_map(|f| [-f32::MAX, -1e30, -100.0, -0.0, 88.0, 89.0, 1e30].map(|x| (f, x))) {
+            let (y, slope) = at(f, x);
+            assert!(y.is_finite() && slope.is_finite(), "{f:?} at {x}: {y} {slope}");
         }
     }
 
     #[test]
     fn a_unit_that_is_off_makes_no_subnormal_numbers() {
-        for x in [-30.0, -50.0, -87.0, -1e3, -1e30] {
-            let (mut y, mut slope) = ([0.0], [0.0]);
-            mish_slope(&[x], &mut y, &mut slope);
-            assert!((1e-10 * y[0]).is_normal() && (1e-10 * slope[0]).is_normal(), "at {x}: {} {}", y[0], slope[0]);
+        for (f, x) in
+            [Activation::Mish, Activation::Silu].into_iter().flat_map(|f| [-30.0, -87.0, -1e30].map(|x| (f, x)))
+        {
+            let (y, slope) = at(f, x);
+            assert!((1e-10 * y).is_normal() && (1e-10 * slope).is_normal(), "{f:?} at {x}: {y} {slope}");
         }
     }
 
     #[test]
     fn a_nan_is_not_hidden() {
-        let (mut y, mut slope) = ([0.0], [0.0]);
-        mish_slope(&[f32::NAN], &mut y, &mut slope);
-        assert!(y[0].is_nan());
-        mish_in_place(&mut y);
-        assert!(y[0].is_nan());
+        assert!(ALL.into_iter().all(|f| at(f, f32::NAN).0.is_nan()));
     }
 }

@@ -2,7 +2,7 @@
 //!
 //! Matrices are row-major slices; `width` is the number of columns.
 
-use crate::activation::{mish, mish_and_slope};
+use crate::activation::{Activation, mish, relu, silu_and_slope, tanh_and_slope};
 use crate::vectorised::vectorised;
 
 /// Lanes that the loops work on at a time: one AVX-512 register of f32.
@@ -69,47 +69,34 @@ impl FirstLayer<'_> {
     }
 }
 
-vectorised! {
-    /// `out = mish(base + shift + actions · kernel)`, `rows × width`.
-    pub fn first_layer(layer: &FirstLayer<'_>, out: &mut [f32]) {
-        let width = layer.shift.len();
-        for (row, out) in out.chunks_exact_mut(width).enumerate() {
-            let a = layer.action(row);
-            let base = &layer.base[row / layer.repeat * width..][..width];
-            let whole = width - width % LANES;
-            for at in (0..whole).step_by(LANES) {
-                let acc = layer.before_activation(base, a, at);
-                let out = &mut out[at..at + LANES];
-                for l in 0..LANES {
-                    out[l] = mish(acc[l]);
-                }
+#[inline(always)]
+fn first_rows(layer: &FirstLayer<'_>, out: &mut [f32], f: impl Fn(f32) -> f32) {
+    let width = layer.shift.len();
+    for (row, out) in out.chunks_exact_mut(width).enumerate() {
+        let a = layer.action(row);
+        let base = &layer.base[row / layer.repeat * width..][..width];
+        let whole = width - width % LANES;
+        for at in (0..whole).step_by(LANES) {
+            let acc = layer.before_activation(base, a, at);
+            let out = &mut out[at..at + LANES];
+            for l in 0..LANES {
+                out[l] = f(acc[l]);
             }
-            for at in whole..width {
-                out[at] = mish(combine_one(base[at] + layer.shift[at], a, layer.kernel, width, at));
-            }
+        }
+        for at in whole..width {
+            out[at] = f(combine_one(base[at] + layer.shift[at], a, layer.kernel, width, at));
         }
     }
 }
 
 vectorised! {
-    /// `first_layer` that also keeps the slope for the backward pass.
-    pub fn first_layer_slope(layer: &FirstLayer<'_>, out: &mut [f32], slope: &mut [f32]) {
-        let width = layer.shift.len();
-        for (row, (out, slope)) in out.chunks_exact_mut(width).zip(slope.chunks_exact_mut(width)).enumerate() {
-            let a = layer.action(row);
-            let base = &layer.base[row / layer.repeat * width..][..width];
-            let whole = width - width % LANES;
-            for at in (0..whole).step_by(LANES) {
-                let acc = layer.before_activation(base, a, at);
-                let (out, slope) = (&mut out[at..at + LANES], &mut slope[at..at + LANES]);
-                for l in 0..LANES {
-                    (out[l], slope[l]) = mish_and_slope(acc[l]);
-                }
-            }
-            for at in whole..width {
-                let x = combine_one(base[at] + layer.shift[at], a, layer.kernel, width, at);
-                (out[at], slope[at]) = mish_and_slope(x);
-            }
+    /// `out = f(base + shift + actions · kernel)`, `rows × width`.
+    pub fn first_layer(f: Activation, layer: &FirstLayer<'_>, out: &mut [f32]) {
+        match f {
+            Activation::Mish => first_rows(layer, out, mish),
+            Activation::Relu => first_rows(layer, out, relu),
+            Activation::Silu => first_rows(layer, out, |x| silu_and_slope(x).0),
+            Activation::Tanh => first_rows(layer, out, |x| tanh_and_slope(x).0),
         }
     }
 }
@@ -181,15 +168,11 @@ mod tests {
             }
             let layer =
                 FirstLayer { base: &x, repeat: 1, shift: &v[..width], actions: &[0.3, -0.2, 0.9], kernel: &v[width..] };
-            let (mut plain, mut y, mut slope) = (vec![0.0; 3 * width], vec![0.0; 3 * width], vec![0.0; 3 * width]);
-            first_layer(&layer, &mut plain);
-            first_layer_slope(&layer, &mut y, &mut slope);
-            assert_eq!(plain.len(), y.len());
-            for i in 0..3 * width {
+            let mut y = vec![0.0; 3 * width];
+            first_layer(Activation::Mish, &layer, &mut y);
+            for (i, y) in y.iter().enumerate() {
                 let pre = x[i] + v[i % width] + [0.3, -0.2, 0.9][i / width] * v[width + i % width];
-                let (y64, slope64) = mish_f64(f64::from(pre));
-                assert!((f64::from(plain[i]) - y64).abs() < 1e-5 && (f64::from(y[i]) - y64).abs() < 1e-5);
-                assert!((f64::from(slope[i]) - slope64).abs() < 1e-5);
+                assert!((f64::from(*y) - mish_f64(f64::from(pre)).0).abs() < 1e-5);
             }
         }
     }

@@ -1,11 +1,14 @@
-//! The diffusion policy: the best of N_a candidates (Eq. 25), drawn from the target actor and valued by the target critics.
+//! The diffusion policy: it draws candidates from the target actor, of which it takes one by what the target critics say of
+//! them, the best if nothing else is asked for (Eq. 25).
 
+use crate::choice::{Choice, Rule};
 use crate::ensemble::Ensemble;
 use crate::error::PolicyError;
 use crate::noise_predictor::NoisePredictor;
-use crate::policy::{ActionNoise, Cost, Policy, check_range};
+use crate::policy::{EpisodeState, Policy, check_range};
 use crate::precision::Precision;
-use crate::shape::{EnsembleShape, NoiseShape, tile_numbers};
+use crate::schedule::Reverse;
+use crate::shape::{EnsembleShape, MlpConfig, NoiseShape, tile_numbers};
 use crate::slices::read;
 use crate::weights::{Layout, Tensors, Weights};
 use candle_core::{Device, Tensor};
@@ -13,42 +16,60 @@ use serde::{Deserialize, Serialize};
 
 /// Most denoising steps that are believed; the tensors' shapes do not bound them.
 const MOST_STEPS: usize = 1000;
-/// Before the names of the two networks' tensors.
+/// Before the names of the networks' tensors.
 const ACTOR: &str = "actor.";
 const CRITIC: &str = "critic.";
+const VALUE: &str = "value.";
 
 /// The shapes of a diffusion policy's networks.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
 pub struct DiffusionShape {
     /// Numbers in an observation s.
     pub observation_dim: usize,
     /// Numbers in an action a.
     pub action_dim: usize,
-    /// Width of the three hidden layers of noise predictor and critics.
-    pub hidden: usize,
+    /// The noise predictor's hidden layers.
+    pub actor: MlpConfig,
+    /// The critics' hidden layers.
+    pub critic: MlpConfig,
+    /// The value function's, if there is one.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub value: Option<MlpConfig>,
     /// Ensemble size K.
     pub critics: usize,
     /// Denoising steps T.
     pub diffusion_steps: usize,
+    /// How each of them is made when sampling.
+    #[serde(default)]
+    pub reverse: Reverse,
 }
 
 impl DiffusionShape {
     /// Of the noise predictor.
     pub fn actor(&self) -> NoiseShape {
-        let Self { observation_dim, action_dim, hidden, diffusion_steps, .. } = *self;
-        NoiseShape { observation_dim, action_dim, hidden, diffusion_steps }
+        let Self { observation_dim, action_dim, diffusion_steps, reverse, .. } = *self;
+        NoiseShape { observation_dim, action_dim, layers: self.actor.clone(), diffusion_steps, reverse }
     }
 
     /// Of the critics.
     pub fn critics(&self) -> EnsembleShape {
-        let Self { observation_dim, action_dim, hidden, critics, .. } = *self;
-        EnsembleShape { members: critics, observation_dim, action_dim, hidden, outputs: 1 }
+        let Self { observation_dim, action_dim, critics, .. } = *self;
+        EnsembleShape { members: critics, observation_dim, action_dim, layers: self.critic.clone(), outputs: 1 }
+    }
+
+    /// Of the value function, if there is one.
+    pub fn value(&self) -> Option<EnsembleShape> {
+        let layers = self.value.clone()?;
+        Some(EnsembleShape { members: 1, action_dim: 0, layers, ..self.critics() })
     }
 
     fn check(&self) -> Result<(), PolicyError> {
         check_range("observation_dim", self.observation_dim)?;
         check_range("action_dim", self.action_dim)?;
-        check_range("hidden", self.hidden)?;
+        self.actor.check("actor.hidden")?;
+        self.critic.check("critic.hidden")?;
+        self.value.as_ref().map_or(Ok(()), |value| value.check("value.hidden"))?;
         check_range("critics", self.critics)?;
         if self.diffusion_steps > MOST_STEPS {
             return Err(PolicyError::Range { field: "diffusion_steps", value: self.diffusion_steps });
@@ -57,79 +78,86 @@ impl DiffusionShape {
     }
 }
 
-/// Target actor and target critics.
+/// Target actor, target critics and, if the choice takes it, a value function.
 pub struct DiffusionPolicy {
     shape: DiffusionShape,
+    choice: Choice,
     actor: NoisePredictor,
     critics: Ensemble,
+    value: Option<Ensemble>,
+    precision: Precision,
 }
 
-/// Of some states: the chosen actions, `states × action_dim`; which candidates they are; and the ensemble-mean values of
-/// all candidates, `states × candidates`.
-type Choice = (Vec<f32>, Vec<usize>, Vec<f32>);
-
 impl DiffusionPolicy {
-    /// What it is called on the wire.
-    pub const KIND: &str = "diffusion";
-
-    /// The tensors of a policy of these networks, as they are named in a file.
-    pub fn tensors(actor: &NoisePredictor, critics: &Ensemble) -> candle_core::Result<Tensors> {
+    /// The tensors of a policy of these networks, as they are named in a file. There is a value function exactly if
+    /// the shape says so.
+    pub fn tensors(
+        actor: &NoisePredictor,
+        critics: &Ensemble,
+        value: Option<&Ensemble>,
+    ) -> candle_core::Result<Tensors> {
         let mut tensors = actor.weights().tensors(ACTOR)?;
         tensors.extend(critics.weights().tensors(CRITIC)?);
+        if let Some(value) = value {
+            tensors.extend(value.weights().tensors(VALUE)?);
+        }
         Ok(tensors)
     }
 
     pub(crate) fn load(
         shape: DiffusionShape,
+        choice: Choice,
         tensors: &mut Tensors,
         precision: Precision,
     ) -> Result<Self, PolicyError> {
         shape.check()?;
+        choice.check()?;
         let mut weights = |layout: Layout, prefix: &str| -> Result<Weights, PolicyError> {
             let values = layout.join(tensors, prefix)?;
             Ok(Weights::constant(layout, values))
         };
         let actor = NoisePredictor::new(shape.actor(), weights(shape.actor().layout(), ACTOR)?, precision);
         let critics = Ensemble::new(shape.critics(), weights(shape.critics().layout(), CRITIC)?, precision);
-        Ok(Self { shape, actor, critics })
+        let value = match shape.value() {
+            Some(of) => Some(Ensemble::new(of.clone(), weights(of.layout(), VALUE)?, precision)),
+            None if choice.needs_value() => return Err(PolicyError::NoValue),
+            None => None,
+        };
+        Ok(Self { shape, choice, actor, critics, value, precision })
     }
 
-    /// Draws candidates, with noise `T × states × candidates × action_dim`, and chooses the best. With one candidate the
-    /// critics are not asked.
-    pub(crate) fn choose(
-        &self,
-        observations: &[f32],
-        candidates: usize,
-        noise: Vec<f32>,
-    ) -> Result<Choice, PolicyError> {
-        let DiffusionShape { observation_dim, action_dim, critics, diffusion_steps, .. } = self.shape;
-        let states = observations.len() / observation_dim;
+    /// Draws candidates with noise `T × states × candidates × action_dim`. Gives these, `states × candidates × action_dim`,
+    /// and what the choice's rule compares of each, `states × candidates`: zeros where there is nothing to choose.
+    pub(crate) fn draw(&self, observations: &[f32], noise: Vec<f32>) -> Result<(Vec<f32>, Vec<f32>), PolicyError> {
+        let DiffusionShape { observation_dim, action_dim, diffusion_steps, .. } = self.shape;
+        let (states, candidates) = (observations.len() / observation_dim, self.choice.candidates as usize);
         let rows = states * candidates;
         let observations = Tensor::from_slice(observations, (states, observation_dim), &Device::Cpu)?;
         let noise = Tensor::from_vec(noise, (diffusion_steps, rows, action_dim), &Device::Cpu)?;
         let drawn = self.actor.sample(&observations, &noise)?;
-        let mut values = vec![0.0; rows];
-        if candidates > 1 {
-            read(&self.critics.values(&observations, &drawn)?, |each: &[f32]| {
-                for critic in each.chunks_exact(rows) {
-                    values.iter_mut().zip(critic).for_each(|(mean, q)| *mean += q / critics as f32);
-                }
-            })?;
+        let worth = match candidates {
+            1 => vec![0.0; rows],
+            _ => self.worth(&observations, &drawn)?,
+        };
+        Ok((read(&drawn, <[f32]>::to_vec)?, worth))
+    }
+
+    /// What the choice's rule compares of each of some actions.
+    fn worth(&self, observations: &Tensor, actions: &Tensor) -> Result<Vec<f32>, PolicyError> {
+        let rows = actions.dim(0)?;
+        let values = self.critics.values(observations, actions)?;
+        let mut worth = read(&values, |values: &[f32]| self.choice.value.reduce(values, rows))?;
+        if let (Rule::Nearest, Some(value)) = (self.choice.rule, &self.value) {
+            let of_states = read(&value.state_values(observations)?, <[f32]>::to_vec)?;
+            for (of_one, v) in worth.chunks_exact_mut(self.choice.candidates as usize).zip(of_states) {
+                of_one.iter_mut().for_each(|q| *q = -(*q - v).powi(2));
+            }
         }
-        let chosen = values.chunks_exact(candidates).map(best).collect::<Result<Vec<_>, _>>()?;
-        let actions = read(&drawn, |drawn: &[f32]| {
-            let row = |(i, chosen): (usize, &usize)| &drawn[(i * candidates + chosen) * action_dim..][..action_dim];
-            chosen.iter().enumerate().flat_map(row).copied().collect::<Vec<f32>>()
-        })?;
-        Ok((actions, chosen, values))
+        Ok(worth)
     }
 }
 
 impl Policy for DiffusionPolicy {
-    fn kind(&self) -> &'static str {
-        Self::KIND
-    }
-
     fn observation_dim(&self) -> usize {
         self.shape.observation_dim
     }
@@ -138,59 +166,55 @@ impl Policy for DiffusionPolicy {
         self.shape.action_dim
     }
 
-    fn samples_candidates(&self) -> bool {
-        true
+    fn precision(&self) -> Precision {
+        self.precision.in_effect()
     }
 
-    fn cost(&self, states: usize, candidates: usize) -> Cost {
-        let DiffusionShape { observation_dim, action_dim, hidden, diffusion_steps, .. } = self.shape;
-        let (states, candidates, steps) = (states as u64, candidates as u64, diffusion_steps as u64);
+    fn choice(&self) -> Option<Choice> {
+        Some(self.choice)
+    }
+
+    fn choose(&mut self, choice: Choice) -> Result<(), PolicyError> {
+        choice.check()?;
+        if choice.needs_value() && self.value.is_none() {
+            return Err(PolicyError::NoValue);
+        }
+        self.choice = choice;
+        Ok(())
+    }
+
+    fn memory(&self, states: usize) -> u64 {
+        let DiffusionShape { observation_dim, action_dim, diffusion_steps, .. } = self.shape;
+        let (states, candidates, steps) = (states as u64, u64::from(self.choice.candidates), diffusion_steps as u64);
         let rows = states.saturating_mul(candidates);
         // The noise of all steps, the candidates and their copies, and their values.
         let drawn = rows.saturating_mul(action_dim as u64).saturating_mul(steps + 3).saturating_add(rows);
         let observed = states.saturating_mul(observation_dim as u64);
-        let sampling = drawn.saturating_add(observed).saturating_add(tile_numbers(candidates, hidden));
-        let critics = self.shape.critics().cost(states, candidates);
-        let actor = rows.saturating_mul(steps).saturating_mul(self.shape.actor().layout().count() as u64);
-        Cost {
-            bytes: sampling.saturating_mul(4).saturating_add(critics.bytes),
-            products: actor.saturating_add(critics.products),
-        }
+        let sampling = drawn.saturating_add(observed).saturating_add(tile_numbers(candidates, &self.shape.actor));
+        let of_states = self.shape.value().map_or(0, |value| value.memory(states, 1));
+        let critics = self.shape.critics().memory(states, candidates).saturating_add(of_states);
+        sampling.saturating_mul(4).saturating_add(critics)
     }
 
-    fn act(
-        &self,
-        observations: &[f32],
-        candidates: usize,
-        noise: &mut [ActionNoise],
-        actions: &mut [f32],
-    ) -> Result<(), PolicyError> {
-        let (n, steps) = (noise.len(), self.shape.diffusion_steps);
-        let row = candidates * self.shape.action_dim;
-        let mut draws = vec![0.0; steps * n * row];
-        for (i, stream) in noise.iter_mut().enumerate() {
-            for step in 0..steps {
-                stream.fill(&mut draws[(step * n + i) * row..][..row]);
+    fn act(&self, observations: &[f32], states: &mut [EpisodeState], actions: &mut [f32]) -> Result<(), PolicyError> {
+        let DiffusionShape { action_dim, diffusion_steps, .. } = self.shape;
+        let (n, candidates) = (states.len(), self.choice.candidates as usize);
+        let row = candidates * action_dim;
+        let mut noise = vec![0.0; diffusion_steps * n * row];
+        for (i, state) in states.iter_mut().enumerate() {
+            for step in 0..diffusion_steps {
+                state.fill_normal(&mut noise[(step * n + i) * row..][..row]);
             }
         }
-        actions.copy_from_slice(&self.choose(observations, candidates, draws)?.0);
+        let (drawn, worth) = self.draw(observations, noise)?;
+        let of_each = drawn.chunks_exact(row).zip(worth.chunks_exact(candidates)).zip(states);
+        for (action, ((drawn, worth), state)) in actions.chunks_exact_mut(action_dim).zip(of_each) {
+            let chosen = self.choice.pick(worth, state)?;
+            action.copy_from_slice(&drawn[chosen * action_dim..][..action_dim]);
+        }
         match actions.iter().any(|x| x.is_nan()) {
             true => Err(PolicyError::NotANumber("a sampled action")),
             false => Ok(()),
         }
     }
-}
-
-/// The place of the largest value, the first of equals.
-fn best(values: &[f32]) -> Result<usize, PolicyError> {
-    let mut best = 0;
-    for (i, value) in values.iter().enumerate() {
-        if value.is_nan() {
-            return Err(PolicyError::NotANumber("the value of a candidate"));
-        }
-        if *value > values[best] {
-            best = i;
-        }
-    }
-    Ok(best)
 }

@@ -6,20 +6,29 @@ pub enum PolicyError {
     /// The bytes are no safetensors file.
     #[error("the weights are not a readable safetensors file")]
     Unreadable(#[from] safetensors::SafeTensorError),
-    /// The file does not say which kind of policy it holds.
-    #[error("the weights do not say what kind of policy they are (metadata `policy`)")]
-    NoDescription,
+    /// The file does not say what policy it holds.
+    #[error("the weights do not say what policy they are (metadata `quad`)")]
+    NoHeader,
     /// What it says is not understood.
     #[error("what the weights say about themselves is not understood: {0}")]
-    Description(#[from] serde_json::Error),
+    Header(#[from] serde_json::Error),
     /// A shape with a number out of range.
     #[error("the weights' {field} is {value}, which is out of range")]
     Range {
-        /// Name in the description.
+        /// Name in the header.
         field: &'static str,
         /// What it says.
         value: usize,
     },
+    /// A temperature that nothing can be drawn with.
+    #[error("the softmax's temperature is {0}, but must be above 0")]
+    Temperature(f32),
+    /// It is to choose among candidates, but draws none.
+    #[error("this policy draws no candidates, so there is nothing to choose among")]
+    NoCandidates,
+    /// It is to choose by a value function, but has none.
+    #[error("the rule `nearest` takes a value function, which this policy does not have")]
+    NoValue,
     /// A tensor is missing.
     #[error("the weights lack the tensor {0:?}")]
     Missing(String),

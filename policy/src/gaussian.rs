@@ -2,9 +2,9 @@
 
 use crate::ensemble::Ensemble;
 use crate::error::PolicyError;
-use crate::policy::{ActionNoise, Cost, Policy, check_range};
+use crate::policy::{EpisodeState, Policy, check_range};
 use crate::precision::Precision;
-use crate::shape::EnsembleShape;
+use crate::shape::{EnsembleShape, MlpConfig};
 use crate::slices::read;
 use crate::weights::{Tensors, Weights};
 use candle_core::{Device, Result, Tensor};
@@ -14,21 +14,23 @@ use serde::{Deserialize, Serialize};
 const ACTOR: &str = "actor.";
 
 /// The shape of a Gaussian policy's network.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
 pub struct GaussianShape {
     /// Numbers in an observation s.
     pub observation_dim: usize,
     /// Numbers in an action a.
     pub action_dim: usize,
-    /// Width of the three hidden layers.
-    pub hidden: usize,
+    /// Its hidden layers.
+    pub actor: MlpConfig,
 }
 
 impl GaussianShape {
     /// Of the network whose tanh is the mean.
     pub fn actor(&self) -> EnsembleShape {
-        let Self { observation_dim, action_dim, hidden } = *self;
-        EnsembleShape { members: 1, observation_dim, action_dim: 0, hidden, outputs: action_dim }
+        let Self { observation_dim, action_dim, .. } = *self;
+        let layers = self.actor.clone();
+        EnsembleShape { members: 1, observation_dim, action_dim: 0, layers, outputs: action_dim }
     }
 }
 
@@ -44,9 +46,6 @@ pub fn gaussian_mean(actor: &Ensemble, observations: &Tensor) -> Result<Tensor> 
 }
 
 impl GaussianPolicy {
-    /// What it is called on the wire.
-    pub const KIND: &str = "gaussian";
-
     /// The tensors of a policy with this network, as they are named in a file.
     pub fn tensors(actor: &Ensemble) -> Result<Tensors> {
         actor.weights().tensors(ACTOR)
@@ -55,18 +54,15 @@ impl GaussianPolicy {
     pub(crate) fn load(shape: GaussianShape, tensors: &mut Tensors) -> std::result::Result<Self, PolicyError> {
         check_range("observation_dim", shape.observation_dim)?;
         check_range("action_dim", shape.action_dim)?;
-        check_range("hidden", shape.hidden)?;
+        shape.actor.check("actor.hidden")?;
         let layout = shape.actor().layout();
         let values = layout.join(tensors, ACTOR)?;
-        Ok(Self { shape, actor: Ensemble::new(shape.actor(), Weights::constant(layout, values), Precision::F32) })
+        let actor = Ensemble::new(shape.actor(), Weights::constant(layout, values), Precision::F32);
+        Ok(Self { shape, actor })
     }
 }
 
 impl Policy for GaussianPolicy {
-    fn kind(&self) -> &'static str {
-        Self::KIND
-    }
-
     fn observation_dim(&self) -> usize {
         self.shape.observation_dim
     }
@@ -75,24 +71,23 @@ impl Policy for GaussianPolicy {
         self.shape.action_dim
     }
 
-    fn samples_candidates(&self) -> bool {
-        false
+    fn precision(&self) -> Precision {
+        Precision::F32
     }
 
-    fn cost(&self, states: usize, _candidates: usize) -> Cost {
+    fn memory(&self, states: usize) -> u64 {
         let GaussianShape { observation_dim, action_dim, .. } = self.shape;
-        let Cost { bytes, products } = self.shape.actor().cost(states as u64, 1);
-        Cost { bytes: bytes + 4 * states as u64 * (observation_dim + 2 * action_dim) as u64, products }
+        let numbers = states as u64 * (observation_dim + 2 * action_dim) as u64;
+        self.shape.actor().memory(states as u64, 1) + 4 * numbers
     }
 
     fn act(
         &self,
         observations: &[f32],
-        _candidates: usize,
-        noise: &mut [ActionNoise],
+        states: &mut [EpisodeState],
         actions: &mut [f32],
     ) -> std::result::Result<(), PolicyError> {
-        let observations = Tensor::from_slice(observations, (noise.len(), self.shape.observation_dim), &Device::Cpu)?;
+        let observations = Tensor::from_slice(observations, (states.len(), self.shape.observation_dim), &Device::Cpu)?;
         let means = gaussian_mean(&self.actor, &observations)?;
         read(&means, |means: &[f32]| actions.copy_from_slice(means))?;
         if actions.iter().any(|x| x.is_nan()) {

@@ -1,5 +1,6 @@
 //! Kinds of policy, and how one is read from a file that says which it is.
 
+use crate::choice::Choice;
 use crate::diffusion::{DiffusionPolicy, DiffusionShape};
 use crate::error::PolicyError;
 use crate::gaussian::{GaussianPolicy, GaussianShape};
@@ -9,46 +10,47 @@ use crate::weights::{Tensors, check_finite};
 use candle_core::Device;
 use candle_core::safetensors::Load;
 use safetensors::{SafeTensorError, SafeTensors};
+use serde::de::{DeserializeOwned, IgnoredAny};
 use serde::{Deserialize, Serialize};
 use std::collections::{BTreeMap, HashMap};
 
-/// Key of the description in a safetensors file's metadata.
-const DESCRIPTION: &str = "policy";
+/// Key of the header in a safetensors file's metadata.
+const HEADER: &str = "quad";
 /// Longest header of a safetensors file that is read, bytes. The paper's networks have 3 KB; a million empty tensors would
 /// take a gigabyte of memory before anything else is known of them.
 const MAX_HEADER: u64 = 1 << 20;
 
-/// What a file of weights says about itself: the kind of policy and the shapes of its networks.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
-#[serde(tag = "kind", rename_all = "lowercase")]
-pub enum Description {
-    /// Best of several samples of a diffusion model.
-    Diffusion(DiffusionShape),
+/// What a policy is: its kind, the shapes of its networks, and how it chooses.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(tag = "kind", rename_all = "lowercase", deny_unknown_fields)]
+pub enum PolicyConfig {
+    /// One of several samples of a diffusion model.
+    Diffusion {
+        /// Of its networks.
+        shape: DiffusionShape,
+        /// Which sample it is.
+        choice: Choice,
+    },
     /// The mean of a Gaussian.
-    Gaussian(GaussianShape),
+    Gaussian {
+        /// Of its network.
+        shape: GaussianShape,
+    },
 }
 
-impl Description {
-    /// The kind as it is called on the wire.
-    pub fn kind(&self) -> &'static str {
-        match self {
-            Self::Diffusion(_) => DiffusionPolicy::KIND,
-            Self::Gaussian(_) => GaussianPolicy::KIND,
-        }
-    }
+/// What a policy's file says beside its tensors: JSON under one key of its metadata, written once, with the tensors. `O` says
+/// where the policy comes from, which is not looked into here.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Header<O> {
+    /// What it is.
+    pub policy: PolicyConfig,
+    /// Where it comes from.
+    pub origin: O,
+}
 
-    /// What a safetensors file says that it is.
-    ///
-    /// # Errors
-    /// No such file, or one that says nothing of the kind.
-    pub fn read(file: &[u8]) -> Result<Self, PolicyError> {
-        check_header(file)?;
-        let (_, metadata) = SafeTensors::read_metadata(file)?;
-        let described = metadata.metadata().as_ref().and_then(|metadata| metadata.get(DESCRIPTION));
-        Ok(serde_json::from_str(described.ok_or(PolicyError::NoDescription)?)?)
-    }
-
-    /// A safetensors file of a policy's weights that says what they are: always the same bytes for the same numbers.
+impl<O: Serialize> Header<O> {
+    /// The safetensors file of a policy with this header: always the same bytes for the same header and numbers.
     ///
     /// # Errors
     /// A number that is not finite.
@@ -58,21 +60,36 @@ impl Description {
             check_finite(name, tensor)?;
             here.insert(name, tensor.to_device(&Device::Cpu)?);
         }
-        let metadata = HashMap::from([(DESCRIPTION.to_owned(), serde_json::to_string(self)?)]);
+        let metadata = HashMap::from([(HEADER.to_owned(), serde_json::to_string(self)?)]);
         Ok(safetensors::serialize(here, Some(metadata))?)
     }
 }
 
-/// Reads a policy from a safetensors file: exactly the tensors that its description asks for, all finite.
+impl<O: DeserializeOwned> Header<O> {
+    /// What a policy's file says of itself.
+    ///
+    /// # Errors
+    /// No safetensors file, or one without such a header.
+    pub fn read(file: &[u8]) -> Result<Self, PolicyError> {
+        check_header(file)?;
+        let (_, metadata) = SafeTensors::read_metadata(file)?;
+        let header = metadata.metadata().as_ref().and_then(|metadata| metadata.get(HEADER));
+        Ok(serde_json::from_str(header.ok_or(PolicyError::NoHeader)?)?)
+    }
+}
+
+/// Reads a policy from its file: exactly the tensors that its header asks for, all finite.
 ///
 /// # Errors
 /// A file that is not what it should be, or a kind of policy that is not known here.
-pub fn load_policy(bytes: &[u8], precision: Precision) -> Result<Box<dyn Policy>, PolicyError> {
-    let description = Description::read(bytes)?;
-    let mut tensors = read_tensors(bytes)?;
-    let policy: Box<dyn Policy> = match description {
-        Description::Diffusion(shape) => Box::new(DiffusionPolicy::load(shape, &mut tensors, precision)?),
-        Description::Gaussian(shape) => Box::new(GaussianPolicy::load(shape, &mut tensors)?),
+pub fn load_policy(file: &[u8], precision: Precision) -> Result<Box<dyn Policy>, PolicyError> {
+    let Header { policy, origin: IgnoredAny } = Header::read(file)?;
+    let mut tensors = read_tensors(file)?;
+    let policy: Box<dyn Policy> = match policy {
+        PolicyConfig::Diffusion { shape, choice } => {
+            Box::new(DiffusionPolicy::load(shape, choice, &mut tensors, precision)?)
+        }
+        PolicyConfig::Gaussian { shape } => Box::new(GaussianPolicy::load(shape, &mut tensors)?),
     };
     match tensors.into_keys().next() {
         Some(name) => Err(PolicyError::Unexpected(name)),
@@ -101,11 +118,14 @@ fn check_header(file: &[u8]) -> Result<(), PolicyError> {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::ensemble::Ensemble;
+    use crate::weights::Weights;
+    use candle_core::{DType, Tensor};
     use std::fmt::Write;
 
     /// A file of so many tensors without numbers.
     fn empty_tensors(count: usize) -> Vec<u8> {
-        let mut header = String::from("{\"__metadata__\":{\"policy\":\"none\"}");
+        let mut header = String::from("{\"__metadata__\":{\"quad\":\"none\"}");
         for number in 0..count {
             write!(header, ",\"{number:07}\":{{\"dtype\":\"F32\",\"shape\":[0],\"data_offsets\":[0,0]}}").unwrap();
         }
@@ -130,5 +150,37 @@ mod tests {
         for file in [&empty_tensors(10_000)[..], b"short", b""] {
             assert_eq!(refused(file), [false; 2]);
         }
+    }
+    /// The file of a Gaussian policy that is from `origin`.
+    fn gaussian(origin: &str) -> Vec<u8> {
+        let shape = GaussianShape { observation_dim: 3, action_dim: 1, hidden: 4 };
+        let layout = shape.actor().layout();
+        let values = Tensor::zeros(layout.count(), DType::F32, &Device::Cpu).unwrap();
+        let actor = Ensemble::new(shape.actor(), Weights::constant(layout, values), Precision::F32);
+        let header = Header { policy: PolicyConfig::Gaussian { shape }, origin };
+        header.to_safetensors(&GaussianPolicy::tensors(&actor).unwrap()).unwrap()
+    }
+
+    #[test]
+    fn a_file_says_what_it_is_and_where_it_is_from() {
+        let file = gaussian("\"a run\"");
+        assert!((0..30).all(|_| gaussian("\"a run\"") == file), "the same file has the same bytes");
+        let header = Header::<String>::read(&file).unwrap();
+        assert_eq!(header.origin, "\"a run\"");
+        let json = serde_json::to_string(&header.policy).unwrap();
+        assert_eq!(json, r#"{"kind":"gaussian","shape":{"observation_dim":3,"action_dim":1,"hidden":4}}"#);
+        let newer = json.replace("hidden", "width");
+        assert!(serde_json::from_str::<PolicyConfig>(&newer).is_err(), "what is not known is not ignored");
+        let tensor = Tensor::zeros(1, DType::F32, &Device::Cpu).unwrap();
+        let nameless = safetensors::serialize([("weights", tensor)], None).unwrap();
+        assert!(matches!(load_policy(&nameless, Precision::F32), Err(PolicyError::NoHeader)));
+        assert!(matches!(Header::<u64>::read(&file), Err(PolicyError::Header(_))), "another origin than was wanted");
+    }
+
+    #[test]
+    fn a_policy_says_the_precision_that_it_has() {
+        let mut policy = load_policy(&gaussian(""), Precision::Bf16).unwrap();
+        assert_eq!((policy.precision(), policy.choice()), (Precision::F32, None));
+        assert!(matches!(policy.choose(Choice::best_of(1)), Err(PolicyError::NoCandidates)));
     }
 }

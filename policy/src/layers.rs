@@ -1,15 +1,19 @@
 //! Where the layers of some networks of one shape lie in one flat vector.
 //!
 //! A vector for all weights keeps an optimiser's step at one operation, and each named tensor is one contiguous run of it:
-//! layer after layer the kernels of all members, then their biases.
+//! layer after layer the kernels of all members, then their biases, then scales and shifts of the norm, if there is one.
 
-use crate::weights::Part;
+use crate::shape::{Initial, MlpConfig};
+use crate::weights::{Part, Start};
+use std::ops::Range;
 
-/// Linear layers of given widths for K members: for each layer K kernels `[in, out]`, then K biases `[out]`.
+/// Linear layers for K members: for each K kernels `[in, out]`, then K biases `[out]`.
 #[derive(Clone, Debug)]
 pub(crate) struct Layers {
     members: usize,
     widths: Vec<usize>,
+    norm: bool,
+    initial: Initial,
     /// Of each layer's first kernel; behind the last layer, of the end.
     offsets: Vec<usize>,
 }
@@ -24,21 +28,53 @@ pub(crate) struct LayerMut<'a> {
 
 impl Layers {
     /// The first kernel lies at `start`.
-    pub fn new(members: usize, widths: &[usize], start: usize) -> Self {
-        let mut offsets = vec![start];
-        for (layer, pair) in widths.windows(2).enumerate() {
-            offsets.push(offsets[layer] + members * (pair[0] + 1) * pair[1]);
+    pub fn new(members: usize, inputs: usize, config: &MlpConfig, outputs: usize, start: usize) -> Self {
+        let widths: Vec<usize> = [inputs].iter().chain(&config.hidden).chain(&[outputs]).copied().collect();
+        let mut layers = Self { members, widths, norm: config.norm, initial: config.initial, offsets: vec![start] };
+        for layer in 0..layers.count() {
+            let ((inputs, outputs), normed) = (layers.shape(layer), layers.is_normed(layer));
+            let numbers = (inputs + if normed { 3 } else { 1 }) * outputs;
+            layers.offsets.push(layers.offsets[layer] + members * numbers);
         }
-        Self { members, widths: widths.to_vec(), offsets }
+        layers
     }
 
     pub fn count(&self) -> usize {
         self.widths.len() - 1
     }
 
-    /// Where the last layer ends.
-    pub fn end(&self) -> usize {
-        self.offsets[self.count()]
+    /// Networks side by side.
+    pub fn members(&self) -> usize {
+        self.members
+    }
+
+    /// Whether a norm stands between the hidden layers' linear maps and their activations.
+    pub fn norm(&self) -> bool {
+        self.norm
+    }
+
+    fn is_normed(&self, layer: usize) -> bool {
+        self.norm && layer + 1 < self.count()
+    }
+
+    /// Numbers that go in.
+    pub fn inputs(&self) -> usize {
+        self.widths[0]
+    }
+
+    /// Numbers that come out.
+    pub fn outputs(&self) -> usize {
+        self.widths[self.count()]
+    }
+
+    /// Widths of the hidden layers.
+    pub fn hidden(&self) -> &[usize] {
+        &self.widths[1..self.count()]
+    }
+
+    /// Where in the vector they lie.
+    pub fn range(&self) -> Range<usize> {
+        self.offsets[0]..self.offsets[self.count()]
     }
 
     /// (inputs, outputs) of a layer.
@@ -56,8 +92,8 @@ impl Layers {
         &weights[self.offsets[layer] + (self.members * inputs + member) * outputs..][..outputs]
     }
 
-    /// All kernels and biases in the part of a vector that is these layers'. They share nothing, so that each may be
-    /// written by another thread.
+    /// All kernels and biases in the part of a vector that is these layers', which have no norm. They share nothing, so that
+    /// each may be written by another thread.
     pub fn split_mut<'a>(&self, mut rest: &'a mut [f32]) -> Vec<LayerMut<'a>> {
         let mut all = Vec::with_capacity(self.count() * self.members);
         for layer in 0..self.count() {
@@ -71,23 +107,32 @@ impl Layers {
         all
     }
 
-    /// Names, shapes and offsets of the tensors `{prefix}.{layer}.kernel` and `.bias`; `leading` says whether the number
-    /// of members is their first dimension.
+    /// Names, shapes, offsets and initial values of the tensors `{prefix}{layer}.kernel` and `.bias`, and with a norm
+    /// `.scale` and `.shift`; `leading` says whether the number of members is their first dimension.
     pub fn named(&self, prefix: &str, leading: bool) -> Vec<Part> {
-        let members = leading.then_some(self.members);
-        let part = |layer: usize, kind: &str, shape: &[usize], offset| Part {
-            name: format!("{prefix}{layer}.{kind}"),
-            shape: members.into_iter().chain(shape.iter().copied()).collect(),
-            offset,
-        };
-        (0..self.count())
-            .flat_map(|layer| {
-                let ((inputs, outputs), offset) = (self.shape(layer), self.offsets[layer]);
-                [
-                    part(layer, "kernel", &[inputs, outputs], offset),
-                    part(layer, "bias", &[outputs], offset + self.members * inputs * outputs),
-                ]
-            })
-            .collect()
+        let mut parts = Vec::new();
+        for layer in 0..self.count() {
+            let (inputs, outputs) = self.shape(layer);
+            let (kernel, bias) = self.initial.of_layer(inputs, outputs);
+            let mut offset = self.offsets[layer];
+            let mut push = |kind: &str, shape: &[usize], start| {
+                let members = leading.then_some(self.members);
+                let name = format!("{prefix}{layer}.{kind}");
+                parts.push(Part {
+                    name,
+                    shape: members.into_iter().chain(shape.iter().copied()).collect(),
+                    offset,
+                    start,
+                });
+                offset += self.members * shape.iter().product::<usize>();
+            };
+            push("kernel", &[inputs, outputs], kernel);
+            push("bias", &[outputs], bias);
+            if self.is_normed(layer) {
+                push("scale", &[outputs], Start::Constant(1.0));
+                push("shift", &[outputs], Start::Constant(0.0));
+            }
+        }
+        parts
     }
 }

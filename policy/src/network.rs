@@ -1,13 +1,12 @@
-//! The network that all others are made of: three hidden Mish layers over [s, a, …] and a narrow linear output; forward
-//! and backward for one tile of rows.
+//! One network on one tile of rows: hidden layers with an activation each, and a linear output; forward and backward.
 //!
-//! The first layer is taken apart: the state's part is computed once per state, whatever number of actions is tried in
-//! it, and the action's few columns are fused with the activation.
+//! Forward passes that nothing is kept of take the first layer apart: the state's part is computed once per state, whatever
+//! number of actions is tried in it, and the action's few columns are fused with the activation.
 
 use crate::layers::Layers;
 use quad_kernels::Buffer;
-use quad_kernels::activation::{bias_mish, bias_mish_slope, multiply};
-use quad_kernels::narrow::{FirstLayer, dots, first_layer, first_layer_slope, scale_by_combination};
+use quad_kernels::activation::{Activation, activate, activate_with_slope, multiply};
+use quad_kernels::narrow::{FirstLayer, dots, first_layer, scale_by_combination};
 use quad_kernels::product::{Rounded, product, product_transposed};
 use std::cell::RefCell;
 
@@ -19,45 +18,46 @@ const BLOCK: usize = 32;
 /// One member of the networks in a vector of weights.
 #[derive(Clone, Copy)]
 pub(crate) struct Network<'a> {
-    weights: &'a [f32],
-    layers: &'a Layers,
-    member: usize,
-    observation_dim: usize,
-    action_dim: usize,
-    /// The two kernels between hidden layers with their numbers rounded, if they are to be used.
-    rounded: Option<&'a [Rounded; 2]>,
+    pub weights: &'a [f32],
+    pub layers: &'a Layers,
+    pub activation: Activation,
+    pub member: usize,
+    /// The kernels between hidden layers with their numbers rounded, if forward passes are to use these.
+    pub rounded: Option<&'a [Rounded]>,
 }
 
 /// What a tile of rows is fed: `repeat` consecutive rows share a row of `base`.
 #[derive(Clone, Copy)]
 pub(crate) struct Input<'a> {
-    /// State part of the first pre-activation, from [`Network::state_part`].
+    /// State part of the first pre-activation, from [`Network::first_part`].
     pub base: &'a [f32],
     pub repeat: usize,
     /// Added to each row of the first pre-activation (bias and all else that the tile shares).
     pub shift: &'a [f32],
-    /// `rows × action_dim`.
+    /// `rows × a`, behind the state among the inputs; a may be 0.
     pub actions: &'a [f32],
+    /// The first kernel's rows that multiply them: `a × width`.
+    pub kernel: &'a [f32],
 }
 
 /// Activations of a tile's hidden layers, and their slopes; on the backward pass the gradients before the activations.
 pub(crate) struct Activations<'a> {
-    pub x: [&'a mut [f32]; 3],
-    pub slope: [&'a mut [f32]; 3],
+    pub x: Vec<&'a mut [f32]>,
+    pub slope: Vec<&'a mut [f32]>,
 }
 
 /// Buffers of one thread, grown to the largest tile it met.
 #[derive(Default)]
 pub(crate) struct Workspace {
-    x: [Buffer; 3],
-    slope: [Buffer; 3],
-    temporary: Buffer,
+    pair: [Buffer; 2],
     /// The output layer's kernel, transposed.
     output: Buffer,
     /// State part of the first layer.
     base: Buffer,
     /// Network output or its gradient.
     out: Buffer,
+    x: Vec<Buffer>,
+    slope: Vec<Buffer>,
 }
 
 thread_local! {
@@ -83,45 +83,27 @@ impl Workspace {
         result
     }
 
-    /// The activations of `len` numbers a layer, for a tile whose gradients are taken at once.
-    pub fn activations(&mut self, len: usize) -> (Activations<'_>, Scratch<'_>) {
-        let Self { x, slope, temporary, output, .. } = self;
-        let activations =
-            Activations { x: x.each_mut().map(|x| x.sized(len)), slope: slope.each_mut().map(|s| s.sized(len)) };
-        (activations, Scratch { temporary, output })
+    /// Lends room for the activations of `rows` rows, for a tile whose gradients are taken at once.
+    pub fn with_activations<R>(
+        &mut self,
+        rows: usize,
+        widths: &[usize],
+        work: impl FnOnce(&mut Activations<'_>, &mut Self) -> R,
+    ) -> R {
+        let (mut x, mut slope) = (std::mem::take(&mut self.x), std::mem::take(&mut self.slope));
+        x.resize_with(widths.len().max(x.len()), Buffer::default);
+        slope.resize_with(widths.len().max(slope.len()), Buffer::default);
+        let result = {
+            let x = x.iter_mut().zip(widths).map(|(buffer, width)| buffer.sized(rows * width)).collect();
+            let slope = slope.iter_mut().zip(widths).map(|(buffer, width)| buffer.sized(rows * width)).collect();
+            work(&mut Activations { x, slope }, self)
+        };
+        (self.x, self.slope) = (x, slope);
+        result
     }
-
-    pub fn scratch(&mut self) -> Scratch<'_> {
-        Scratch { temporary: &mut self.temporary, output: &mut self.output }
-    }
-}
-
-/// Buffers whose contents are not needed afterwards.
-pub(crate) struct Scratch<'a> {
-    temporary: &'a mut Buffer,
-    output: &'a mut Buffer,
 }
 
 impl<'a> Network<'a> {
-    pub fn new(weights: &'a [f32], layers: &'a Layers, member: usize, dims: (usize, usize)) -> Self {
-        Self { weights, layers, member, observation_dim: dims.0, action_dim: dims.1, rounded: None }
-    }
-
-    /// The same, but forward passes use these kernels, which are of the same weights.
-    pub fn with_rounded(self, rounded: Option<&'a [Rounded; 2]>) -> Self {
-        Self { rounded, ..self }
-    }
-
-    /// Width of the hidden layers.
-    pub fn hidden(&self) -> usize {
-        self.layers.shape(0).1
-    }
-
-    /// Width of the output.
-    fn outputs(&self) -> usize {
-        self.layers.shape(3).1
-    }
-
     pub fn kernel(&self, layer: usize) -> &'a [f32] {
         self.layers.kernel(self.weights, layer, self.member)
     }
@@ -130,108 +112,115 @@ impl<'a> Network<'a> {
         self.layers.bias(self.weights, layer, self.member)
     }
 
-    /// Rows of the first kernel that multiply the action.
-    fn action_kernel(&self) -> &'a [f32] {
-        let from = self.observation_dim * self.hidden();
-        &self.kernel(0)[from..from + self.action_dim * self.hidden()]
+    /// The last layer's number.
+    fn last(&self) -> usize {
+        self.layers.count() - 1
     }
 
-    /// Rows of the first kernel behind those of state and action.
-    pub fn tail_kernel(&self) -> &'a [f32] {
-        &self.kernel(0)[(self.observation_dim + self.action_dim) * self.hidden()..]
+    /// Width of the first hidden layer.
+    pub fn width(&self) -> usize {
+        self.layers.shape(0).1
     }
 
-    /// `out[states × hidden] = observations · kernel_s`, without the bias.
-    pub fn state_part(&self, observations: &[f32], out: &mut [f32]) {
-        let kernel = &self.kernel(0)[..self.observation_dim * self.hidden()];
-        product(observations, kernel, out, self.observation_dim, self.hidden());
+    /// Rows of the first kernel, those that multiply some of the inputs.
+    pub fn first_kernel(&self, from: usize, count: usize) -> &'a [f32] {
+        let width = self.width();
+        &self.kernel(0)[from * width..(from + count) * width]
     }
 
-    fn first(&self, input: Input<'a>) -> FirstLayer<'a> {
-        let Input { base, repeat, shift, actions } = input;
-        FirstLayer { base, repeat, shift, actions, kernel: self.action_kernel() }
+    /// `out[states × width] = x · kernel`, for the first `inputs` of the inputs, without the bias.
+    pub fn first_part(&self, x: &[f32], inputs: usize, out: &mut [f32]) {
+        product(x, self.first_kernel(0, inputs), out, inputs, self.width());
     }
 
-    /// The output layer's kernel as `outputs × hidden`.
+    /// The output layer's kernel as `outputs × width`.
     fn output_rows<'b>(&self, transposed: &'b mut Buffer) -> &'b [f32]
     where
         'a: 'b,
     {
-        let (kernel, hidden, outputs) = (self.kernel(3), self.hidden(), self.outputs());
+        let (kernel, (width, outputs)) = (self.kernel(self.last()), self.layers.shape(self.last()));
         if outputs == 1 {
             return kernel;
         }
         let rows = transposed.sized(kernel.len());
-        for h in 0..hidden {
+        for h in 0..width {
             for j in 0..outputs {
-                rows[j * hidden + h] = kernel[h * outputs + j];
+                rows[j * width + h] = kernel[h * outputs + j];
             }
         }
         rows
     }
 
-    /// The two kernels between hidden layers, rounded; `None` where [`Self::forward`] is as fast without.
-    pub fn round(&self) -> Option<[Rounded; 2]> {
-        let round = |layer| Rounded::new(self.kernel(layer), self.hidden(), self.hidden());
-        Some([round(1)?, round(2)?])
+    /// The kernels between hidden layers, rounded; `None` where [`Self::forward`] is as fast without.
+    pub fn round(&self) -> Option<Vec<Rounded>> {
+        let round = |layer| {
+            let (inputs, outputs) = self.layers.shape(layer);
+            Rounded::new(self.kernel(layer), inputs, outputs)
+        };
+        (1..self.last()).map(round).collect()
     }
 
     /// `out[rows × outputs]` of a tile.
     pub fn forward(&self, input: Input<'_>, work: &mut Workspace, out: &mut [f32]) {
-        let (h, outputs) = (self.hidden(), self.outputs());
-        let [x, y, _] = &mut work.x;
+        let (outputs, width, last) = (self.layers.outputs(), self.width(), self.last());
+        let action_dim = input.kernel.len() / width;
+        let [x, y] = &mut work.pair;
         let output = self.output_rows(&mut work.output);
-        let hidden = |layer: usize, x: &[f32], out: &mut [f32]| {
-            match self.rounded {
-                Some(kernels) => kernels[layer - 1].product(x, out),
-                None => product(x, self.kernel(layer), out, h, h),
-            }
-            bias_mish(out, self.bias(layer));
-        };
         let block = if self.rounded.is_some() { BLOCK } else { TILE };
         let states = (block / input.repeat).max(1);
         let rows = states * input.repeat;
-        for (i, (base, out)) in input.base.chunks(states * h).zip(out.chunks_mut(rows * outputs)).enumerate() {
+        for (i, (base, out)) in input.base.chunks(states * width).zip(out.chunks_mut(rows * outputs)).enumerate() {
             let count = out.len() / outputs;
-            let actions = &input.actions[i * rows * self.action_dim..][..count * self.action_dim];
-            let (x, y) = (x.sized(count * h), y.sized(count * h));
-            let network: Network<'_> = *self;
-            first_layer(&network.first(Input { base, actions, ..input }), x);
-            hidden(1, x, y);
-            hidden(2, y, x);
-            dots(x, output, self.bias(3), out, h);
+            let actions = &input.actions[i * rows * action_dim..][..count * action_dim];
+            let Input { repeat, shift, kernel, .. } = input;
+            first_layer(self.activation, &FirstLayer { base, repeat, shift, actions, kernel }, x.sized(count * width));
+            for layer in 1..last {
+                let (inputs, width) = self.layers.shape(layer);
+                let (x, y) = if layer % 2 == 1 { (&mut *x, &mut *y) } else { (&mut *y, &mut *x) };
+                let (x, y) = (x.sized(count * inputs), y.sized(count * width));
+                match self.rounded {
+                    Some(kernels) => kernels[layer - 1].product(x, y),
+                    None => product(x, self.kernel(layer), y, inputs, width),
+                }
+                activate(self.activation, y, self.bias(layer));
+            }
+            let width = self.layers.shape(last).0;
+            let x = if last % 2 == 1 { &mut *x } else { &mut *y };
+            dots(x.sized(count * width), output, self.bias(last), out, width);
         }
     }
 
-    /// `forward` that leaves activations and slopes behind for `backward`.
-    pub fn forward_saving(&self, input: Input<'_>, left: &mut Activations<'_>, scratch: Scratch<'_>, out: &mut [f32]) {
-        let h = self.hidden();
-        let ([x1, x2, x3], [s1, s2, s3]) = (&mut left.x, &mut left.slope);
-        let network: Network<'_> = *self;
-        first_layer_slope(&network.first(input), x1, s1);
-        product(x1, self.kernel(1), x2, h, h);
-        bias_mish_slope(x2, self.bias(1), s2);
-        product(x2, self.kernel(2), x3, h, h);
-        bias_mish_slope(x3, self.bias(2), s3);
-        dots(x3, self.output_rows(scratch.output), self.bias(3), out, h);
+    /// `forward` of whole rows `rows × inputs` that leaves activations and slopes behind for `backward`.
+    pub fn forward_saving(&self, input: &[f32], left: &mut Activations<'_>, work: &mut Workspace, out: &mut [f32]) {
+        let last = self.last();
+        for layer in 0..last {
+            let (inputs, width) = self.layers.shape(layer);
+            let (before, here) = left.x.split_at_mut(layer);
+            let x = before.last().map_or(input, |x| &**x);
+            product(x, self.kernel(layer), here[0], inputs, width);
+            activate_with_slope(self.activation, here[0], self.bias(layer), left.slope[layer]);
+        }
+        dots(left.x[last - 1], self.output_rows(&mut work.output), self.bias(last), out, self.layers.shape(last).0);
     }
 
     /// Turns the slopes of a tile into the gradients δ before each activation, given that of the output.
-    pub fn backward(&self, output_gradient: &[f32], slope: &mut [&mut [f32]; 3], scratch: Scratch<'_>) {
-        let h = self.hidden();
-        let [s1, s2, s3] = slope;
-        let temporary = scratch.temporary.sized(s1.len());
-        scale_by_combination(s3, output_gradient, self.output_rows(scratch.output), h);
-        product_transposed(s3, self.kernel(2), temporary, h, h);
-        multiply(s2, temporary);
-        product_transposed(s2, self.kernel(1), temporary, h, h);
-        multiply(s1, temporary);
+    pub fn backward(&self, output_gradient: &[f32], slope: &mut [&mut [f32]], work: &mut Workspace) {
+        let last = self.last();
+        let output = self.output_rows(&mut work.output);
+        scale_by_combination(slope[last - 1], output_gradient, output, self.layers.shape(last).0);
+        for layer in (1..last).rev() {
+            let (inputs, width) = self.layers.shape(layer);
+            let (below, above) = slope.split_at_mut(layer);
+            let (below, above) = (&mut *below[layer - 1], &*above[0]);
+            let temporary = work.pair[0].sized(below.len());
+            product_transposed(above, self.kernel(layer), temporary, inputs, width);
+            multiply(below, temporary);
+        }
     }
 
-    /// After `backward`: the action's gradient, `rows × action_dim`, from that before the first activation.
-    pub fn action_gradient(&self, delta: &[f32], out: &mut [f32]) {
-        let zero = vec![0.0; self.action_dim];
-        dots(delta, self.action_kernel(), &zero, out, self.hidden());
+    /// After `backward`: the gradient of the inputs `from .. from + count`, `rows × count`.
+    pub fn input_gradient(&self, first: &[f32], (from, count): (usize, usize), out: &mut [f32]) {
+        product_transposed(first, self.first_kernel(from, count), out, count, self.width());
     }
 }
 

@@ -1,28 +1,37 @@
 //! The noise predictor ε_θ(a^t, s, t) and the sampler that denoises with it.
-//!
-//! On the CPU custom operations of candle's do the work (`noise_ops`); elsewhere plain ones do.
 
-use crate::noise_ops::{Parts, Predict, Sample};
+use crate::mlp::Mlp;
 use crate::operation::OnCpu;
 use crate::plain;
 use crate::precision::Precision;
 use crate::rounded::RoundedOnce;
-use crate::saved::{Pool, SavedActivations};
+use crate::sampler::Sample;
 use crate::schedule::Schedule;
 use crate::shape::{NoiseShape, TIME_FEATURES};
-use crate::slices::{has_fast_body, read};
-use crate::weights::{Tensors, Weights};
-use candle_core::{D, DType, Result, Tensor};
+use crate::weights::Weights;
+use candle_core::{D, DType, Result, Tensor, bail};
+use quad_kernels::activation::Activation;
 use quad_kernels::product::Rounded;
-use std::sync::{Arc, OnceLock};
+use std::sync::Arc;
 
 /// A noise predictor and its weights.
 pub struct NoisePredictor {
     parts: Arc<Parts>,
     weights: Weights,
     precision: Precision,
-    rounded: RoundedOnce<Option<[Rounded; 2]>>,
-    saved: Pool<SavedActivations>,
+    rounded: RoundedOnce<Option<Vec<Rounded>>>,
+}
+
+/// What does not change in training.
+pub(crate) struct Parts {
+    pub shape: NoiseShape,
+    /// Embeds a denoising step.
+    pub time: Mlp,
+    /// Over [s, a^t, embedding].
+    pub trunk: Mlp,
+    pub schedule: Schedule,
+    /// Sinusoids of t = 1..T, `T × 16`.
+    pub features: Vec<f32>,
 }
 
 /// cos(t·f_k), then sin(t·f_k), with f_k = exp(-k·ln(10000)/7) for k = 0..7, of t = 1..T.
@@ -37,14 +46,13 @@ impl NoisePredictor {
     /// `weights` are of the shape's layout; `precision` is for what no gradient is taken of.
     pub fn new(shape: NoiseShape, weights: Weights, precision: Precision) -> Self {
         let parts = Parts {
-            shape,
-            time: shape.time_layers(),
-            trunk: shape.trunk_layers(),
-            schedule: Schedule::variance_preserving(shape.diffusion_steps),
+            time: Mlp::new(shape.time_layers(), Activation::Mish, "time."),
+            trunk: Mlp::new(shape.trunk_layers(), shape.layers.activation, "trunk."),
+            schedule: Schedule::variance_preserving(shape.diffusion_steps, shape.reverse),
             features: time_features(shape.diffusion_steps),
+            shape,
         };
-        let (rounded, saved) = (RoundedOnce::default(), Pool::default());
-        Self { parts: Arc::new(parts), weights, precision, rounded, saved }
+        Self { parts: Arc::new(parts), weights, precision, rounded: RoundedOnce::default() }
     }
 
     /// Its weights.
@@ -58,8 +66,8 @@ impl NoisePredictor {
     }
 
     /// Its shape.
-    pub fn shape(&self) -> NoiseShape {
-        self.parts.shape
+    pub fn shape(&self) -> &NoiseShape {
+        &self.parts.shape
     }
 
     /// The noise schedule that it was made for.
@@ -67,82 +75,86 @@ impl NoisePredictor {
         &self.parts.schedule
     }
 
-    /// ε_θ(a^t, s, t): `observations [B, o]`, `actions [B, a]`, `t [B]` (u32, in 1..=T) → `[B, a]`. Gradients flow to the
-    /// weights.
+    /// ε_θ(a^t, s, t): `observations [B, o]`, `actions [B, a]`, `t [B]` (u32, in 1..=T) → `[B, a]`. Differentiable in weights,
+    /// observations and actions.
     pub fn predict(&self, observations: &Tensor, actions: &Tensor, t: &Tensor) -> Result<Tensor> {
-        let weights = self.weights.values();
-        if !has_fast_body(weights.device()) || observations.track_op() || actions.track_op() {
-            return self.plain_predict(observations, actions, t);
-        }
-        let gradient = match (weights.track_op(), self.weights.kept_gradient()) {
-            (true, Some(kept)) => Some((kept, self.saved.lend())),
-            _ => None,
-        };
-        let operation = OnCpu(Predict {
-            parts: self.parts.clone(),
-            t: read(t, <[u32]>::to_vec)?,
-            gradient,
-            embedding: OnceLock::new(),
-        });
-        weights.apply_op3(&observations.contiguous()?, &actions.contiguous()?, operation)
+        self.predict_by(Mlp::forward, observations, actions, t)
+    }
+
+    /// [`Self::predict`] with one implementation of the networks.
+    pub(crate) fn predict_by(
+        &self,
+        network: fn(&Mlp, &Weights, &Tensor) -> Result<Tensor>,
+        observations: &Tensor,
+        actions: &Tensor,
+        t: &Tensor,
+    ) -> Result<Tensor> {
+        let Parts { time, trunk, features, shape, .. } = &*self.parts;
+        let features = Tensor::from_slice(features, (shape.diffusion_steps, TIME_FEATURES), actions.device())?;
+        let embedding = network(time, &self.weights, &features)?.squeeze(0)?;
+        let embedding = embedding.index_select(&(t.to_dtype(DType::F32)? - 1.0)?.to_dtype(DType::U32)?, 0)?;
+        network(trunk, &self.weights, &Tensor::cat(&[observations, actions, &embedding], D::Minus1)?)?.squeeze(0)
     }
 
     /// The same network with its weights as constants, which share their memory with these.
-    pub fn frozen(&self) -> Self {
-        let (parts, weights) = (self.parts.clone(), self.weights.frozen());
-        Self { parts, weights, precision: Precision::F32, rounded: RoundedOnce::default(), saved: Pool::default() }
+    pub fn detach(&self) -> Self {
+        let (parts, weights) = (self.parts.clone(), self.weights.detach());
+        Self { parts, weights, precision: Precision::F32, rounded: RoundedOnce::default() }
     }
 
-    /// Draws actions by the whole reverse process (DDPM), x_0 clipped to [-1, 1] at each step.
+    /// Draws actions by the whole reverse process (DDPM).
     ///
     /// `observations` is `[n, o]`; `noise` is `[T, rows, a]`, standard normal, where equally many consecutive rows share an
     /// observation: first a^T, then the noise of the reverse steps from t = T down to 2. Gives `[rows, a]`, through which no
     /// gradient flows.
     pub fn sample(&self, observations: &Tensor, noise: &Tensor) -> Result<Tensor> {
         let weights = self.weights.values().detach();
-        if !has_fast_body(weights.device()) {
-            return self.plain_sample(observations, noise);
+        self.check_noise(observations, noise)?;
+        if !self.parts.trunk.is_fast(&self.weights) {
+            return self.detach().sample_by(Mlp::forward, observations, noise);
         }
         let rounded = match self.precision {
             Precision::F32 => None,
-            Precision::Bf16 => Some(self.rounded.get(&self.weights, |weights| self.parts.network(weights).round())?),
+            Precision::Bf16 => {
+                Some(self.rounded.get(&self.weights, |weights| self.parts.trunk.network(weights, 0).round())?)
+            }
         };
         let operation = OnCpu(Sample { parts: self.parts.clone(), rounded });
         weights.apply_op3_no_bwd(&observations.contiguous()?, &noise.contiguous()?, &operation)
     }
 
-    /// [`Self::predict`] in plain candle operations.
-    pub(crate) fn plain_predict(&self, observations: &Tensor, actions: &Tensor, t: &Tensor) -> Result<Tensor> {
-        let weights = self.weights.layout().split(self.weights.values(), "")?;
-        self.plain_predict_with(&weights, observations, actions, t)
+    /// [`Self::sample`], but differentiable in the weights, through every reverse step; slower.
+    pub fn sample_with_gradient(&self, observations: &Tensor, noise: &Tensor) -> Result<Tensor> {
+        self.check_noise(observations, noise)?;
+        self.sample_by(Mlp::forward, observations, noise)
     }
 
-    fn plain_predict_with(
+    /// The reverse process, step by step, with one implementation of the networks.
+    pub(crate) fn sample_by(
         &self,
-        weights: &Tensors,
+        network: fn(&Mlp, &Weights, &Tensor) -> Result<Tensor>,
         observations: &Tensor,
-        actions: &Tensor,
-        t: &Tensor,
+        noise: &Tensor,
     ) -> Result<Tensor> {
-        let steps = self.parts.shape.diffusion_steps;
-        let features = Tensor::from_slice(&self.parts.features, (steps, TIME_FEATURES), t.device())?;
-        let embedding = plain::mlp(weights, "time.", 2, &features)?;
-        let time = embedding.index_select(&(t.to_dtype(DType::F32)? - 1.0)?.to_dtype(DType::U32)?, 0)?;
-        plain::mlp(weights, "trunk.", 4, &Tensor::cat(&[observations, actions, &time], D::Minus1)?)
-    }
-
-    /// [`Self::sample`] in plain candle operations.
-    pub(crate) fn plain_sample(&self, observations: &Tensor, noise: &Tensor) -> Result<Tensor> {
-        let weights = self.weights.layout().split(&self.weights.values().detach(), "")?;
         let (steps, rows, _) = noise.dims3()?;
         let observations = plain::repeat_rows(observations, rows / observations.dim(0)?)?;
         let mut actions = noise.get(0)?;
         for t in (1..=steps).rev() {
             let all = Tensor::full(t as u32, rows, noise.device())?;
-            let epsilon = self.plain_predict_with(&weights, &observations, &actions, &all)?;
+            let epsilon = self.predict_by(network, &observations, &actions, &all)?;
             let z = if t > 1 { Some(noise.get(steps - t + 1)?) } else { None };
             actions = self.schedule().reverse(t, &actions, &epsilon, z.as_ref())?;
         }
         Ok(actions)
+    }
+
+    fn check_noise(&self, observations: &Tensor, noise: &Tensor) -> Result<()> {
+        let NoiseShape { observation_dim, action_dim, diffusion_steps, .. } = self.parts.shape;
+        let ((states, o), (steps, rows, a)) = (observations.dims2()?, noise.dims3()?);
+        let fits = states > 0 && rows > 0 && rows.is_multiple_of(states) && (o, a) == (observation_dim, action_dim);
+        if !fits || steps != diffusion_steps {
+            bail!("a noise predictor of {:?} got {states} × {o} and noise {steps} × {rows} × {a}", self.parts.shape);
+        }
+        Ok(())
     }
 }

@@ -1,8 +1,13 @@
 //! The networks in plain candle operations, which candle differentiates: what runs on a GPU, and what the fast ones
 //! on the CPU are tested against.
 
+use crate::layers::Layers;
 use crate::weights::Tensors;
-use candle_core::{Result, Tensor};
+use candle_core::{D, Result, Tensor};
+use quad_kernels::activation::Activation;
+
+/// Added to a layer norm's variance.
+const EPSILON: f64 = 1e-6;
 
 /// x·tanh(softplus(x)) as x·n/(n + 2) with n = e^x (e^x + 2). From 20 on it is x, to the last bit of f32; the bound keeps
 /// value and derivative finite everywhere (the derivative of candle's own Mish is NaN from 89 on).
@@ -13,20 +18,40 @@ fn mish(x: &Tensor) -> Result<Tensor> {
     x * (&n / (&n + 2.0)?)?
 }
 
-/// Linear layers `{name}0 … {name}{layers - 1}` with Mish between: `x · kernel + bias`. A leading number of members on the
-/// weights is a batch dimension.
-pub(crate) fn mlp(weights: &Tensors, name: &str, layers: usize, x: &Tensor) -> Result<Tensor> {
+fn activate(f: Activation, x: &Tensor) -> Result<Tensor> {
+    match f {
+        Activation::Mish => mish(x),
+        Activation::Relu => x.relu(),
+        Activation::Silu => x.silu(),
+        Activation::Tanh => x.tanh(),
+    }
+}
+
+/// Each row over its numbers: (x - mean)/√(variance + ε)·scale + shift, for `x [K, rows, width]` and `[K, 1, width]`.
+/// (candle-nn's own has no gradient, and says nothing.)
+fn layer_norm(x: &Tensor, scale: &Tensor, shift: &Tensor) -> Result<Tensor> {
+    let centred = x.broadcast_sub(&x.mean_keepdim(D::Minus1)?)?;
+    let deviation = (centred.sqr()?.mean_keepdim(D::Minus1)? + EPSILON)?.sqrt()?;
+    centred.broadcast_div(&deviation)?.broadcast_mul(scale)?.broadcast_add(shift)
+}
+
+/// Layers `{prefix}0 …`: `x [1 or K, rows, in]` → `[K, rows, out]`.
+pub(crate) fn mlp(weights: &Tensors, prefix: &str, layers: &Layers, f: Activation, x: &Tensor) -> Result<Tensor> {
+    // `[K, in, out]` or `[K, 1, out]`, whether the tensors are named as members' or as one network's.
     let get = |layer: usize, kind: &str| {
-        let path = format!("{name}{layer}.{kind}");
-        weights.get(&path).ok_or_else(|| candle_core::Error::CannotFindTensor { path }.bt())
+        let path = format!("{prefix}{layer}.{kind}");
+        let tensor = weights.get(&path).ok_or_else(|| candle_core::Error::CannotFindTensor { path }.bt())?;
+        let rows = if kind == "kernel" { layers.shape(layer).0 } else { 1 };
+        tensor.reshape((layers.members(), rows, layers.shape(layer).1))
     };
     let mut x = x.clone();
-    for layer in 0..layers {
-        let (kernel, bias) = (get(layer, "kernel")?, get(layer, "bias")?);
-        let bias = if bias.rank() == 2 { bias.unsqueeze(1)? } else { bias.clone() };
-        x = x.contiguous()?.broadcast_matmul(kernel)?.broadcast_add(&bias)?;
-        if layer + 1 < layers {
-            x = mish(&x)?;
+    for layer in 0..layers.count() {
+        x = x.contiguous()?.broadcast_matmul(&get(layer, "kernel")?)?.broadcast_add(&get(layer, "bias")?)?;
+        if layer + 1 < layers.count() {
+            if layers.norm() {
+                x = layer_norm(&x, &get(layer, "scale")?, &get(layer, "shift")?)?;
+            }
+            x = activate(f, &x)?;
         }
     }
     Ok(x)
@@ -35,5 +60,8 @@ pub(crate) fn mlp(weights: &Tensors, name: &str, layers: usize, x: &Tensor) -> R
 /// Each row `times` times, one after the other: `[n, w]` → `[n·times, w]`.
 pub(crate) fn repeat_rows(x: &Tensor, times: usize) -> Result<Tensor> {
     let (rows, width) = x.dims2()?;
+    if times == 1 {
+        return Ok(x.clone());
+    }
     x.unsqueeze(1)?.broadcast_as((rows, times, width))?.reshape((rows * times, width))
 }

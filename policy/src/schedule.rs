@@ -1,11 +1,26 @@
 //! The variance-preserving noise schedule and one step of the reverse process.
 
 use candle_core::{Device, Result, Tensor};
+use serde::{Deserialize, Serialize};
+
+/// How a reverse step is made of a predicted noise.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum Reverse {
+    /// x_0 is clipped to ±1, the noise's variance is 1 - α_t (DAC).
+    #[default]
+    ClipClean,
+    /// x_0 is clipped to ±1, the variance is the posterior's, (1 - α_t)(1 - ᾱ_{t-1})/(1 - ᾱ_t) (Diffusion-QL).
+    Posterior,
+    /// x_0 is not clipped, but the outcome is, noise and all; the variance is 1 - α_t (IDQL, AlignIQL).
+    ClipSample,
+}
 
 /// Constants of the diffusion over t = 1..T (Eq. 3–5; DAC's "vp" schedule).
 #[derive(Clone, Debug, PartialEq)]
 pub struct Schedule {
     steps: Vec<Step>,
+    reverse: Reverse,
 }
 
 /// Of one t.
@@ -19,29 +34,33 @@ struct Step {
     from_clean: f32,
     /// Of x_t in the posterior's mean.
     from_noisy: f32,
-    /// sqrt(1 - α_t), or 0 at t = 1.
+    /// Standard deviation of the noise, 0 at t = 1.
     noise: f32,
 }
 
 impl Schedule {
     /// β_t = 1 - exp(-0.1/T - 0.5·(10 - 0.1)·(2t - 1)/T²) for t = 1..T.
-    pub fn variance_preserving(steps: usize) -> Self {
+    pub fn variance_preserving(steps: usize, reverse: Reverse) -> Self {
         let total = steps as f64;
         let mut before = 1.0; // ᾱ_{t-1}
         let step = |t: usize| {
             let alpha = (-0.1 / total - 0.5 * (10.0 - 0.1) * (2 * t - 1) as f64 / (total * total)).exp();
             let alpha_bar = before * alpha;
+            let shrink = match reverse {
+                Reverse::Posterior => (1.0 - before) / (1.0 - alpha_bar),
+                Reverse::ClipClean | Reverse::ClipSample => 1.0,
+            };
             let step = Step {
                 signal: alpha_bar.sqrt() as f32,
                 deviation: (1.0 - alpha_bar).sqrt() as f32,
                 from_clean: (before.sqrt() * (1.0 - alpha) / (1.0 - alpha_bar)) as f32,
                 from_noisy: (alpha.sqrt() * (1.0 - before) / (1.0 - alpha_bar)) as f32,
-                noise: if t == 1 { 0.0 } else { (1.0 - alpha).sqrt() as f32 },
+                noise: if t == 1 { 0.0 } else { ((1.0 - alpha) * shrink).sqrt() as f32 },
             };
             before = alpha_bar;
             step
         };
-        Self { steps: (1..=steps).map(step).collect() }
+        Self { steps: (1..=steps).map(step).collect(), reverse }
     }
 
     /// sqrt(ᾱ_t) and sqrt(1 - ᾱ_t) for each t in 1..=T, `[B, width]` each, a row for each t with its number in all
@@ -54,35 +73,39 @@ impl Schedule {
         Ok((rows(|step| step.signal)?, rows(|step| step.deviation)?))
     }
 
-    /// x_0 as a predicted noise ε has it, (x_t - sqrt(1 - ᾱ_t)·ε)/sqrt(ᾱ_t), clipped to [-1, 1]; all `[rows, a]`.
+    /// x_0 as a predicted noise ε has it, (x_t - sqrt(1 - ᾱ_t)·ε)/sqrt(ᾱ_t), clipped to [-1, 1] unless samples are; all
+    /// `[rows, a]`.
     pub fn clean(&self, t: usize, x: &Tensor, epsilon: &Tensor) -> Result<Tensor> {
         let Step { signal, deviation, .. } = self.steps[t - 1];
-        ((x - (epsilon * f64::from(deviation))?)? * f64::from(1.0 / signal))?.clamp(-1f32, 1f32)
+        let clean = ((x - (epsilon * f64::from(deviation))?)? * f64::from(1.0 / signal))?;
+        if self.reverse == Reverse::ClipSample { Ok(clean) } else { clean.clamp(-1f32, 1f32) }
     }
 
-    /// x_t → x_{t-1}: the posterior's mean with x_0 clipped to [-1, 1], plus its noise for t > 1. All `[rows, a]`.
+    /// x_t → x_{t-1}: the posterior's mean plus noise for t > 1. All `[rows, a]`, and differentiable.
     ///
     /// `epsilon` is the predicted noise, `z` standard normal.
     pub fn reverse(&self, t: usize, x: &Tensor, epsilon: &Tensor, z: Option<&Tensor>) -> Result<Tensor> {
         let Step { from_clean, from_noisy, noise, .. } = self.steps[t - 1];
         let scale = |x: &Tensor, by: f32| x * f64::from(by);
         let mean = (scale(&self.clean(t, x, epsilon)?, from_clean)? + scale(x, from_noisy)?)?;
-        match z {
-            Some(z) if t > 1 => mean + scale(z, noise)?,
-            _ => Ok(mean),
-        }
+        let next = match z {
+            Some(z) if t > 1 => (mean + scale(z, noise)?)?,
+            _ => mean,
+        };
+        if self.reverse == Reverse::ClipSample { next.clamp(-1f32, 1f32) } else { Ok(next) }
     }
 
     /// [`Self::reverse`] on slices; `z` is not read at t = 1.
     pub(crate) fn reverse_in_place(&self, t: usize, x: &mut [f32], epsilon: &[f32], z: &[f32]) {
         let Step { signal, deviation, from_clean, from_noisy, noise } = self.steps[t - 1];
         let scale = 1.0 / signal;
+        let clips_sample = self.reverse == Reverse::ClipSample;
+        let (clean_bound, bound) = if clips_sample { (f32::INFINITY, 1.0) } else { (1.0, f32::INFINITY) };
         for (i, (x, epsilon)) in x.iter_mut().zip(epsilon).enumerate() {
-            let clean = ((*x - deviation * epsilon) * scale).clamp(-1.0, 1.0);
-            *x = from_clean * clean + from_noisy * *x;
-            if t > 1 {
-                *x += noise * z[i];
-            }
+            let clean = ((*x - deviation * epsilon) * scale).clamp(-clean_bound, clean_bound);
+            let mean = from_clean * clean + from_noisy * *x;
+            let next = if t > 1 { mean + noise * z[i] } else { mean };
+            *x = next.clamp(-bound, bound);
         }
     }
 }

@@ -1,17 +1,84 @@
-//! The shapes of networks: where the layers of each lie in its vector of weights, and what it takes to run one.
+//! The shapes of networks: a line of configuration for hidden layers, and what goes in and comes out.
 
+use crate::error::PolicyError;
 use crate::layers::Layers;
 use crate::network::TILE;
-use crate::policy::Cost;
-use crate::weights::Layout;
+use crate::policy::check_range;
+use crate::schedule::Reverse;
+use crate::weights::{Layout, Start};
+use quad_kernels::activation::Activation;
+use serde::{Deserialize, Serialize};
 
 /// Size of the sinusoidal features of a denoising step.
 pub(crate) const TIME_FEATURES: usize = 16;
 /// Width of the network that embeds them, and of its output.
 pub(crate) const TIME_EMBEDDING: usize = 32;
+/// Most hidden layers that are believed.
+const MOST_LAYERS: usize = 64;
+
+/// A network's hidden layers, as a configuration or a policy's file has them.
+#[derive(Clone, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct MlpConfig {
+    /// Their widths.
+    pub hidden: Vec<usize>,
+    /// What follows each of them.
+    pub activation: Activation,
+    /// Whether a layer norm (Ba et al. 2016; ε = 1e-6) stands before each activation.
+    #[serde(default)]
+    pub norm: bool,
+    /// What the weights begin with.
+    #[serde(default)]
+    pub initial: Initial,
+}
+
+/// What a network's weights begin with.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum Initial {
+    /// Kernels U(±√(6/(in + out))) (Glorot and Bengio 2010), biases 0.
+    #[default]
+    Xavier,
+    /// Kernels √2 times an orthogonal matrix (Saxe et al. 2014), biases 0.
+    Orthogonal,
+    /// PyTorch's: kernels and biases U(±1/√in).
+    Torch,
+}
+
+impl Initial {
+    /// Of a linear layer's kernel and bias.
+    pub(crate) fn of_layer(self, inputs: usize, outputs: usize) -> (Start, Start) {
+        match self {
+            Self::Xavier => (Start::Uniform((6.0 / (inputs + outputs) as f32).sqrt()), Start::Constant(0.0)),
+            Self::Orthogonal => (Start::Orthogonal(std::f32::consts::SQRT_2), Start::Constant(0.0)),
+            Self::Torch => {
+                let bound = 1.0 / (inputs as f32).sqrt();
+                (Start::Uniform(bound), Start::Uniform(bound))
+            }
+        }
+    }
+}
+
+impl MlpConfig {
+    /// That there are hidden layers, and of reasonable widths.
+    ///
+    /// # Errors
+    /// There are none or too many, or one's width is out of range.
+    pub fn check(&self, field: &'static str) -> Result<(), PolicyError> {
+        if !(1..=MOST_LAYERS).contains(&self.hidden.len()) {
+            return Err(PolicyError::Range { field, value: self.hidden.len() });
+        }
+        self.hidden.iter().try_for_each(|width| check_range(field, *width))
+    }
+
+    /// Numbers of the widest hidden layer.
+    fn widest(&self) -> usize {
+        self.hidden.iter().copied().max().unwrap_or(1)
+    }
+}
 
 /// The shape of an ensemble.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[derive(Clone, Debug, PartialEq, Eq)]
 pub struct EnsembleShape {
     /// Networks, K.
     pub members: usize,
@@ -19,27 +86,30 @@ pub struct EnsembleShape {
     pub observation_dim: usize,
     /// Numbers in an action a; 0 for networks of s alone.
     pub action_dim: usize,
-    /// Width of the three hidden layers.
-    pub hidden: usize,
+    /// The hidden layers of each.
+    pub layers: MlpConfig,
     /// Numbers that come out.
     pub outputs: usize,
 }
 
 impl EnsembleShape {
     pub(crate) fn layers(&self) -> Layers {
-        let Self { observation_dim, action_dim, hidden, .. } = *self;
-        Layers::new(self.members, &[observation_dim + action_dim, hidden, hidden, hidden, self.outputs], 0)
+        Layers::new(self.members, self.observation_dim + self.action_dim, &self.layers, self.outputs, 0)
     }
 
-    /// What it takes to run all networks forward on so many states, `repeat` rows for each.
-    pub(crate) fn cost(&self, states: u64, repeat: u64) -> Cost {
+    /// Bytes that it takes to run all networks forward on so many states, `repeat` rows for each.
+    pub(crate) fn memory(&self, states: u64, repeat: u64) -> u64 {
         let (rows, members) = (states.saturating_mul(repeat), self.members as u64);
         let outputs = rows.saturating_mul(members).saturating_mul(self.outputs as u64);
-        let bytes = 4 * outputs.saturating_add(tile_numbers(repeat, self.hidden));
-        Cost { bytes, products: rows.saturating_mul(self.layout().count() as u64) }
+        let inside = match self.layers.norm {
+            false => tile_numbers(repeat, &self.layers),
+            // The plain implementation keeps whole layers: input and output of an operation.
+            true => rows.saturating_mul(members).saturating_mul(4 * self.layers.widest() as u64),
+        };
+        outputs.saturating_add(inside).saturating_mul(4)
     }
 
-    /// Tensors `{0..3}.kernel` `[K, in, out]` and `{0..3}.bias` `[K, out]`.
+    /// Tensors `{0..}.kernel` `[K, in, out]` and `{0..}.bias` `[K, out]`, and with a norm `.scale` and `.shift` `[K, out]`.
     pub fn layout(&self) -> Layout {
         Layout::new(self.layers().named("", true))
     }
@@ -47,36 +117,45 @@ impl EnsembleShape {
 
 /// Numbers that the threads keep of the tiles of rows that they are at: rows of one state are not parted, and of each row
 /// there are some hidden layers.
-pub(crate) fn tile_numbers(repeat: u64, hidden: usize) -> u64 {
-    const LAYERS: u64 = 6;
-    (rayon::current_num_threads() as u64 * LAYERS).saturating_mul(repeat.max(TILE as u64)).saturating_mul(hidden as u64)
+pub(crate) fn tile_numbers(repeat: u64, layers: &MlpConfig) -> u64 {
+    let each = (2 * layers.hidden.len()).max(4) as u64;
+    let tiles = (rayon::current_num_threads() as u64 * each).saturating_mul(repeat.max(TILE as u64));
+    tiles.saturating_mul(layers.widest() as u64)
 }
 
 /// The shape of a noise predictor.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[derive(Clone, Debug, PartialEq, Eq)]
 pub struct NoiseShape {
     /// Numbers in an observation s.
     pub observation_dim: usize,
     /// Numbers in an action a.
     pub action_dim: usize,
-    /// Width of the three hidden layers.
-    pub hidden: usize,
+    /// Its hidden layers.
+    pub layers: MlpConfig,
     /// Denoising steps T.
     pub diffusion_steps: usize,
+    /// How each of them is made when sampling.
+    pub reverse: Reverse,
 }
 
 impl NoiseShape {
+    /// The network that embeds a denoising step; always the same.
     pub(crate) fn time_layers(&self) -> Layers {
-        Layers::new(1, &[TIME_FEATURES, TIME_EMBEDDING, TIME_EMBEDDING], 0)
+        let config = MlpConfig {
+            hidden: vec![TIME_EMBEDDING],
+            activation: Activation::Mish,
+            norm: false,
+            initial: self.layers.initial,
+        };
+        Layers::new(1, TIME_FEATURES, &config, TIME_EMBEDDING, 0)
     }
 
     pub(crate) fn trunk_layers(&self) -> Layers {
-        let Self { observation_dim, action_dim, hidden, .. } = *self;
-        let input = observation_dim + action_dim + TIME_EMBEDDING;
-        Layers::new(1, &[input, hidden, hidden, hidden, action_dim], self.time_layers().end())
+        let input = self.observation_dim + self.action_dim + TIME_EMBEDDING;
+        Layers::new(1, input, &self.layers, self.action_dim, self.time_layers().range().end)
     }
 
-    /// Tensors `time.{0,1}` and `trunk.{0..3}`, each with `.kernel` `[in, out]` and `.bias` `[out]`.
+    /// Tensors `time.{0,1}` and `trunk.{0..}`, each with `.kernel` `[in, out]` and `.bias` `[out]`.
     pub fn layout(&self) -> Layout {
         let mut parts = self.time_layers().named("time.", false);
         parts.extend(self.trunk_layers().named("trunk.", false));

@@ -1,16 +1,27 @@
 //! The weights of a network: one flat vector, with named tensors in it.
 
 use crate::error::PolicyError;
+use crate::gradient::KeptGradient;
 use crate::slices::{has_fast_body, modify};
-use candle_core::backprop::GradStore;
 use candle_core::{DType, Device, Result, Tensor, Var};
 use rand::Rng;
+use rand_distr::{Distribution, StandardNormal};
 use std::collections::BTreeMap;
 use std::sync::Arc;
-use std::sync::atomic::{AtomicBool, Ordering};
 
 /// Tensors by name.
 pub type Tensors = BTreeMap<String, Tensor>;
+
+/// What a tensor's numbers are before training.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub enum Start {
+    /// All the same.
+    Constant(f32),
+    /// Uniform within ± this.
+    Uniform(f32),
+    /// This times matrices with orthonormal rows or columns, whichever are fewer.
+    Orthogonal(f32),
+}
 
 /// A named tensor's place in a flat vector.
 #[derive(Clone, Debug)]
@@ -21,11 +32,50 @@ pub struct Part {
     pub shape: Vec<usize>,
     /// Where in the vector it begins.
     pub offset: usize,
+    /// What it begins with.
+    pub start: Start,
 }
 
 impl Part {
     fn count(&self) -> usize {
         self.shape.iter().product()
+    }
+
+    fn fill(&self, values: &mut [f32], generator: &mut impl Rng) {
+        match (self.start, &self.shape[..]) {
+            (Start::Constant(value), _) => values.fill(value),
+            (Start::Uniform(bound), _) => values.fill_with(|| generator.random_range(-bound..bound)),
+            (Start::Orthogonal(gain), [.., rows, columns]) => {
+                values.chunks_exact_mut(rows * columns).for_each(|matrix| {
+                    orthogonal(matrix, (*rows, *columns), generator);
+                    matrix.iter_mut().for_each(|x| *x *= gain);
+                });
+            }
+            (Start::Orthogonal(gain), _) => values.fill(gain),
+        }
+    }
+}
+
+/// Fills a matrix with orthonormal columns, or rows if these are fewer: normal numbers, orthogonalised one after the other.
+fn orthogonal(matrix: &mut [f32], (rows, columns): (usize, usize), generator: &mut impl Rng) {
+    let (count, length) = (rows.min(columns), rows.max(columns));
+    let mut vectors: Vec<Vec<f64>> = Vec::with_capacity(count);
+    while vectors.len() < count {
+        let mut vector: Vec<f64> = (0..length).map(|_| StandardNormal.sample(generator)).collect();
+        for other in &vectors {
+            let along: f64 = vector.iter().zip(other).map(|(x, y)| x * y).sum();
+            vector.iter_mut().zip(other).for_each(|(x, y)| *x -= along * y);
+        }
+        let size = vector.iter().map(|x| x * x).sum::<f64>().sqrt();
+        // A vector that hardly stands out of the others is drawn again: its direction would be rounding.
+        if size > 1e-3 {
+            vector.iter_mut().for_each(|x| *x /= size);
+            vectors.push(vector);
+        }
+    }
+    for (i, x) in matrix.iter_mut().enumerate() {
+        let (row, column) = (i / columns, i % columns);
+        *x = if columns <= rows { vectors[column][row] } else { vectors[row][column] } as f32;
     }
 }
 
@@ -60,19 +110,27 @@ impl Layout {
     pub fn join(&self, tensors: &mut Tensors, prefix: &str) -> std::result::Result<Tensor, PolicyError> {
         let mut flat = Vec::with_capacity(self.0.len());
         for part in self.0.iter() {
-            let name = format!("{prefix}{}", part.name);
-            let Some(tensor) = tensors.remove(&name) else { return Err(PolicyError::Missing(name)) };
-            if tensor.dtype() != DType::F32 {
-                return Err(PolicyError::Type { name, found: format!("{:?}", tensor.dtype()) });
-            }
-            if tensor.dims() != part.shape {
-                return Err(PolicyError::Shape { name, found: tensor.dims().to_vec(), expected: part.shape.clone() });
-            }
-            check_finite(&name, &tensor)?;
+            let tensor = take(tensors, format!("{prefix}{}", part.name), &part.shape)?;
             flat.push(tensor.flatten_all()?);
         }
         Ok(Tensor::cat(&flat, 0)?)
     }
+}
+
+/// Takes a tensor of that name and shape out of `tensors`.
+///
+/// # Errors
+/// It is missing, or has another type or shape, or a number that is not finite.
+pub fn take(tensors: &mut Tensors, name: String, shape: &[usize]) -> std::result::Result<Tensor, PolicyError> {
+    let Some(tensor) = tensors.remove(&name) else { return Err(PolicyError::Missing(name)) };
+    if tensor.dtype() != DType::F32 {
+        return Err(PolicyError::Type { name, found: format!("{:?}", tensor.dtype()) });
+    }
+    if tensor.dims() != shape {
+        return Err(PolicyError::Shape { name, found: tensor.dims().to_vec(), expected: shape.to_vec() });
+    }
+    check_finite(&name, &tensor)?;
+    Ok(tensor)
 }
 
 /// That a tensor holds neither a NaN nor an infinity.
@@ -109,17 +167,15 @@ impl Weights {
     }
 
     /// The same vector as a constant; it changes with this one.
-    pub(crate) fn frozen(&self) -> Self {
-        Self::constant(self.layout.clone(), self.values.detach())
+    pub fn detach(&self) -> Self {
+        Self { kept: None, layout: self.layout.clone(), values: self.values.detach(), changes: self.changes }
     }
 
-    /// Xavier-uniform kernels, U(±√(6/(in + out))), and zero biases.
+    /// What each part begins with.
     pub fn initial(layout: &Layout, generator: &mut impl Rng, device: &Device) -> Result<Tensor> {
         let mut values = vec![0.0; layout.count()];
-        for part in layout.0.iter().filter(|part| part.name.ends_with("kernel")) {
-            let [.., inputs, outputs] = part.shape[..] else { continue };
-            let bound = (6.0 / (inputs + outputs) as f32).sqrt();
-            values[part.offset..][..part.count()].fill_with(|| generator.random_range(-bound..bound));
+        for part in layout.0.iter() {
+            part.fill(&mut values[part.offset..][..part.count()], generator);
         }
         Tensor::from_vec(values, layout.count(), device)
     }
@@ -148,7 +204,7 @@ impl Weights {
         Ok(self.change(|mine| mine.slice_set(&values, 0, 0))?)
     }
 
-    /// Changes the vector in place, after which kernels that were rounded from it are rounded again.
+    /// Changes the vector in place. Kernels that were rounded from it are no longer used.
     pub fn change(&mut self, work: impl FnOnce(&Tensor) -> Result<()>) -> Result<()> {
         self.changes += 1;
         work(&self.values.detach())
@@ -159,51 +215,61 @@ impl Weights {
         self.changes
     }
 
-    /// Where a custom operation leaves the gradient of these weights.
-    pub(crate) fn kept_gradient(&self) -> Option<Arc<KeptGradient>> {
-        self.kept.clone()
+    /// Where the fast implementation leaves the gradient of these weights.
+    pub(crate) fn kept_gradient(&self) -> Option<&Arc<KeptGradient>> {
+        self.kept.as_ref()
     }
 
-    /// The gradient of the loss that `gradients` are of. Take it exactly once after each backward pass: one that is not taken is
-    /// added to the next.
-    ///
-    /// # Errors
-    /// If the loss does not depend on these weights.
-    pub fn gradient(&self, gradients: &GradStore) -> Result<Tensor> {
-        // A loss may reach the weights through custom operations, plain ones, or both.
-        match (self.kept.as_ref().and_then(|kept| kept.take()), gradients.get(&self.values)) {
-            (Some(kept), Some(returned)) => kept + returned,
-            (Some(gradient), None) => Ok(gradient),
-            (None, Some(gradient)) => Ok(gradient.clone()),
-            (None, None) => candle_core::bail!("the loss does not depend on the weights that it is to train"),
+    /// Moves them towards `online`, as a target network follows its online network: `w = (1 - rate)·w + rate·online`.
+    pub fn follow(&mut self, online: &Self, rate: f32) -> Result<()> {
+        let online = online.values.detach();
+        if has_fast_body(online.device()) {
+            return crate::slices::read(&online, |online: &[f32]| {
+                self.change(|mine| modify(mine, |mine| quad_kernels::optimiser::ema(mine, online, rate)))
+            })?;
         }
+        let (keep, take) = (1.0 - f64::from(rate), f64::from(rate));
+        self.change(|mine| mine.slice_set(&((mine * keep)? + (online * take)?)?, 0, 0))
     }
 }
 
-/// A gradient in memory that is kept from step to step. Handing megabytes to candle's `GradStore` instead costs some
-/// milliseconds in each backward pass: they are allocated three times over, and given back to the system.
-#[derive(Debug)]
-pub(crate) struct KeptGradient {
-    values: Tensor,
-    written: AtomicBool,
-}
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use rand::SeedableRng;
+    use rand_chacha::ChaCha8Rng;
 
-impl KeptGradient {
-    fn new(weights: &Tensor) -> Result<Self> {
-        Ok(Self { values: weights.zeros_like()?.detach(), written: AtomicBool::new(false) })
-    }
-
-    /// Has `work` write the gradient; added up where the weights have a part in the loss more than once.
-    pub fn write(&self, work: impl FnOnce(&mut [f32])) -> Result<()> {
-        if !self.written.swap(true, Ordering::Relaxed) {
-            return modify(&self.values, work);
+    #[test]
+    fn each_part_begins_with_what_it_says() {
+        let part = |name: &str, shape: &[usize], offset, start| Part {
+            name: name.to_owned(),
+            shape: shape.to_vec(),
+            offset,
+            start,
+        };
+        let layout = Layout::new(vec![
+            part("wide", &[2, 3, 5], 0, Start::Orthogonal(2.0)),
+            part("tall", &[1, 5, 3], 30, Start::Orthogonal(2.0)),
+            part("scale", &[4], 45, Start::Constant(1.0)),
+            part("flat", &[100], 49, Start::Uniform(0.25)),
+        ]);
+        let values = Weights::initial(&layout, &mut ChaCha8Rng::seed_from_u64(0), &Device::Cpu).unwrap();
+        let parts = layout.split(&values, "").unwrap();
+        for (name, transposed) in [("wide", false), ("tall", true)] {
+            for matrix in parts[name].to_vec3::<f32>().unwrap() {
+                let matrix = Tensor::new(matrix, &Device::Cpu).unwrap();
+                let rows = if transposed { matrix.t().unwrap() } else { matrix };
+                let rows = rows.contiguous().unwrap();
+                let products: Vec<Vec<f32>> = rows.matmul(&rows.t().unwrap()).unwrap().to_vec2().unwrap();
+                for (i, row) in products.iter().enumerate() {
+                    for (j, x) in row.iter().enumerate() {
+                        assert!((x - if i == j { 4.0 } else { 0.0 }).abs() < 1e-5, "{name}: {products:?}");
+                    }
+                }
+            }
         }
-        let mut more = vec![0.0; self.values.elem_count()];
-        work(&mut more);
-        modify(&self.values, |sum| sum.iter_mut().zip(&more).for_each(|(sum, x)| *sum += x))
-    }
-
-    fn take(&self) -> Option<Tensor> {
-        self.written.swap(false, Ordering::Relaxed).then(|| self.values.clone())
+        assert_eq!(parts["scale"].to_vec1::<f32>().unwrap(), [1.0; 4]);
+        let flat = parts["flat"].to_vec1::<f32>().unwrap();
+        assert!(flat.iter().all(|x| x.abs() < 0.25) && flat.iter().any(|x| x.abs() > 0.2));
     }
 }

@@ -18,14 +18,14 @@ use bincode::{Decode, Encode};
 use crate::hash::Hash;
 
 /// Version of keys, messages and encoding. Frames of another version are refused.
-pub const PROTOCOL_VERSION: u16 = 7;
+pub const PROTOCOL_VERSION: u16 = 8;
 
 const MAGIC: &[u8; 4] = b"QUAD";
 const HEADER_LENGTH: usize = MAGIC.len() + size_of::<u16>() + size_of::<u8>();
 
-/// Largest frame without tensors: tens of thousands of episodes fit.
+/// Largest frame without a policy: tens of thousands of episodes fit.
 const SMALL: usize = 1 << 20;
-/// Largest frame with tensors; the paper's networks take a tenth of it.
+/// Largest frame with a policy; the paper's networks take a tenth of it.
 pub(crate) const LARGE: usize = 64 << 20;
 /// Most bytes of memory per byte of a valid small frame: an empty text in a list takes 24 bytes, 8 of them in the frame.
 const MEMORY_PER_WIRE_BYTE: usize = 4;
@@ -84,12 +84,12 @@ pub enum CodecError {
     /// A field has a value that it cannot have.
     #[error("the message is malformed: {0}")]
     Malformed(String),
-    /// The tensors are not those that the hash was made of.
-    #[error("the tensors have the hash {found}, not {claimed} as the message says")]
+    /// The file is not the one that the hash was made of.
+    #[error("the file has the hash {found}, not {claimed} as the message says")]
     Hash {
         /// The hash in the message.
         claimed: Hash,
-        /// The hash of the tensors.
+        /// The hash of the file.
         found: Hash,
     },
 }

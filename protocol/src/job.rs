@@ -74,16 +74,14 @@ pub struct Job {
     pub incarnation: u64,
     /// Gradient step of the snapshot.
     pub step: u64,
-    /// Hash of the snapshot's tensors.
+    /// Hash of the snapshot's file.
     pub weights: Hash,
     /// Environment to act in.
     pub environment: String,
     /// Seed of what an environment draws once and keeps over all episodes (AntMaze-v0: its goal); the same for a whole run.
-    pub instance: u64,
+    pub environment_seed: u64,
     /// One episode for each seed.
     pub seeds: Vec<u64>,
-    /// Actions that the policy draws in each state before it takes the best (the paper's N_a).
-    pub candidates: u32,
     /// Progress is to be told this often; after three times as long without any, the job may go to another evaluator.
     pub progress_milliseconds: u64,
 }

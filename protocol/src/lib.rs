@@ -6,7 +6,7 @@
 //!
 //! - `name`: what runs and evaluators may be called; `hash`: how weights are identified.
 //! - [`keys`]: where on Zenoh each message is found.
-//! - `snapshot`: weights, from the learner to evaluators; `origin`: what their file says of where it comes from.
+//! - `snapshot`: weights, from the learner to evaluators; `origin`: what the header of their file says of where it comes from.
 //! - `seeds`: which episodes an evaluation has; `job`: an evaluator asks for work and gets some.
 //! - `progress`: an evaluator tells how far its job is.
 //! - `score`: an evaluator delivers scores, the learner acknowledges them.
@@ -31,8 +31,8 @@ pub use codec::{CodecError, Message, PROTOCOL_VERSION, decode, decode_from, enco
 pub use hash::Hash;
 pub use job::{Job, JobReply, JobRequest};
 pub use name::{InvalidName, Name};
-pub use origin::{Origin, OriginError};
+pub use origin::Origin;
 pub use progress::Progress;
 pub use score::{EpisodeScore, ScoreReply, ScoreReport};
 pub use seeds::episode_seeds;
-pub use snapshot::{Schema, Snapshot};
+pub use snapshot::Snapshot;

@@ -34,9 +34,9 @@ pub struct ScoreReport {
     pub job: u64,
     /// Gradient step of the snapshot.
     pub step: u64,
-    /// Hash of the snapshot's tensors.
+    /// Hash of the snapshot's file.
     pub weights: Hash,
-    /// The arithmetic that the policy was computed in, e.g. `f32-avx2` or `bf16-amx`: evaluators of one name compute the same bits.
+    /// The arithmetic that the policy's actions were computed in, e.g. `f32-avx2` or `bf16-amx`: the same name gives the same bits.
     pub precision: Name,
     /// The episodes.
     pub episodes: Vec<EpisodeScore>,

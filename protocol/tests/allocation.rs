@@ -61,10 +61,8 @@ fn claim_too_much<M: Message>(message: &M) {
 fn claimed_lengths_are_not_believed() {
     let name = || Name::new("some-name").unwrap();
     let environment = || "hopper".to_owned();
-    let tensors = vec![7; 100];
-    let hash = Hash::of(&tensors);
-    let schema =
-        Schema { environment: environment(), observation_dim: 11, action_dim: 3, policy: "diffusion".to_owned() };
+    let file = vec![7; 100];
+    let hash = Hash::of(&file);
     let episodes = vec![EpisodeScore { seed: 1, episode_return: 2.0, length: 3, score: 4.0 }; 3];
     let job = Job {
         id: 1,
@@ -73,12 +71,11 @@ fn claimed_lengths_are_not_believed() {
         step: 3,
         weights: hash,
         environment: environment(),
-        instance: 4,
+        environment_seed: 4,
         seeds: vec![1, 2, 3],
-        candidates: 10,
         progress_milliseconds: 300,
     };
-    claim_too_much(&Snapshot { run: name(), incarnation: 1, step: 2, schema, hash, tensors });
+    claim_too_much(&Snapshot { run: name(), incarnation: 1, step: 2, hash, file });
     let environments = vec![environment(); 3];
     claim_too_much(&JobRequest::Claim { evaluator: name(), attempt: 1, environments });
     let failed = Some(environment());

@@ -20,11 +20,6 @@ fn text() -> impl Strategy<Value = String> {
     vec(any::<char>(), 0..20).prop_map(String::from_iter)
 }
 
-/// At most as long as the name of an environment or of a kind of policy may be: a character has up to four bytes.
-fn short_text() -> impl Strategy<Value = String> {
-    vec(any::<char>(), 0..=Schema::MAX_NAME_LENGTH / 4).prop_map(String::from_iter)
-}
-
 fn hash() -> impl Strategy<Value = Hash> {
     any::<[u8; 8]>().prop_map(|bytes| Hash::of(&bytes))
 }
@@ -43,24 +38,13 @@ fn episodes() -> impl Strategy<Value = Vec<EpisodeScore>> {
 }
 
 fn snapshot() -> impl Strategy<Value = Snapshot> {
-    let schema = (short_text(), any::<[u32; 2]>(), short_text()).prop_map(
-        |(environment, [observation_dim, action_dim], policy)| Schema {
-            environment,
-            observation_dim,
-            action_dim,
-            policy,
-        },
-    );
-    (name(), any::<u64>(), any::<u64>(), schema, vec(any::<u8>(), 0..500)).prop_map(
-        |(run, incarnation, step, schema, tensors)| Snapshot {
-            run,
-            incarnation,
-            step,
-            schema,
-            hash: Hash::of(&tensors),
-            tensors,
-        },
-    )
+    (name(), any::<u64>(), any::<u64>(), vec(any::<u8>(), 0..500)).prop_map(|(run, incarnation, step, file)| Snapshot {
+        run,
+        incarnation,
+        step,
+        hash: Hash::of(&file),
+        file,
+    })
 }
 
 fn job_request() -> impl Strategy<Value = JobRequest> {
@@ -72,8 +56,8 @@ fn job_request() -> impl Strategy<Value = JobRequest> {
 }
 
 fn job_reply() -> impl Strategy<Value = JobReply> {
-    let job = (any::<[u64; 5]>(), name(), hash(), text(), vec(any::<u64>(), 0..100), any::<u32>()).prop_map(
-        |([id, incarnation, step, instance, progress_milliseconds], run, weights, environment, seeds, candidates)| {
+    let job = (any::<[u64; 5]>(), name(), hash(), text(), vec(any::<u64>(), 0..100)).prop_map(
+        |([id, incarnation, step, environment_seed, progress_milliseconds], run, weights, environment, seeds)| {
             JobReply::Job(Job {
                 id,
                 run,
@@ -81,9 +65,8 @@ fn job_reply() -> impl Strategy<Value = JobReply> {
                 step,
                 weights,
                 environment,
-                instance,
+                environment_seed,
                 seeds,
-                candidates,
                 progress_milliseconds,
             })
         },
@@ -225,11 +208,11 @@ proptest! {
     #![proptest_config(ProptestConfig { cases: 64, failure_persistence: None, ..ProptestConfig::default() })]
 
     #[test]
-    fn tensors_that_are_not_the_hash_s(message in snapshot(), bit in any::<prop::sample::Index>()) {
-        prop_assume!(!message.tensors.is_empty());
+    fn a_file_that_is_not_the_hash_s(message in snapshot(), bit in any::<prop::sample::Index>()) {
+        prop_assume!(!message.file.is_empty());
         let mut frame = encode(&message).unwrap();
-        let bit = bit.index(8 * message.tensors.len());
-        let first = frame.len() - message.tensors.len();
+        let bit = bit.index(8 * message.file.len());
+        let first = frame.len() - message.file.len();
         frame[first + bit / 8] ^= 1 << (bit % 8);
         let found = Hash::of(&frame[first..]);
         prop_assert_eq!(decode::<Snapshot>(&frame), Err(CodecError::Hash { claimed: message.hash, found }));
@@ -248,42 +231,22 @@ fn a_name_that_is_not_allowed_is_malformed() {
     assert_eq!(error.label(), "malformed");
 }
 
-fn hopper() -> Schema {
-    Schema { environment: "hopper".to_owned(), observation_dim: 11, action_dim: 3, policy: "diffusion".to_owned() }
+fn message(file: Vec<u8>) -> Snapshot {
+    let run = Name::new("r".repeat(Name::MAX_LENGTH)).unwrap();
+    Snapshot { run, incarnation: 1, step: 1, hash: Hash::of(&file), file }
 }
 
 #[test]
-fn a_schema_has_no_long_names() {
-    let decoded = |environment: usize, policy: usize| {
-        let schema = Schema { environment: "e".repeat(environment), policy: "p".repeat(policy), ..hopper() };
-        let tensors = vec![1, 2, 3];
-        let hash = Hash::of(&tensors);
-        let message = Snapshot { run: Name::new("run").unwrap(), incarnation: 1, step: 1, schema, hash, tensors };
-        decode::<Snapshot>(&encode(&message).unwrap())
-    };
-    assert!(decoded(64, 64).is_ok());
-    for (environment, policy, field) in [(65, 1, "environment"), (1, 65, "policy"), (1, 1 << 20, "policy")] {
-        let error = decoded(environment, policy).unwrap_err();
-        assert!(matches!(&error, CodecError::Malformed(text) if text.contains(field)), "{error}");
-    }
-}
-
-#[test]
-fn what_every_receiver_refuses_is_not_sent() {
-    let tensors = vec![0; Snapshot::LIMIT];
-    let schema = hopper();
-    let hash = Hash::of(&tensors);
-    let message = Snapshot { run: Name::new("run").unwrap(), incarnation: 1, step: 1, schema, hash, tensors };
-    let error = encode(&message).unwrap_err();
+fn the_largest_file_is_sent_and_what_every_receiver_refuses_is_not() {
+    let largest = message(vec![1; Snapshot::MOST_FILE]);
+    assert!(decode::<Snapshot>(&encode(&largest).unwrap()).unwrap() == largest);
+    let error = encode(&message(vec![0; Snapshot::LIMIT])).unwrap_err();
     assert!(matches!(error, CodecError::Oversized { length, limit } if length > limit), "{error}");
 }
 
 #[test]
 fn six_megabytes_take_milliseconds() {
-    let tensors: Vec<u8> = (0..6_000_000u32).map(|i| i.wrapping_mul(2_654_435_761).to_le_bytes()[3]).collect();
-    let schema = hopper();
-    let hash = Hash::of(&tensors);
-    let message = Snapshot { run: Name::new("run").unwrap(), incarnation: 1, step: 1, schema, hash, tensors };
+    let message = message((0..6_000_000u32).map(|i| i.wrapping_mul(2_654_435_761).to_le_bytes()[3]).collect());
     let fastest = |work: &dyn Fn()| {
         let times = (0..10).map(|_| {
             let begin = Instant::now();

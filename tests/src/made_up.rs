@@ -1,6 +1,6 @@
 //! Messages that tests make up: well-formed, but no learner or evaluator of ours has sent them.
 
-use quad_protocol::{EpisodeScore, Hash, JobRequest, Name, Progress, Schema, ScoreReport, Snapshot};
+use quad_protocol::{EpisodeScore, Hash, JobRequest, Name, Progress, ScoreReport, Snapshot};
 
 /// A name that is allowed.
 pub fn name(text: &str) -> Name {
@@ -42,9 +42,7 @@ pub fn report(run: &Name, step: u64, seed: u64) -> ScoreReport {
     }
 }
 
-/// A policy for Hopper, whatever the tensors are.
-pub fn snapshot(run: &Name, incarnation: u64, step: u64, tensors: &[u8]) -> Snapshot {
-    let schema =
-        Schema { environment: "hopper".to_owned(), observation_dim: 11, action_dim: 3, policy: "diffusion".to_owned() };
-    Snapshot { run: run.clone(), incarnation, step, schema, hash: Hash::of(tensors), tensors: tensors.to_vec() }
+/// A snapshot, whatever is in its file.
+pub fn snapshot(run: &Name, incarnation: u64, step: u64, file: &[u8]) -> Snapshot {
+    Snapshot { run: run.clone(), incarnation, step, hash: Hash::of(file), file: file.to_vec() }
 }

@@ -38,12 +38,13 @@ impl Setting {
 steps = {steps}
 eval_interval = {eval_interval}
 episodes = {episodes}
-candidates = {candidates}
 seed = {seed}
 batch_size = 16
 
 [agent]
-hidden = {hidden}
+candidates = {candidates}
+actor.hidden = [{hidden}, {hidden}, {hidden}]
+critic.hidden = [{hidden}, {hidden}, {hidden}]
 critics = 2
 diffusion_steps = 2
 actor_ema_start = 10

@@ -141,7 +141,7 @@ fn a_sampler_fills_batches_with_each_transition_once_a_pass() {
     let mut batch = Batch::default();
     let mut drawn = Vec::new();
     for _ in 0..7 {
-        sampler.next(&transitions, &mut batch);
+        transitions.gather(sampler.next_items(), &mut batch);
         assert_eq!(batch.size, 3);
         for k in 0..3 {
             let i = batch.observations[11 * k] as usize;

@@ -30,7 +30,7 @@ pub struct Evaluator {
 }
 
 impl Evaluator {
-    /// An evaluator that computes policies in `precision`.
+    /// An evaluator that computes policies in `precision`, as far as they can be.
     pub fn new(name: Name, precision: Precision, metrics: Metrics, beat: Beat) -> Evaluator {
         Evaluator { name, precision, metrics, policy: None, beat }
     }
@@ -51,9 +51,10 @@ impl Evaluator {
             }
         };
         job::check_memory(job, policy.as_ref()).inspect_err(|error| metrics.rejected(error.label()))?;
+        let arithmetic = Name::new(policy.precision().arithmetic())?;
         info!(run = %job.run, step = job.step, episodes = job.seeds.len(), "evaluating");
         let episodes = self.roll_out(job, spec, policy, |steps, episodes| client.tell(job, steps, episodes)).await?;
-        Ok(ScoreReport::of(job, self.name.clone(), Name::new(self.precision.arithmetic())?, episodes))
+        Ok(ScoreReport::of(job, self.name.clone(), arithmetic, episodes))
     }
 
     /// The policy that `job` names, from the last job or from a snapshot.
@@ -112,7 +113,7 @@ fn heartbeat(job: &Job) -> Duration {
 mod tests {
     use std::sync::atomic::{AtomicU32, Ordering::Relaxed};
 
-    use quad_policy::{ActionNoise, Cost, PolicyError};
+    use quad_policy::{EpisodeState, PolicyError};
     use quad_service::Health;
 
     use super::super::fixtures::job;
@@ -127,10 +128,6 @@ mod tests {
     }
 
     impl Policy for Sleeper {
-        fn kind(&self) -> &'static str {
-            "sleeper"
-        }
-
         fn observation_dim(&self) -> usize {
             11
         }
@@ -139,15 +136,15 @@ mod tests {
             3
         }
 
-        fn samples_candidates(&self) -> bool {
-            false
+        fn precision(&self) -> Precision {
+            Precision::F32
         }
 
-        fn cost(&self, _: usize, _: usize) -> Cost {
-            Cost { bytes: 0, products: 0 }
+        fn memory(&self, _: usize) -> u64 {
+            0
         }
 
-        fn act(&self, _: &[f32], _: usize, _: &mut [ActionNoise], actions: &mut [f32]) -> Result<(), PolicyError> {
+        fn act(&self, _: &[f32], _: &mut [EpisodeState], actions: &mut [f32]) -> Result<(), PolicyError> {
             let stuck = self.calls.fetch_add(1, Relaxed) == self.stuck_at;
             std::thread::sleep(if stuck { 4 * LIMIT } else { LIMIT / 60 });
             actions.fill(0.0);

@@ -6,14 +6,12 @@ use std::time::{Duration, Instant};
 
 use anyhow::Context;
 use quad_dataset::environment::{self, EnvironmentSpec, UnknownEnvironment};
-use quad_policy::{ActionNoise, Policy};
+use quad_policy::{EpisodeState, Policy};
 use quad_protocol::{EpisodeScore, Job};
 
 use crate::metrics::{JobOutcome, Metrics};
 use crate::sim::{EnvironmentError, EpisodeOutcome, Rollout};
 
-/// Most rows (episodes × candidates) of one network call. The paper's job has 100.
-const MAX_ROWS: usize = 65_536;
 /// Most episodes: each is a simulation of its own. A learner gives forty at most.
 const MAX_EPISODES: usize = 256;
 /// Most memory that one network call may take, bytes: far more than the paper's few megabytes, and far less than an evaluator's
@@ -24,16 +22,8 @@ const MAX_BYTES: u64 = 256 << 20;
 #[derive(Debug, thiserror::Error)]
 pub enum JobError {
     /// It is empty, or larger than this evaluator runs.
-    #[error(
-        "it has {episodes} episodes with {candidates} candidates; at most {MAX_EPISODES} episodes and {MAX_ROWS} \
-         candidates in all are run"
-    )]
-    Size {
-        /// Its episodes.
-        episodes: usize,
-        /// Candidates per state.
-        candidates: u32,
-    },
+    #[error("it has {0} episodes, but must have from 1 to {MAX_EPISODES}")]
+    Size(usize),
     /// Its policy would take more memory than this evaluator gives.
     #[error("each of its steps takes {0} bytes of memory, more than {MAX_BYTES}")]
     Memory(u64),
@@ -49,26 +39,25 @@ impl JobError {
     /// The reason as a metric's label.
     pub fn label(&self) -> &'static str {
         match self {
-            JobError::Size { .. } | JobError::Memory(_) => "job_size",
+            JobError::Size(_) | JobError::Memory(_) => "job_size",
             JobError::TooLong => "too_long",
-            JobError::Environment(_) => "schema",
+            JobError::Environment(_) => "environment",
         }
     }
 }
 
 /// Checks a job from the wire; gives its environment.
 pub fn check(job: &Job) -> Result<&'static EnvironmentSpec, JobError> {
-    let (episodes, candidates) = (job.seeds.len(), job.candidates);
-    let rows = episodes.saturating_mul(candidates as usize);
-    if !(1..=MAX_ROWS).contains(&rows) || episodes > MAX_EPISODES {
-        return Err(JobError::Size { episodes, candidates });
+    let episodes = job.seeds.len();
+    if !(1..=MAX_EPISODES).contains(&episodes) {
+        return Err(JobError::Size(episodes));
     }
     Ok(environment::find(&job.environment)?)
 }
 
 /// Checks that a job does not take too much memory with its policy.
 pub fn check_memory(job: &Job, policy: &dyn Policy) -> Result<(), JobError> {
-    let bytes = policy.cost(job.seeds.len(), job.candidates as usize).bytes;
+    let bytes = policy.memory(job.seeds.len());
     if bytes > MAX_BYTES { Err(JobError::Memory(bytes)) } else { Ok(()) }
 }
 
@@ -147,8 +136,7 @@ fn roll_out(
     longest: Duration,
 ) -> anyhow::Result<Option<Vec<EpisodeOutcome>>> {
     let started = Instant::now();
-    let mut rollout = episodes(spec, job)?;
-    let candidates = job.candidates as usize;
+    let mut rollout = episodes(spec, job, policy)?;
     while !rollout.is_done() {
         if shared.cancelled.load(Relaxed) {
             return Ok(None);
@@ -161,7 +149,7 @@ fn roll_out(
         let times = [rollout.select_time(), rollout.physics_time()];
         let done = rollout.episodes_done();
         rollout
-            .step(|observations, noise, actions| policy.act(observations, candidates, noise, actions))
+            .step(|observations, states, actions| policy.act(observations, states, actions))
             .context("the policy cannot act")?;
         metrics.environment_steps.inc_by(rollout.environment_steps() - steps);
         metrics.select_seconds.inc_by((rollout.select_time() - times[0]).as_secs_f64());
@@ -175,8 +163,12 @@ fn roll_out(
 }
 
 /// The job's episodes, at their beginning.
-fn episodes(spec: &'static EnvironmentSpec, job: &Job) -> Result<Rollout<ActionNoise>, EnvironmentError> {
-    Rollout::new(spec, job.instance, &job.seeds, ActionNoise::new)
+fn episodes(
+    spec: &'static EnvironmentSpec,
+    job: &Job,
+    policy: &dyn Policy,
+) -> Result<Rollout<EpisodeState>, EnvironmentError> {
+    Rollout::new(spec, job.environment_seed, &job.seeds, |seed| policy.begin(seed))
 }
 
 fn episode_score(outcome: &EpisodeOutcome) -> EpisodeScore {
@@ -188,30 +180,29 @@ fn episode_score(outcome: &EpisodeOutcome) -> EpisodeScore {
 mod tests {
     use quad_policy::{DiffusionShape, Precision, load_policy};
 
-    use super::super::fixtures::{self, SMALLEST, tensors};
+    use super::super::fixtures::{self, SMALLEST, file};
     use super::*;
     use crate::sim;
 
-    fn job(episodes: u64, candidates: u32) -> Job {
-        Job { seeds: (0..episodes).collect(), candidates, ..fixtures::job() }
+    fn job(episodes: u64) -> Job {
+        Job { seeds: (0..episodes).collect(), ..fixtures::job() }
     }
 
-    fn policy(hidden: usize, critics: usize) -> Box<dyn Policy> {
-        load_policy(&tensors(DiffusionShape { hidden, critics, ..SMALLEST }), Precision::F32).unwrap()
+    fn policy(hidden: usize, critics: usize, candidates: u32) -> Box<dyn Policy> {
+        let shape = DiffusionShape { hidden, critics, ..SMALLEST };
+        load_policy(&file("hopper", shape, candidates), Precision::F32).unwrap()
     }
 
     #[test]
     fn a_job_that_is_empty_or_huge_is_refused() {
-        let label = |episodes, candidates| check(&job(episodes, candidates)).err().map(|error| error.label());
-        assert_eq!([label(1, 1), label(10, 50), label(256, 256)], [None; 3]);
-        for (episodes, candidates) in [(0, 1), (1, 0), (1, u32::MAX), (256, 257), (257, 1), (65_536, 1)] {
-            assert_eq!(label(episodes, candidates), Some("job_size"), "{episodes} × {candidates}");
-        }
+        let label = |episodes| check(&job(episodes)).err().map(|error| error.label());
+        assert_eq!([1, 256].map(label), [None; 2]);
+        assert_eq!([0, 257, 65_536].map(label), [Some("job_size"); 3]);
     }
 
     #[test]
     fn a_job_has_a_longest_time() {
-        let (job, policy, metrics) = (job(2, 1), policy(8, 2), Metrics::new().unwrap());
+        let (job, policy, metrics) = (job(2), policy(8, 2, 1), Metrics::new().unwrap());
         let spec = check(&job).unwrap();
         let run = |longest| roll_out(spec, &job, policy.as_ref(), &Shared::default(), &metrics, longest);
         assert_eq!(run(Job::LONGEST).unwrap().unwrap().len(), 2);
@@ -220,10 +211,10 @@ mod tests {
     }
 
     #[test]
-    fn episodes_have_the_goal_of_the_instance_that_the_job_names() {
-        let spec = environment::find("antmaze-umaze-v0").unwrap();
-        let goals = |instance| -> Vec<Vec<f64>> {
-            let rollout = episodes(spec, &Job { instance, ..job(2, 1) }).unwrap();
+    fn episodes_have_the_goal_of_the_environment_s_seed() {
+        let (spec, policy) = (environment::find("antmaze-umaze-v0").unwrap(), policy(1, 1, 1));
+        let goals = |environment_seed| -> Vec<Vec<f64>> {
+            let rollout = episodes(spec, &Job { environment_seed, ..job(2) }, policy.as_ref()).unwrap();
             rollout.environments().map(|environment| environment.goal().unwrap().to_vec()).collect()
         };
         let (one, other) = (goals(5), goals(6));
@@ -232,12 +223,12 @@ mod tests {
         assert_eq!(one[0], sim::make(spec, 5).unwrap().goal().unwrap());
     }
 
-    /// A file of some megabytes asks for 17 GB: a value of each of 65,535 tiny critics for each of 65,536 candidates.
+    /// A file of some megabytes asks for 66 GB: a value of each of 65,535 tiny critics for each of 256,000 candidates.
     #[test]
     fn the_memory_of_a_policy_is_known_before_it_is_taken() {
-        assert!(check_memory(&job(10, 50), policy(256, 10).as_ref()).is_ok(), "the paper's");
-        assert!(check_memory(&job(1, 1), policy(1, 65_535).as_ref()).is_ok());
-        let many_critics = check_memory(&job(256, 256), policy(1, 65_535).as_ref());
-        assert!(matches!(many_critics, Err(JobError::Memory(17_000_000_000..))), "{many_critics:?}");
+        assert!(check_memory(&job(10), policy(256, 10, 50).as_ref()).is_ok(), "the paper's");
+        assert!(check_memory(&job(1), policy(1, 65_535, 1).as_ref()).is_ok());
+        let many_critics = check_memory(&job(256), policy(1, 65_535, 1000).as_ref());
+        assert!(matches!(many_critics, Err(JobError::Memory(66_000_000_000..))), "{many_critics:?}");
     }
 }

@@ -77,9 +77,9 @@ pub struct ServeArgs {
     /// Name in scores and metrics, unique among the evaluators of a run [default: HOST-PID-RANDOM]
     #[arg(long, value_parser = |text: &str| Name::new(text))]
     name: Option<Name>,
-    /// Arithmetic of the networks, f32 or bf16 [default: bf16 on CPUs that are faster with it, by AMX or AMD's AVX512-BF16]
-    #[arg(long, value_name = "NAME")]
-    precision: Option<Precision>,
+    /// Arithmetic of the networks, f32 or bf16, which rounds and is faster on CPUs with AMX or AMD's AVX512-BF16
+    #[arg(long, value_name = "NAME", default_value = "f32")]
+    precision: Precision,
 }
 
 /// Where a learner of this machine listens by default.
@@ -110,10 +110,9 @@ async fn serve_until_stopped(args: ServeArgs) -> anyhow::Result<()> {
     let name = args.name.map_or_else(unique_name, Ok)?;
     let endpoints = endpoints(args.connect, args.certificates.as_deref())?;
     info!(evaluator = %name, "ready to serve");
-    if args.precision.is_some_and(|wanted| !wanted.is_available()) {
+    if !args.precision.is_available() {
         warn!("{}", Precision::UNAVAILABLE);
     }
-    let precision = args.precision.unwrap_or(Precision::Bf16);
     let health = Health::default();
     // Serves for as long as it is held.
     let _server = match args.metrics {
@@ -127,7 +126,7 @@ async fn serve_until_stopped(args: ServeArgs) -> anyhow::Result<()> {
         None => None,
     };
     let mut discovery = Discovery::start(endpoints.connect, endpoints.certificates.as_ref(), &metrics);
-    let evaluator = Evaluator::new(name, precision, metrics.clone(), health.part("worker", STUCK));
+    let evaluator = Evaluator::new(name, args.precision, metrics.clone(), health.part("worker", STUCK));
     let worker = Worker::new(evaluator, metrics.clone(), discovery.runs());
     let end = async {
         tokio::select! {

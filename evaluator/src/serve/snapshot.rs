@@ -37,7 +37,7 @@ impl Snapshots {
         self.forget(&snapshot.run);
         let mut kept = self.lock();
         kept.push_back(Arc::new(snapshot));
-        while kept.iter().map(|snapshot| snapshot.tensors.len()).sum::<usize>() > MOST_BYTES {
+        while kept.iter().map(|snapshot| snapshot.file.len()).sum::<usize>() > MOST_BYTES {
             kept.pop_front();
         }
         drop(kept);
@@ -149,7 +149,7 @@ mod tests {
         let snapshots = Snapshots::default();
         let keep = |run: &str, step, bytes| {
             let run = Name::new(run).unwrap();
-            snapshots.keep(Snapshot { run, step, tensors: vec![0; bytes], ..snapshot(Vec::new()) });
+            snapshots.keep(Snapshot { run, step, file: vec![0; bytes], ..snapshot(Vec::new()) });
             snapshots.lock().iter().map(|snapshot| snapshot.step).collect::<Vec<u64>>()
         };
         assert_eq!(keep("one", 1, MOST_BYTES / 3), [1]);
@@ -163,8 +163,8 @@ mod tests {
     #[test]
     fn a_job_gets_exactly_the_snapshot_that_it_names() {
         let snapshots = Snapshots::default();
-        snapshots.keep(snapshot(b"tensors".to_vec()));
-        let job = Job { weights: Hash::of(b"tensors"), ..job() };
+        snapshots.keep(snapshot(b"policy".to_vec()));
+        let job = Job { weights: Hash::of(b"policy"), ..job() };
         assert!(snapshots.get(&job).is_some());
         for other in [
             Job { run: Name::new("other").unwrap(), ..job.clone() },

@@ -99,14 +99,14 @@ pub(super) struct AntMaze {
 }
 
 impl AntMaze {
-    /// An ant that waits for its first [`reset`](Environment::reset). `instance` is the seed of a goal that is kept.
-    pub fn new(maze: &'static Maze, spec: &EnvironmentSpec, instance: u64) -> Result<Self, EnvironmentError> {
+    /// An ant that waits for its first [`reset`](Environment::reset). `environment_seed` is that of a goal that is kept.
+    pub fn new(maze: &'static Maze, spec: &EnvironmentSpec, environment_seed: u64) -> Result<Self, EnvironmentError> {
         let model = physics::model(maze.name, || maze.mjcf())?;
         Ok(Self {
             maze,
             physics: Physics::new(model, FRAME_SKIP)?,
             observation: vec![0.0; spec.observation_dim],
-            goal: maze.draw_goal(instance),
+            goal: maze.draw_goal(environment_seed),
             goal_drawn: spec.goal.unwrap_or(Goal::EachEpisode),
             steps: 0,
             max_episode_steps: spec.max_episode_steps,
@@ -179,15 +179,15 @@ mod tests {
 
     use super::*;
 
-    fn ant(name: &str, instance: u64) -> AntMaze {
+    fn ant(name: &str, environment_seed: u64) -> AntMaze {
         let spec = find(name).unwrap();
         let maze = MAZES.iter().find(|maze| maze.name == spec.simulation()).unwrap();
-        AntMaze::new(maze, spec, instance).unwrap()
+        AntMaze::new(maze, spec, environment_seed).unwrap()
     }
 
     /// The goals of some episodes of one ant.
-    fn goals(name: &str, instance: u64, seeds: &[u64]) -> Vec<[f64; 2]> {
-        let mut ant = ant(name, instance);
+    fn goals(name: &str, environment_seed: u64, seeds: &[u64]) -> Vec<[f64; 2]> {
+        let mut ant = ant(name, environment_seed);
         let goal = |&seed: &u64| {
             ant.reset(seed);
             ant.goal
@@ -196,7 +196,7 @@ mod tests {
     }
 
     #[test]
-    fn a_goal_is_kept_by_the_instance_or_drawn_for_the_episode() {
+    fn a_goal_is_of_the_environment_s_seed_or_drawn_for_the_episode() {
         for size in ["umaze", "medium", "large"] {
             let kept = format!("antmaze-{size}-v0");
             let [first, second] = goals(&kept, 5, &[1, 2])[..] else { panic!() };

@@ -4,7 +4,7 @@ use thiserror::Error;
 
 /// The stream that initial states are drawn from, among those of an episode's seed.
 pub(super) const RESET_STREAM: u64 = 1;
-/// The stream that a goal is drawn from, among those of an episode's or an instance's seed.
+/// The stream that a goal is drawn from, among those of an episode's or an environment's seed.
 pub(super) const GOAL_STREAM: u64 = 4;
 
 /// What one step of an environment gave.

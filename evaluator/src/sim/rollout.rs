@@ -12,12 +12,12 @@ use super::simulations::make;
 ///
 /// Episodes that ended leave the batch, so the policy only ever sees live ones. An episode's outcome is a function of
 /// its seed and the policy, whatever else is in the batch, as long as the policy treats its rows independently. For that,
-/// each episode carries its own `N`: what the policy draws its noise from.
-pub struct Rollout<N> {
+/// each episode has its own `S`: what the policy carries through it.
+pub struct Rollout<S> {
     spec: &'static EnvironmentSpec,
     live: Vec<Episode>,
     /// Row i belongs to `live[i]`, as in the next two.
-    noise: Vec<N>,
+    states: Vec<S>,
     /// live × observation_dim
     observations: Vec<f32>,
     /// live × action_dim
@@ -52,29 +52,29 @@ pub struct EpisodeOutcome {
     pub score: f64,
 }
 
-impl<N> Rollout<N> {
-    /// Makes one environment for each seed and resets it to that seed. `instance` is as in [`make`], the same for all; `noise`
-    /// makes an episode's noise out of its seed.
+impl<S> Rollout<S> {
+    /// Makes one environment for each seed and resets it to that seed. `environment_seed` is as in [`make`], the same for all;
+    /// `begin` makes what the policy carries through the episode of a seed.
     ///
     /// # Errors
     ///
     /// The environment cannot be made.
     pub fn new(
         spec: &'static EnvironmentSpec,
-        instance: u64,
+        environment_seed: u64,
         seeds: &[u64],
-        noise: impl FnMut(u64) -> N,
+        begin: impl FnMut(u64) -> S,
     ) -> Result<Self, EnvironmentError> {
         let mut live = Vec::with_capacity(seeds.len());
         for (index, &seed) in seeds.iter().enumerate() {
-            let mut environment = make(spec, instance)?;
+            let mut environment = make(spec, environment_seed)?;
             environment.reset(seed);
             live.push(Episode { environment, index, seed, episode_return: 0.0, length: 0, ended: false });
         }
         Ok(Self {
             spec,
             live,
-            noise: seeds.iter().copied().map(noise).collect(),
+            states: seeds.iter().copied().map(begin).collect(),
             observations: Vec::with_capacity(seeds.len() * spec.observation_dim),
             actions: Vec::with_capacity(seeds.len() * spec.action_dim),
             outcomes: Vec::with_capacity(seeds.len()),
@@ -86,13 +86,13 @@ impl<N> Rollout<N> {
 
     /// Advances every live episode by one control period.
     ///
-    /// `select` is called once, with n × observation_dim observations, the noise of the same n episodes, and the
+    /// `select` is called once, with n × observation_dim observations, the states of the same n episodes, and the
     /// n × action_dim actions it is to fill in.
     ///
     /// # Errors
     ///
     /// That of `select`; no episode has advanced then.
-    pub fn step<E>(&mut self, select: impl FnOnce(&[f32], &mut [N], &mut [f32]) -> Result<(), E>) -> Result<(), E> {
+    pub fn step<E>(&mut self, select: impl FnOnce(&[f32], &mut [S], &mut [f32]) -> Result<(), E>) -> Result<(), E> {
         if self.live.is_empty() {
             return Ok(());
         }
@@ -102,7 +102,7 @@ impl<N> Rollout<N> {
             self.observations.extend(episode.environment.observation().iter().map(|&value| value as f32));
         }
         self.actions.resize(self.live.len() * self.spec.action_dim, 0.0);
-        select(&self.observations, &mut self.noise, &mut self.actions)?;
+        select(&self.observations, &mut self.states, &mut self.actions)?;
         let selected = Instant::now();
         self.select_time += selected - start;
 
@@ -123,7 +123,7 @@ impl<N> Rollout<N> {
         for row in (0..self.live.len()).rev() {
             if self.live[row].ended {
                 let Episode { index, seed, episode_return, length, .. } = self.live.swap_remove(row);
-                self.noise.swap_remove(row);
+                self.states.swap_remove(row);
                 let score = self.spec.normalised_score(episode_return);
                 self.outcomes.push(EpisodeOutcome { index, seed, episode_return, length, score });
             }

@@ -29,15 +29,15 @@ pub fn simulated() -> impl Iterator<Item = &'static EnvironmentSpec> {
 
 /// Makes an environment. Those of one simulation share one compiled model, so the second costs little.
 ///
-/// `instance` is the seed of what the environment draws once and keeps over all episodes, if there is any such thing.
+/// `environment_seed` is that of what the environment draws once and keeps over all episodes, if there is any such thing.
 ///
 /// # Errors
 ///
 /// There is no simulation of the environment, or MuJoCo fails.
-pub fn make(spec: &EnvironmentSpec, instance: u64) -> Result<Box<dyn Environment>, EnvironmentError> {
+pub fn make(spec: &EnvironmentSpec, environment_seed: u64) -> Result<Box<dyn Environment>, EnvironmentError> {
     Ok(match Simulation::of(spec)? {
         Simulation::Locomotion(robot) => Box::new(Locomotion::new(robot, spec)?),
-        Simulation::AntMaze(maze) => Box::new(AntMaze::new(maze, spec, instance)?),
+        Simulation::AntMaze(maze) => Box::new(AntMaze::new(maze, spec, environment_seed)?),
     })
 }
 

@@ -5,9 +5,11 @@ use std::sync::{Arc, Mutex};
 use std::time::{Duration, Instant};
 
 use candle_core::Device;
-use quad_policy::{Description, DiffusionPolicy, DiffusionShape, Ensemble, Layout, NoisePredictor, Precision, Weights};
+use quad_policy::{
+    Choice, DiffusionPolicy, DiffusionShape, Ensemble, Header, Layout, NoisePredictor, PolicyConfig, Precision, Weights,
+};
 use quad_protocol::{
-    Hash, Job, JobReply, JobRequest, Message, Name, Schema, ScoreReply, ScoreReport, Snapshot, decode, encode, keys,
+    Hash, Job, JobReply, JobRequest, Message, Name, Origin, ScoreReply, ScoreReport, Snapshot, decode, encode, keys,
 };
 use quad_service::{Endpoints, open_session, reachable_at};
 use rand::SeedableRng;
@@ -53,8 +55,8 @@ pub struct Learner {
     pub snapshot: Snapshot,
 }
 
-/// A small diffusion policy for Hopper with random weights.
-pub fn tensors() -> Vec<u8> {
+/// The file of a small diffusion policy for Hopper with random weights, which takes the best of so many candidates.
+pub fn file(candidates: u32) -> Vec<u8> {
     let shape = DiffusionShape { observation_dim: 11, action_dim: 3, hidden: 8, critics: 2, diffusion_steps: 5 };
     let mut generator = ChaCha8Rng::seed_from_u64(0);
     let mut weights = |layout: Layout| {
@@ -63,18 +65,18 @@ pub fn tensors() -> Vec<u8> {
     };
     let actor = NoisePredictor::new(shape.actor(), weights(shape.actor().layout()), Precision::F32);
     let critics = Ensemble::new(shape.critics(), weights(shape.critics().layout()), Precision::F32);
-    let tensors = DiffusionPolicy::tensors(&actor, &critics).unwrap();
-    Description::Diffusion(shape).to_safetensors(&tensors).unwrap()
+    let tensors = DiffusionPolicy::tensors(&actor, &critics, None).unwrap();
+    let policy = PolicyConfig::Diffusion { shape, choice: Choice::best_of(candidates) };
+    let origin = Origin { environment: "hopper".to_owned(), seed: 1, step: 10, episodes: 3 };
+    Header { policy, origin }.to_safetensors(&tensors).unwrap()
 }
 
 pub fn name(text: &str) -> Name {
     Name::new(text).unwrap()
 }
 
-pub fn snapshot(tensors: Vec<u8>) -> Snapshot {
-    let schema =
-        Schema { environment: "hopper".to_owned(), observation_dim: 11, action_dim: 3, policy: "diffusion".to_owned() };
-    Snapshot { run: name("run"), incarnation: INCARNATION, step: 10, schema, hash: Hash::of(&tensors), tensors }
+pub fn snapshot(file: Vec<u8>) -> Snapshot {
+    Snapshot { run: name("run"), incarnation: INCARNATION, step: 10, hash: Hash::of(&file), file }
 }
 
 pub fn job(snapshot: &Snapshot) -> Job {
@@ -85,9 +87,8 @@ pub fn job(snapshot: &Snapshot) -> Job {
         step: 10,
         weights: snapshot.hash,
         environment: "hopper".to_owned(),
-        instance: 1,
+        environment_seed: 1,
         seeds: vec![11, 12, 13],
-        candidates: 2,
         progress_milliseconds: 100,
     }
 }
@@ -129,7 +130,7 @@ impl Learner {
             let mut heard = heard.lock().unwrap();
             if key == keys::weights_at(&name("run"), 10) {
                 heard.push(Heard::Weights);
-                reply(&query, &snapshot(b"other tensors".to_vec()));
+                reply(&query, &snapshot(b"other weights".to_vec()));
                 reply(&query, &weights);
             } else if key == keys::scores(&name("run")) {
                 let report: ScoreReport = decode(&message).unwrap();
@@ -180,7 +181,7 @@ impl Learner {
     /// Starts an evaluator and announces the learner alone.
     pub async fn only_evaluator(&self) -> (Evaluator, impl Sized + use<>) {
         let mut command = Command::new(env!("CARGO_BIN_EXE_evaluator"));
-        command.args(["serve", "--name", "one", "--precision", "f32", "--connect", &self.endpoint]);
+        command.args(["serve", "--name", "one", "--connect", &self.endpoint]);
         let evaluator = Evaluator(command.spawn().unwrap());
         (evaluator, self.announce(INCARNATION).await)
     }

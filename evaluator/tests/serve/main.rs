@@ -8,20 +8,18 @@ use std::time::Duration;
 
 use quad_dataset::environment::find;
 use quad_evaluator::sim::Rollout;
-use quad_policy::{ActionNoise, Precision, load_policy};
+use quad_policy::{Precision, load_policy};
 use quad_protocol::{EpisodeScore, Job, ScoreReport, encode, keys};
 
-use learner::{Answer, Heard, Learner, job, name, reports, snapshot, tensors};
+use learner::{Answer, Heard, Learner, file, job, name, reports, snapshot};
 
 /// The scores that `job` must have, to the last bit.
-fn expected(job: &Job, tensors: &[u8]) -> Vec<EpisodeScore> {
-    let policy = load_policy(tensors, Precision::F32).unwrap();
-    let mut rollout =
-        Rollout::new(find(&job.environment).unwrap(), job.instance, &job.seeds, ActionNoise::new).unwrap();
+fn expected(job: &Job, file: &[u8]) -> Vec<EpisodeScore> {
+    let policy = load_policy(file, Precision::F32).unwrap();
+    let spec = find(&job.environment).unwrap();
+    let mut rollout = Rollout::new(spec, job.environment_seed, &job.seeds, |seed| policy.begin(seed)).unwrap();
     while !rollout.is_done() {
-        rollout
-            .step(|observations, noise, actions| policy.act(observations, job.candidates as usize, noise, actions))
-            .unwrap();
+        rollout.step(|observations, states, actions| policy.act(observations, states, actions)).unwrap();
     }
     let outcomes = rollout.into_outcomes().into_iter();
     outcomes
@@ -37,7 +35,7 @@ fn expected(job: &Job, tensors: &[u8]) -> Vec<EpisodeScore> {
 #[tokio::test(flavor = "multi_thread")]
 async fn scores_are_of_exactly_the_weights_and_seeds_that_the_job_names() {
     for published in [false, true] {
-        let learner = Learner::start(snapshot(tensors())).await;
+        let learner = Learner::start(snapshot(file(2))).await;
         let job = job(&learner.snapshot);
         let (evaluator, _tokens) = learner.evaluator().await;
         // At first the evaluator may follow the learner that is dead, which was started first.
@@ -49,7 +47,7 @@ async fn scores_are_of_exactly_the_weights_and_seeds_that_the_job_names() {
         learner.give(job.clone());
         let report = learner.wait_for_scores(1).await;
         let precision = name(&Precision::F32.arithmetic());
-        assert_eq!(report, ScoreReport::of(&job, name("one"), precision, expected(&job, &learner.snapshot.tensors)));
+        assert_eq!(report, ScoreReport::of(&job, name("one"), precision, expected(&job, &learner.snapshot.file)));
         assert_eq!(learner.count(|heard| *heard == Heard::Weights), usize::from(!published));
         assert!(evaluator.leave().success());
         assert_eq!(learner.count(|heard| matches!(heard, Heard::HandedBack(_))), 0);
@@ -58,7 +56,7 @@ async fn scores_are_of_exactly_the_weights_and_seeds_that_the_job_names() {
 
 #[tokio::test(flavor = "multi_thread")]
 async fn a_claim_without_an_answer_is_the_same_claim_again() {
-    let learner = Learner::start(snapshot(tensors())).await;
+    let learner = Learner::start(snapshot(file(2))).await;
     learner.answer(Answer::NoClaim);
     let (_evaluator, _token) = learner.only_evaluator().await;
     let claims = |heard: &[Heard]| -> Vec<u64> {
@@ -72,7 +70,7 @@ async fn a_claim_without_an_answer_is_the_same_claim_again() {
 
 #[tokio::test(flavor = "multi_thread")]
 async fn scores_are_sent_again_until_the_learner_has_saved_them() {
-    let learner = Learner::start(snapshot(tensors())).await;
+    let learner = Learner::start(snapshot(file(2))).await;
     learner.answer(Answer::DiskFull);
     learner.give(job(&learner.snapshot));
     let (_evaluator, _tokens) = learner.evaluator().await;
@@ -89,7 +87,7 @@ async fn scores_are_sent_again_until_the_learner_has_saved_them() {
 #[tokio::test(flavor = "multi_thread")]
 async fn an_evaluator_that_leaves_hands_its_job_back_unless_its_scores_may_be_saved() {
     for (answer, handed_back) in [(Answer::DiskFull, 0), (Answer::Nothing, 1)] {
-        let learner = Learner::start(snapshot(tensors())).await;
+        let learner = Learner::start(snapshot(file(2))).await;
         learner.answer(answer);
         learner.give(job(&learner.snapshot));
         let (evaluator, _tokens) = learner.evaluator().await;
@@ -102,7 +100,7 @@ async fn an_evaluator_that_leaves_hands_its_job_back_unless_its_scores_may_be_sa
 
 #[tokio::test(flavor = "multi_thread")]
 async fn an_evaluator_leaves_in_time_though_its_learner_hangs() {
-    let learner = Learner::start(snapshot(tensors())).await;
+    let learner = Learner::start(snapshot(file(2))).await;
     learner.answer(Answer::Hang);
     learner.give(job(&learner.snapshot));
     let (evaluator, _tokens) = learner.evaluator().await;
@@ -113,9 +111,9 @@ async fn an_evaluator_leaves_in_time_though_its_learner_hangs() {
 
 #[tokio::test(flavor = "multi_thread")]
 async fn a_job_that_is_not_done_is_handed_back() {
-    let learner = Learner::start(snapshot(tensors())).await;
+    let learner = Learner::start(snapshot(file(200))).await;
     let seeds = (0..256).collect();
-    learner.give(Job { seeds, candidates: 200, ..job(&learner.snapshot) });
+    learner.give(Job { seeds, ..job(&learner.snapshot) });
     let (evaluator, _tokens) = learner.evaluator().await;
     learner.wait_for(|heard| heard.contains(&Heard::Progress).then_some(())).await;
     assert!(evaluator.leave().success());

@@ -1,24 +1,30 @@
-//! What the learner and an algorithm know of each other: hyper-parameters, an update, a policy to publish, a state as named
-//! tensors, and a table of metrics; and what algorithms share to check and to measure.
+//! What the learner and an algorithm know of each other: hyper-parameters, a context, an update, a policy to publish, a state
+//! as one list of named parts, and a table of metrics.
+
+use std::sync::Arc;
 
 use candle_core::{Device, Result, Tensor};
-use quad_dataset::Batch;
-use quad_policy::{Description, PolicyError, Precision, Tensors};
+use quad_dataset::{Batch, Transitions};
+use quad_policy::{MlpConfig, PolicyConfig, PolicyError, Precision, Tensors};
 use serde::de::DeserializeOwned;
 
+use super::parts::Parts;
+
 /// What is known of an algorithm before it runs.
-#[derive(Clone, Copy, Debug)]
+#[derive(Clone, Copy)]
 pub struct Definition {
     /// Its name on the command line and in files.
     pub name: &'static str,
-    /// What each update measures, in the order of the values that it gives.
-    pub metrics: &'static [Metric],
     /// The file of its values for each task, `presets/NAME.toml`.
     pub settings: &'static str,
     /// The hyper-parameter that tells its variants apart in run names and tables, if it has any.
     pub variant: Option<&'static str>,
-    /// Reads its hyper-parameters, the `[agent]` table of a preset, and checks them.
-    pub read: fn(&toml::Table) -> std::result::Result<Box<dyn Hyperparameters>, AgentError>,
+    /// What each update measures, in the order of the values that it gives.
+    pub metrics: &'static [Metric],
+    /// Checks its hyper-parameters, the `[agent]` table of a preset.
+    pub check: fn(&toml::Table) -> std::result::Result<(), AgentError>,
+    /// The algorithm at step 0, of such a table.
+    pub start: fn(&toml::Table, Context) -> std::result::Result<Box<dyn Algorithm>, AlgorithmError>,
 }
 
 /// A number that an update measures. Gauges, `metrics.jsonl`, the progress display and docs/metrics.md derive from it.
@@ -32,32 +38,12 @@ pub struct Metric {
     pub label: &'static str,
 }
 
-/// The hyper-parameters of one algorithm.
-pub trait Hyperparameters: Send + Sync {
-    /// What tells variants of the algorithm apart, in run names and tables.
-    fn variant(&self) -> String;
-
-    /// The figures that matter most, for a line of the log.
-    fn summary(&self) -> String;
-
-    /// Whether its policy samples candidates and chooses the best.
-    fn samples_candidates(&self) -> bool;
-
-    /// The algorithm at step 0.
-    ///
-    /// # Errors
-    /// Candle fails.
-    fn start(&self, setting: &Setting) -> std::result::Result<Box<dyn Algorithm>, AlgorithmError>;
-}
-
 /// What an algorithm has to know of a run.
-#[derive(Clone, Debug)]
-pub struct Setting {
-    /// Numbers in an observation.
-    pub observation_dim: usize,
-    /// Numbers in an action.
-    pub action_dim: usize,
-    /// Transitions per update, B.
+#[derive(Clone)]
+pub struct Context {
+    /// What it learns from: transitions, their order in episodes, windows of them.
+    pub transitions: Arc<Transitions>,
+    /// Items per update, B.
     pub batch_size: usize,
     /// Updates of the whole run; learning rates that decay reach 0 there.
     pub total_steps: u64,
@@ -69,32 +55,48 @@ pub struct Setting {
     pub device: Device,
 }
 
+impl Context {
+    /// Numbers in an observation.
+    pub fn observation_dim(&self) -> usize {
+        self.transitions.observation_dim()
+    }
+
+    /// Numbers in an action.
+    pub fn action_dim(&self) -> usize {
+        self.transitions.action_dim()
+    }
+
+    /// The transitions of these numbers as tensors.
+    ///
+    /// # Errors
+    /// Candle fails.
+    pub fn batch(&self, items: &[u32]) -> Result<Minibatch> {
+        let mut batch = Batch::default();
+        self.transitions.gather(items, &mut batch);
+        Minibatch::new(&batch, &self.device)
+    }
+}
+
 /// An algorithm in the middle of a run.
 pub trait Algorithm: Send {
-    /// Update number `step`, from 0; its random numbers are a function of the run's seed and this number. Gives the
-    /// values of the algorithm's metrics.
-    ///
-    /// # Errors
-    /// Candle fails, for example because the batch does not fit the networks.
-    fn update(&mut self, step: u64, batch: &Minibatch) -> Result<Vec<f32>>;
+    /// How many items updates draw from: the transitions, unless it says otherwise.
+    fn items(&self) -> usize;
 
-    /// The policy to be evaluated: what kind it is, and its tensors.
+    /// Update number `step`, from 0, on the items of these numbers; its random numbers are a function of the run's seed and of
+    /// `step`. Gives the values of the algorithm's metrics.
     ///
     /// # Errors
     /// Candle fails.
-    fn policy(&self) -> Result<(Description, Tensors)>;
+    fn update(&mut self, step: u64, items: &[u32]) -> Result<Vec<f32>>;
 
-    /// Everything that updates change: with the step it decides the future of the run.
+    /// The policy to be evaluated: what it is, and its tensors.
     ///
     /// # Errors
     /// Candle fails.
-    fn state(&self) -> Result<Tensors>;
+    fn policy(&self) -> Result<(PolicyConfig, Tensors)>;
 
-    /// Goes on from a state, whose tensors are taken out of `tensors`.
-    ///
-    /// # Errors
-    /// A tensor that is missing or does not fit.
-    fn load(&mut self, tensors: &mut Tensors) -> std::result::Result<(), PolicyError>;
+    /// Everything that updates change, by name: with the step it decides the future of the run. Saving and loading go by it.
+    fn parts(&mut self) -> Parts<'_>;
 }
 
 /// A batch of B transitions as tensors.
@@ -129,6 +131,14 @@ impl Minibatch {
             masks: column(&batch.masks)?,
         })
     }
+
+    /// y = r + γ·mask·v for values v of s', `[B]`, as constants.
+    ///
+    /// # Errors
+    /// Candle fails.
+    pub fn target(&self, gamma: f32, next: &Tensor) -> Result<Tensor> {
+        Ok((&self.rewards + ((next * &self.masks)? * f64::from(gamma))?)?.detach())
+    }
 }
 
 /// Why an algorithm cannot start or be saved.
@@ -137,6 +147,9 @@ pub enum AlgorithmError {
     /// The policy or the state does not hold what it should.
     #[error(transparent)]
     Policy(#[from] PolicyError),
+    /// Its hyper-parameters cannot be used.
+    #[error(transparent)]
+    Agent(#[from] AgentError),
     /// A tensor cannot be computed or moved.
     #[error("candle failed")]
     Candle(#[from] candle_core::Error),
@@ -160,9 +173,25 @@ pub enum AgentError {
     },
 }
 
-/// Reads a table of hyper-parameters.
-pub(super) fn read<T: DeserializeOwned>(table: &toml::Table) -> std::result::Result<T, AgentError> {
-    Ok(T::deserialize(table.clone())?)
+/// The hyper-parameters of one algorithm, which its `[agent]` table is read into.
+pub(super) trait Hyperparameters: DeserializeOwned {
+    /// That each is in its range, as far as its type does not say so.
+    fn check(&self) -> std::result::Result<(), AgentError>;
+}
+
+/// Reads a table of hyper-parameters and checks them.
+pub(super) fn read<T: Hyperparameters>(table: &toml::Table) -> std::result::Result<T, AgentError> {
+    let config = T::deserialize(table.clone())?;
+    config.check()?;
+    Ok(config)
+}
+
+/// That a network has hidden layers of reasonable widths.
+pub(super) fn check_layers(field: &'static str, layers: &MlpConfig) -> std::result::Result<(), AgentError> {
+    layers.check(field).map_err(|_| {
+        let value = format!("{:?}", layers.hidden);
+        AgentError::Range { field, value, range: "a list of the hidden layers' widths, each from 1 to 65535" }
+    })
 }
 
 /// That a hyper-parameter is in its range.
@@ -175,19 +204,9 @@ pub(super) fn check(
     if holds { Ok(()) } else { Err(AgentError::Range { field, value: value.to_string(), range }) }
 }
 
-/// That a hyper-parameter is above 0 and finite.
-pub(super) fn check_positive(field: &'static str, value: f32) -> std::result::Result<(), AgentError> {
-    check(field, value, value > 0.0 && value.is_finite(), "above 0")
-}
-
-/// That a hyper-parameter is in (0, 1].
-pub(super) fn check_rate(field: &'static str, value: f32) -> std::result::Result<(), AgentError> {
-    check(field, value, value > 0.0 && value <= 1.0, "in (0, 1]")
-}
-
-/// That a number of things is within 1..=`most`.
-pub(super) fn check_count(field: &'static str, value: usize, most: usize) -> std::result::Result<(), AgentError> {
-    check(field, value, (1..=most).contains(&value), "a whole number from 1 on, of reasonable size")
+/// The smaller of the critics' values, `[K, B]` → `[B]`. (A minimum would drop a NaN; zero times the sum does not.)
+pub(super) fn smaller(values: &Tensor) -> Result<Tensor> {
+    values.min(0)? + (values.sum(0)? * 0.0)?
 }
 
 /// Tensors `[]` as numbers; from a GPU in one copy, because each copy waits for the GPU.

@@ -6,35 +6,28 @@
 #[allow(clippy::unwrap_used)]
 mod golden;
 
-use super::algorithm::{
-    AgentError, Algorithm, AlgorithmError, Definition, Hyperparameters, Metric, Minibatch, Setting, check, check_count,
-    check_positive, check_rate, numbers, read,
-};
-use super::optimiser::{Adam, AdamStep, cosine_decay, follow};
-use super::random::{Purpose, stream};
-use candle_core::backprop::GradStore;
-use candle_core::{DType, Result, Tensor};
-use quad_policy::{
-    Description, Ensemble, EnsembleShape, GaussianPolicy, GaussianShape, Layout, Part, PolicyError, Tensors, Weights,
-    gaussian_mean,
-};
+use super::algorithm::{AgentError, Algorithm, Context, Definition, Hyperparameters, Metric, check_layers, numbers, read, smaller};
+use super::gaussian::Gaussian;
+use super::hyperparameters::{Positive, Quantile, Rate, Share};
+use super::parts::{Parts, Trained, ensemble};
+use candle_core::{DType, Result};
+use quad_policy::{AdamStep, Ensemble, EnsembleShape, Gradients, MlpConfig, PolicyConfig, Tensors, cosine_decay};
 use serde::Deserialize;
 
 /// What the learner has to know of it.
 pub(super) const DEFINITION: Definition = Definition {
     name: "iql",
-    metrics: METRICS,
     settings: include_str!("../../../presets/iql.toml"),
     variant: None,
-    read: read_config,
+    metrics: METRICS,
+    check: |table| read::<Config>(table).map(drop),
+    start: |table, context| Ok(Box::new(Iql::new(read(table)?, context)?)),
 };
 
 /// Critics, of whose values the smaller counts.
 const CRITICS: usize = 2;
 /// Largest weight of an action of the data.
 const MOST_WEIGHT: f64 = 100.0;
-/// Bounds of the policy's log σ.
-const LOG_STD: (f32, f32) = (-5.0, 2.0);
 
 const METRICS: &[Metric] = &[
     Metric {
@@ -69,169 +62,103 @@ const METRICS: &[Metric] = &[
 ];
 
 /// IQL's hyper-parameters: the `[agent]` table of a preset.
-#[derive(Clone, Debug, Deserialize)]
+#[derive(Deserialize)]
 #[serde(deny_unknown_fields)]
 struct Config {
-    /// Width of the hidden layers of all networks.
-    hidden: usize,
+    actor: MlpConfig,
+    critic: MlpConfig,
+    value: MlpConfig,
     /// Discount γ.
-    gamma: f32,
+    gamma: Share,
     /// The expectile τ of the value function.
-    expectile: f32,
+    expectile: Quantile,
     /// Inverse temperature β of the advantages.
-    temperature: f32,
-    actor_learning_rate: f32,
-    critic_learning_rate: f32,
-    value_learning_rate: f32,
+    temperature: Positive,
+    actor_learning_rate: Positive,
+    critic_learning_rate: Positive,
+    value_learning_rate: Positive,
     /// EMA rate of the target critics.
-    ema_rate: f32,
-}
-
-fn read_config(table: &toml::Table) -> std::result::Result<Box<dyn Hyperparameters>, AgentError> {
-    let config: Config = read(table)?;
-    check_count("hidden", config.hidden, 1 << 14)?;
-    check("gamma", config.gamma, (0.0..=1.0).contains(&config.gamma), "in [0, 1]")?;
-    check("expectile", config.expectile, config.expectile > 0.0 && config.expectile < 1.0, "between 0 and 1")?;
-    check_positive("temperature", config.temperature)?;
-    check_positive("actor_learning_rate", config.actor_learning_rate)?;
-    check_positive("critic_learning_rate", config.critic_learning_rate)?;
-    check_positive("value_learning_rate", config.value_learning_rate)?;
-    check_rate("ema_rate", config.ema_rate)?;
-    Ok(Box::new(config))
+    ema_rate: Rate,
 }
 
 impl Hyperparameters for Config {
-    fn variant(&self) -> String {
-        "iql".to_owned()
+    fn check(&self) -> std::result::Result<(), AgentError> {
+        check_layers("actor", &self.actor)?;
+        check_layers("critic", &self.critic)?;
+        check_layers("value", &self.value)
     }
-
-    fn summary(&self) -> String {
-        format!("iql, expectile {}, temperature {}, {} wide", self.expectile, self.temperature, self.hidden)
-    }
-
-    fn samples_candidates(&self) -> bool {
-        false
-    }
-
-    fn start(&self, setting: &Setting) -> std::result::Result<Box<dyn Algorithm>, AlgorithmError> {
-        Ok(Box::new(Iql::new(self.clone(), setting.clone())?))
-    }
-}
-
-/// A network with its optimiser.
-struct Trained {
-    network: Ensemble,
-    adam: Adam,
 }
 
 /// IQL in the middle of a run.
 struct Iql {
     config: Config,
-    setting: Setting,
-    shape: GaussianShape,
+    context: Context,
     /// V.
-    value: Trained,
+    value: Trained<Ensemble>,
     /// Q_1 and Q_2, and their EMA Q̂.
-    critics: Trained,
+    critics: Trained<Ensemble>,
     target_critics: Ensemble,
-    /// The policy's mean is its tanh.
-    actor: Trained,
-    /// The policy's log σ, the same in all states, `[a]`.
-    log_std: Weights,
-    log_std_adam: Adam,
-}
-
-impl Trained {
-    fn new(shape: EnsembleShape, setting: &Setting, network: u64) -> Result<Self> {
-        let (layout, mut generator) = (shape.layout(), stream(setting.seed, Purpose::Weights, network));
-        let values = Weights::initial(&layout, &mut generator, &setting.device)?;
-        let weights = Weights::trainable(layout, &values)?;
-        Ok(Self { adam: Adam::new(&weights)?, network: Ensemble::new(shape, weights, setting.precision) })
-    }
-
-    fn descend(&mut self, gradients: &GradStore, rate: f32, count: u64) -> Result<()> {
-        self.adam.step(self.network.weights_mut(), gradients, AdamStep { rate, clip: None, count })?;
-        Ok(())
-    }
-
-    fn state(&self, name: &str) -> Result<Tensors> {
-        let mut tensors = self.network.weights().tensors(name)?;
-        tensors.extend(self.adam.tensors(self.network.weights(), name)?);
-        Ok(tensors)
-    }
-
-    fn load(&mut self, tensors: &mut Tensors, name: &str) -> std::result::Result<(), PolicyError> {
-        self.network.weights_mut().load(tensors, name)?;
-        self.adam.load(self.network.weights(), tensors, name)
-    }
+    actor: Gaussian,
 }
 
 impl Iql {
-    fn new(config: Config, setting: Setting) -> Result<Self> {
-        let Setting { observation_dim, action_dim, .. } = setting;
-        let shape = GaussianShape { observation_dim, action_dim, hidden: config.hidden };
-        let of_pairs =
-            EnsembleShape { members: CRITICS, observation_dim, action_dim, hidden: config.hidden, outputs: 1 };
-        let of_states = EnsembleShape { members: 1, action_dim: 0, ..of_pairs };
-        let critics = Trained::new(of_pairs, &setting, 1)?;
-        let log_std = Layout::new(vec![Part { name: "log_std".to_owned(), shape: vec![action_dim], offset: 0 }]);
-        let log_std = Weights::trainable(log_std, &Tensor::zeros(action_dim, DType::F32, &setting.device)?)?;
+    fn new(config: Config, context: Context) -> Result<Self> {
+        let (observation_dim, action_dim) = (context.observation_dim(), context.action_dim());
+        let shape = |members, action_dim, layers: &MlpConfig| EnsembleShape {
+            members,
+            observation_dim,
+            action_dim,
+            layers: layers.clone(),
+            outputs: 1,
+        };
+        let critics = ensemble(shape(CRITICS, action_dim, &config.critic), &context, 1)?;
         Ok(Self {
-            value: Trained::new(of_states, &setting, 2)?,
-            target_critics: Ensemble::new(of_pairs, critics.network.weights().copy()?, setting.precision),
+            value: ensemble(shape(1, 0, &config.value), &context, 2)?,
+            target_critics: critics.network.copy()?,
             critics,
-            actor: Trained::new(shape.actor(), &setting, 0)?,
-            log_std_adam: Adam::new(&log_std)?,
-            log_std,
-            shape,
+            actor: Gaussian::new(&config.actor, &context, 0)?,
             config,
-            setting,
+            context,
         })
-    }
-
-    /// log π(a|s) of the batch, `[B]`.
-    fn log_probability(&self, batch: &Minibatch) -> Result<Tensor> {
-        let log_std = self.log_std.values().clamp(LOG_STD.0, LOG_STD.1)?;
-        let error = (&batch.actions - gaussian_mean(&self.actor.network, &batch.observations)?)?;
-        let square = error.broadcast_div(&log_std.exp()?)?.sqr()?;
-        let half_log_2_pi = 0.5 * (2.0 * std::f64::consts::PI).ln();
-        ((square * -0.5)?.broadcast_sub(&log_std)? - half_log_2_pi)?.sum(1)
     }
 }
 
 impl Algorithm for Iql {
-    fn update(&mut self, step: u64, batch: &Minibatch) -> Result<Vec<f32>> {
-        let Config { expectile, temperature, .. } = self.config;
-        let (expectile, count) = (f64::from(expectile), step + 1);
+    fn items(&self) -> usize {
+        self.context.transitions.len()
+    }
 
-        // V(s) towards an expectile of the smaller Q̂(s, a), Eq. 5. (A minimum would drop a NaN; zero times the sum does not.)
-        let q = self.target_critics.values(&batch.observations, &batch.actions)?;
-        let q = (q.min(0)? + (q.sum(0)? * 0.0)?)?;
+    fn update(&mut self, step: u64, items: &[u32]) -> Result<Vec<f32>> {
+        let (batch, count) = (self.context.batch(items)?, step + 1);
+        let adam = |rate: f32| AdamStep { rate, clip: None, count };
+        let expectile = f64::from(*self.config.expectile);
+
+        // V(s) towards an expectile of the smaller Q̂(s, a), Eq. 5.
+        let q = smaller(&self.target_critics.values(&batch.observations, &batch.actions)?)?;
         let u = (&q - self.value.network.state_values(&batch.observations)?.squeeze(0)?)?;
         let side = u.lt(0f32)?.to_dtype(DType::F32)?.affine(1.0 - 2.0 * expectile, expectile)?;
         let value_loss = (side * u.sqr()?)?.mean_all()?;
-        self.value.descend(&value_loss.backward()?, self.config.value_learning_rate, count)?;
+        self.value.descend(&Gradients::of(&value_loss)?, adam(*self.config.value_learning_rate))?;
 
         // The policy towards actions of the data, the more so the better they are, Eq. 7.
-        let value = self.value.network.frozen();
+        let value = self.value.network.detach();
         let v = value.state_values(&batch.observations)?.squeeze(0)?;
         let advantage = (&q - &v)?;
-        let weight = (&advantage * f64::from(temperature))?.exp()?;
+        let weight = (&advantage * f64::from(*self.config.temperature))?.exp()?;
         let clipped = weight.gt(MOST_WEIGHT)?.to_dtype(DType::F32)?;
         let weight = weight.minimum(MOST_WEIGHT)?;
-        let actor_loss = (&weight * self.log_probability(batch)?)?.mean_all()?.neg()?;
-        let rate = self.config.actor_learning_rate * cosine_decay(step, self.setting.total_steps);
-        let gradients = actor_loss.backward()?;
-        self.actor.descend(&gradients, rate, count)?;
-        self.log_std_adam.step(&mut self.log_std, &gradients, AdamStep { rate, clip: None, count })?;
+        let log_probability = self.actor.log_probability(&batch.observations, &batch.actions)?;
+        let actor_loss = (&weight * log_probability)?.mean_all()?.neg()?;
+        let rate = *self.config.actor_learning_rate * cosine_decay(step, self.context.total_steps);
+        self.actor.descend(&Gradients::of(&actor_loss)?, adam(rate))?;
 
         // Q(s, a) towards r + γ·V(s'), Eq. 6.
         let next = value.state_values(&batch.next_observations)?.squeeze(0)?;
-        let targets = (&batch.rewards + ((next * &batch.masks)? * f64::from(self.config.gamma))?)?;
+        let targets = batch.target(*self.config.gamma, &next)?;
         let error = self.critics.network.squared_error(&batch.observations, &batch.actions, &targets)?;
         let critic_loss = (error * CRITICS as f64)?;
-        self.critics.descend(&critic_loss.backward()?, self.config.critic_learning_rate, count)?;
-        follow(self.target_critics.weights_mut(), self.critics.network.weights(), self.config.ema_rate)?;
+        self.critics.descend(&Gradients::of(&critic_loss)?, adam(*self.config.critic_learning_rate))?;
+        self.target_critics.weights_mut().follow(self.critics.network.weights(), *self.config.ema_rate)?;
 
         let mut metrics = numbers(&[
             &targets.mean_all()?,
@@ -247,26 +174,15 @@ impl Algorithm for Iql {
         Ok(metrics)
     }
 
-    fn policy(&self) -> Result<(Description, Tensors)> {
-        Ok((Description::Gaussian(self.shape), GaussianPolicy::tensors(&self.actor.network)?))
+    fn policy(&self) -> Result<(PolicyConfig, Tensors)> {
+        self.actor.policy()
     }
 
-    fn state(&self) -> Result<Tensors> {
-        let mut tensors = self.value.state("value.")?;
-        tensors.extend(self.critics.state("critic.")?);
-        tensors.extend(self.target_critics.weights().tensors("target_critic.")?);
-        tensors.extend(self.actor.state("actor.")?);
-        tensors.extend(self.log_std.tensors("actor.")?);
-        tensors.extend(self.log_std_adam.tensors(&self.log_std, "actor.")?);
-        Ok(tensors)
-    }
-
-    fn load(&mut self, tensors: &mut Tensors) -> std::result::Result<(), PolicyError> {
-        self.value.load(tensors, "value.")?;
-        self.critics.load(tensors, "critic.")?;
-        self.target_critics.weights_mut().load(tensors, "target_critic.")?;
-        self.actor.load(tensors, "actor.")?;
-        self.log_std.load(tensors, "actor.")?;
-        self.log_std_adam.load(&self.log_std, tensors, "actor.")
+    fn parts(&mut self) -> Parts<'_> {
+        let parts = Parts::default()
+            .trained("value", &mut self.value)
+            .trained("critic", &mut self.critics)
+            .weights("target_critic", self.target_critics.weights_mut());
+        self.actor.parts(parts)
     }
 }

@@ -4,12 +4,15 @@
 //! [`ALGORITHMS`] and its values for each task in `presets/`.
 
 mod algorithm;
+mod gaussian;
+mod hyperparameters;
 mod iql;
-pub mod optimiser;
-pub mod quad;
+mod parts;
+mod quad;
 mod random;
 
-pub use algorithm::{AgentError, Algorithm, AlgorithmError, Definition, Hyperparameters, Metric, Minibatch, Setting};
+pub use algorithm::{AgentError, Algorithm, AlgorithmError, Context, Definition, Metric, Minibatch};
+pub use parts::Parts;
 
 /// All algorithms, the one that learns unless another is asked for first.
 pub const ALGORITHMS: [Definition; 2] = [quad::DEFINITION, iql::DEFINITION];

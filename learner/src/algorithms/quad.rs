@@ -7,72 +7,41 @@ mod config;
 mod golden;
 mod metrics;
 
-use super::algorithm::{
-    AgentError, Algorithm, AlgorithmError, Definition, Hyperparameters, Minibatch, Setting, numbers,
-};
-use super::optimiser::{Adam, AdamStep, cosine_decay, follow};
+use super::algorithm::{Algorithm, AlgorithmError, Context, Definition, Minibatch, numbers, read};
+use super::parts::{Parts, Trained, ensemble, initial};
 use super::random::{Purpose, stream};
-use candle_core::{DType, Device, Result, Tensor};
+use candle_core::{DType, Result, Tensor};
 use candle_nn::loss::mse;
 use config::{Eta, Guidance, Quad as Config, TargetReduce};
 use metrics::METRICS;
 use quad_policy::{
-    Description, DiffusionPolicy, DiffusionShape, Ensemble, NoisePredictor, PolicyError, Tensors, Weights,
-    mean_and_variance,
+    AdamStep, Choice, DiffusionPolicy, DiffusionShape, Ensemble, Gradients, NoisePredictor, PolicyConfig, Reverse, Tensors,
+    cosine_decay, mean_and_variance,
 };
 use rand::Rng;
 use rand_distr::{Distribution, StandardNormal};
 
 /// What the learner has to know of it.
-pub const DEFINITION: Definition = Definition {
+pub(super) const DEFINITION: Definition = Definition {
     name: "quad",
-    metrics: METRICS,
     settings: include_str!("../../../presets/quad.toml"),
     variant: Some("guidance"),
-    read,
+    metrics: METRICS,
+    check: |table| read::<Config>(table).map(drop),
+    start: |table, context| Ok(Box::new(Quad::new(read(table)?, context)?)),
 };
-
-fn read(table: &toml::Table) -> std::result::Result<Box<dyn Hyperparameters>, AgentError> {
-    Ok(Box::new(config::read(table)?))
-}
-
-impl Hyperparameters for Config {
-    fn variant(&self) -> String {
-        match self.guidance {
-            Guidance::Quad => "quad",
-            Guidance::Dac => "dac",
-            Guidance::None => "none",
-        }
-        .to_owned()
-    }
-
-    fn summary(&self) -> String {
-        let Self { samples, critics, hidden, .. } = self;
-        format!("guidance {}, {samples} samples, {critics} critics, {hidden} wide", self.variant())
-    }
-
-    fn samples_candidates(&self) -> bool {
-        true
-    }
-
-    fn start(&self, setting: &Setting) -> std::result::Result<Box<dyn Algorithm>, AlgorithmError> {
-        Ok(Box::new(Quad::new(self.clone(), setting.clone())?))
-    }
-}
 
 /// QUAD in the middle of a run.
 pub(super) struct Quad {
     config: Config,
-    setting: Setting,
+    context: Context,
     shape: DiffusionShape,
     /// ε_θ and its EMA.
-    actor: NoisePredictor,
+    actor: Trained<NoisePredictor>,
     target_actor: NoisePredictor,
     /// Q_1..Q_K and their EMA Q̂.
-    critics: Ensemble,
+    critics: Trained<Ensemble>,
     target_critics: Ensemble,
-    actor_adam: Adam,
-    critic_adam: Adam,
     /// Strength η of behaviour cloning, `[]`.
     eta: Tensor,
     /// ν̂² (Eq. 23), `[]`; none before the first guided update.
@@ -90,7 +59,7 @@ struct Noise {
 }
 
 /// What the critics say about noisy actions, and how far they are trusted.
-struct Advice {
+struct Guide {
     /// ḡ: the mean over critics of ∇_a Q̂_k(s, a^t), over the mean of |Q̂_k(s, a)| (Eq. 10), `[B, a]`.
     gradient: Tensor,
     /// ν̂² after this batch (Eq. 23), `[]`.
@@ -102,40 +71,37 @@ struct Advice {
 }
 
 impl Quad {
-    fn new(config: Config, setting: Setting) -> std::result::Result<Self, AlgorithmError> {
+    fn new(config: Config, context: Context) -> std::result::Result<Self, AlgorithmError> {
         let shape = DiffusionShape {
-            observation_dim: setting.observation_dim,
-            action_dim: setting.action_dim,
-            hidden: config.hidden,
-            critics: config.critics,
-            diffusion_steps: config.diffusion_steps,
+            observation_dim: context.observation_dim(),
+            action_dim: context.action_dim(),
+            actor: config.actor.clone(),
+            critic: config.critic.clone(),
+            value: None,
+            critics: *config.critics,
+            diffusion_steps: *config.diffusion_steps,
+            reverse: Reverse::ClipClean,
         };
-        let weights = |layout: quad_policy::Layout, network| {
-            let mut generator = stream(setting.seed, Purpose::Weights, network);
-            let values = Weights::initial(&layout, &mut generator, &setting.device)?;
-            Weights::trainable(layout, &values)
-        };
-        let (actor, critics) = (weights(shape.actor().layout(), 0)?, weights(shape.critics().layout(), 1)?);
-        let precision = setting.precision;
+        let (actor, critics) =
+            (initial(&shape.actor().layout(), &context, 0)?, ensemble(shape.critics(), &context, 1)?);
+        let precision = context.precision;
         Ok(Self {
-            actor_adam: Adam::new(&actor)?,
-            critic_adam: Adam::new(&critics)?,
             target_actor: NoisePredictor::new(shape.actor(), actor.copy()?, precision),
-            target_critics: Ensemble::new(shape.critics(), critics.copy()?, precision),
-            actor: NoisePredictor::new(shape.actor(), actor, precision),
-            critics: Ensemble::new(shape.critics(), critics, precision),
-            eta: Tensor::new(config.eta.initial, &setting.device)?,
+            target_critics: critics.network.copy()?,
+            actor: Trained::new(NoisePredictor::new(shape.actor(), actor, precision))?,
+            critics,
+            eta: Tensor::new(*config.eta.initial, &context.device)?,
             nu_squared: None,
             shape,
             config,
-            setting,
+            context,
         })
     }
 
     fn noise(&self, step: u64) -> Result<Noise> {
-        let mut generator = stream(self.setting.seed, Purpose::Noise, step);
-        let (b, a, device) = (self.setting.batch_size, self.shape.action_dim, &self.setting.device);
-        let (steps, rows) = (self.config.diffusion_steps, b * self.config.samples);
+        let mut generator = stream(self.context.seed, Purpose::Noise, step);
+        let (b, a, device) = (self.context.batch_size, self.shape.action_dim, &self.context.device);
+        let (steps, rows) = (self.shape.diffusion_steps, b * *self.config.samples);
         let mut normal = |n: usize| -> Vec<f32> { (0..n).map(|_| StandardNormal.sample(&mut generator)).collect() };
         let (next, epsilon) = (normal(steps * rows * a), normal(b * a));
         Ok(Noise {
@@ -147,46 +113,45 @@ impl Quad {
 
     /// One pass through Algorithm 1's loop; `step` counts from 0.
     fn step(&mut self, step: u64, batch: &Minibatch, noise: &Noise) -> Result<Vec<f32>> {
-        let decay = cosine_decay(step, self.setting.total_steps);
-        let (clip, count, ema_rate) = (Some(self.config.gradient_clip), step + 1, self.config.ema_rate);
+        let decay = cosine_decay(step, self.context.total_steps);
+        let (clip, count, ema_rate) = (Some(*self.config.gradient_clip), step + 1, *self.config.ema_rate);
 
         // Lines 4–7: every critic towards the lower confidence bound (Eq. 20).
         let targets = self.targets(batch, noise)?;
-        let critic_loss = self.critics.squared_error(&batch.observations, &batch.actions, &targets)?;
-        let adam = AdamStep { rate: self.config.critic_learning_rate * decay, clip, count };
-        let critic_gradient_norm = self.critic_adam.step(self.critics.weights_mut(), &critic_loss.backward()?, adam)?;
-        follow(self.target_critics.weights_mut(), self.critics.weights(), ema_rate)?;
+        let critic_loss = self.critics.network.squared_error(&batch.observations, &batch.actions, &targets)?;
+        let adam = AdamStep { rate: *self.config.critic_learning_rate * decay, clip, count };
+        let critic_gradient_norm = self.critics.descend(&Gradients::of(&critic_loss)?, adam)?;
+        self.target_critics.weights_mut().follow(self.critics.network.weights(), ema_rate)?;
 
         // Lines 8–11: behaviour cloning, pulled along the gradients that the critics agree on (Eq. 5 and 19).
         let (signal, deviation) =
-            self.actor.schedule().noising(&noise.t, self.shape.action_dim, &self.setting.device)?;
+            self.actor.network.schedule().noising(&noise.t, self.shape.action_dim, &self.context.device)?;
         let noisy = ((&batch.actions * signal)? + (&noise.epsilon * &deviation)?)?;
-        let t = Tensor::from_slice(&noise.t, noise.t.len(), &self.setting.device)?;
-        let predicted = self.actor.predict(&batch.observations, &noisy, &t)?;
+        let t = Tensor::from_slice(&noise.t, noise.t.len(), &self.context.device)?;
+        let predicted = self.actor.network.predict(&batch.observations, &noisy, &t)?;
         let bc_loss = mse(&predicted, &noise.epsilon)?;
         let mut actor_loss = (&bc_loss * &self.eta)?;
         let zero = self.eta.zeros_like()?;
         let (mut lambda_mean, mut delta_share) = (zero.clone(), zero.clone());
         if self.config.guidance != Guidance::None {
-            let advice = self.advice(batch, &noisy, &predicted.detach())?;
-            let pull = (advice.gradient * deviation)?.broadcast_mul(&advice.lambda.unsqueeze(1)?)?;
+            let guide = self.guide(batch, &noisy, &predicted.detach())?;
+            let pull = (guide.gradient * deviation)?.broadcast_mul(&guide.lambda.unsqueeze(1)?)?;
             actor_loss = (actor_loss + (&predicted * pull)?.mean_all()?)?;
-            (lambda_mean, delta_share) = (advice.lambda.mean_all()?, advice.delta_share);
-            self.nu_squared = Some(advice.nu_squared);
+            (lambda_mean, delta_share) = (guide.lambda.mean_all()?, guide.delta_share);
+            self.nu_squared = Some(guide.nu_squared);
         }
-        let rate = self.config.actor_learning_rate * decay;
-        let adam = AdamStep { rate, clip, count };
-        let actor_gradient_norm = self.actor_adam.step(self.actor.weights_mut(), &actor_loss.backward()?, adam)?;
+        let rate = *self.config.actor_learning_rate * decay;
+        let actor_gradient_norm = self.actor.descend(&Gradients::of(&actor_loss)?, AdamStep { rate, clip, count })?;
 
         // Line 12: dual ascent on η, with the actor as it is now.
         if let Some(threshold) = self.config.eta.threshold
             && self.config.guidance != Guidance::None
         {
-            let predicted = self.actor.frozen().predict(&batch.observations, &noisy, &t)?;
-            self.eta = self.ascended_eta((mse(&predicted, &noise.epsilon)? - f64::from(threshold))?)?;
+            let predicted = self.actor.network.detach().predict(&batch.observations, &noisy, &t)?;
+            self.eta = self.ascended_eta((mse(&predicted, &noise.epsilon)? - f64::from(*threshold))?)?;
         }
-        if step.is_multiple_of(self.config.actor_ema_every) && step > self.config.actor_ema_start {
-            follow(self.target_actor.weights_mut(), self.actor.weights(), ema_rate)?;
+        if step.is_multiple_of(*self.config.actor_ema_every) && step > self.config.actor_ema_start {
+            self.target_actor.weights_mut().follow(self.actor.network.weights(), ema_rate)?;
         }
 
         let nu_squared = self.nu_squared.as_ref().unwrap_or(&zero);
@@ -209,8 +174,8 @@ impl Quad {
     /// η after a step of dual ascent: `excess` is how far the BC loss is above its threshold, `[]`.
     fn ascended_eta(&self, excess: Tensor) -> Result<Tensor> {
         let Eta { rate, minimum, maximum, .. } = self.config.eta;
-        let raised = (&self.eta + (excess.clamp(-1f32, 1f32)? * f64::from(rate))?)?;
-        raised.clamp(minimum, maximum)
+        let raised = (&self.eta + (excess.clamp(-1f32, 1f32)? * f64::from(*rate))?)?;
+        raised.clamp(*minimum, *maximum)
     }
 
     /// y = r + γ·mask·(mean - ρ·std over the critics of each one's value of s') (Eq. 20), `[B]`. Each critic's value of s'
@@ -218,20 +183,20 @@ impl Quad {
     fn targets(&self, batch: &Minibatch, noise: &Noise) -> Result<Tensor> {
         let next_actions = self.target_actor.sample(&batch.next_observations, &noise.next)?;
         let q = self.target_critics.values(&batch.next_observations, &next_actions)?;
-        let q = q.reshape((self.config.critics, (), self.config.samples))?;
+        let q = q.reshape((self.shape.critics, (), *self.config.samples))?;
         let value = match self.config.target_reduce {
             TargetReduce::Mean => q.mean(2)?,
             // A maximum would drop a NaN; zero times their sum lets none get lost.
             TargetReduce::Max => (q.max(2)? + (q.sum(2)? * 0.0)?)?,
         };
         let (mean, variance) = mean_and_variance(&value)?;
-        let bound = (mean - (variance.sqrt()? * f64::from(self.config.rho))?)?;
-        &batch.rewards + ((bound * &batch.masks)? * f64::from(self.config.gamma))?
+        let bound = (mean - (variance.sqrt()? * f64::from(*self.config.rho))?)?;
+        batch.target(*self.config.gamma, &bound)
     }
 
     /// The target critics' gradients at noisy actions, and λ for each (Eq. 10 and 21–24); all of it constants.
-    fn advice(&self, batch: &Minibatch, noisy: &Tensor, predicted: &Tensor) -> Result<Advice> {
-        let (tau, delta) = (f64::from(self.config.tau), f64::from(self.config.delta));
+    fn guide(&self, batch: &Minibatch, noisy: &Tensor, predicted: &Tensor) -> Result<Guide> {
+        let (tau, delta) = (f64::from(self.config.tau), f64::from(*self.config.delta));
         let scale = (self.target_critics.values(&batch.observations, &batch.actions)?.abs()?.mean_all()? + 1e-6)?;
         let gradients = self.target_critics.action_gradients(&batch.observations, noisy)?.broadcast_div(&scale)?;
 
@@ -241,7 +206,7 @@ impl Quad {
         let (mean, variance) = mean_and_variance(&alignment)?; // l̄, and σ² of Eq. 22
         let spread = mean.broadcast_sub(&mean.mean_all()?)?.sqr()?.mean_all()?;
         let nu_squared = match &self.nu_squared {
-            Some(before) => (before + ((spread - before)? * f64::from(self.config.nu_ema_rate))?)?,
+            Some(before) => (before + ((spread - before)? * f64::from(*self.config.nu_ema_rate))?)?,
             None => spread,
         };
         let (lambda, delta_share) = match self.config.guidance {
@@ -252,51 +217,33 @@ impl Quad {
             }
             Guidance::Dac | Guidance::None => (variance.ones_like()?, nu_squared.zeros_like()?),
         };
-        Ok(Advice { gradient: mean_and_variance(&gradients)?.0, nu_squared, lambda, delta_share })
+        Ok(Guide { gradient: mean_and_variance(&gradients)?.0, nu_squared, lambda, delta_share })
     }
 }
 
 impl Algorithm for Quad {
-    fn update(&mut self, step: u64, batch: &Minibatch) -> Result<Vec<f32>> {
-        let noise = self.noise(step)?;
-        self.step(step, batch, &noise)
+    fn items(&self) -> usize {
+        self.context.transitions.len()
     }
 
-    fn policy(&self) -> Result<(Description, Tensors)> {
-        let tensors = DiffusionPolicy::tensors(&self.target_actor, &self.target_critics)?;
-        Ok((Description::Diffusion(self.shape), tensors))
+    fn update(&mut self, step: u64, items: &[u32]) -> Result<Vec<f32>> {
+        let (batch, noise) = (self.context.batch(items)?, self.noise(step)?);
+        self.step(step, &batch, &noise)
     }
 
-    fn state(&self) -> Result<Tensors> {
-        let (actor, critics) = (self.actor.weights(), self.critics.weights());
-        let mut tensors = actor.tensors("actor.")?;
-        tensors.extend(critics.tensors("critic.")?);
-        tensors.extend(self.target_actor.weights().tensors("target_actor.")?);
-        tensors.extend(self.target_critics.weights().tensors("target_critic.")?);
-        tensors.extend(self.actor_adam.tensors(actor, "actor.")?);
-        tensors.extend(self.critic_adam.tensors(critics, "critic.")?);
-        tensors.insert("eta".to_owned(), self.eta.reshape(1)?);
-        if let Some(nu_squared) = &self.nu_squared {
-            tensors.insert("nu_squared".to_owned(), nu_squared.reshape(1)?);
-        }
-        Ok(tensors)
+    fn policy(&self) -> Result<(PolicyConfig, Tensors)> {
+        let tensors = DiffusionPolicy::tensors(&self.target_actor, &self.target_critics, None)?;
+        let choice = Choice::best_of(*self.config.candidates); // Eq. 25
+        Ok((PolicyConfig::Diffusion { shape: self.shape.clone(), choice }, tensors))
     }
 
-    fn load(&mut self, tensors: &mut Tensors) -> std::result::Result<(), PolicyError> {
-        self.actor.weights_mut().load(tensors, "actor.")?;
-        self.critics.weights_mut().load(tensors, "critic.")?;
-        self.target_actor.weights_mut().load(tensors, "target_actor.")?;
-        self.target_critics.weights_mut().load(tensors, "target_critic.")?;
-        self.actor_adam.load(self.actor.weights(), tensors, "actor.")?;
-        self.critic_adam.load(self.critics.weights(), tensors, "critic.")?;
-        self.eta =
-            scalar(tensors, "eta", &self.setting.device)?.ok_or_else(|| PolicyError::Missing("eta".to_owned()))?;
-        self.nu_squared = scalar(tensors, "nu_squared", &self.setting.device)?;
-        Ok(())
+    fn parts(&mut self) -> Parts<'_> {
+        Parts::default()
+            .trained("actor", &mut self.actor)
+            .trained("critic", &mut self.critics)
+            .weights("target_actor", self.target_actor.weights_mut())
+            .weights("target_critic", self.target_critics.weights_mut())
+            .number("eta", &mut self.eta)
+            .maybe("nu_squared", &mut self.nu_squared)
     }
-}
-
-/// Takes a tensor of one number out of `tensors`, if it is there.
-fn scalar(tensors: &mut Tensors, name: &str, device: &Device) -> Result<Option<Tensor>> {
-    tensors.remove(name).map(|tensor| tensor.reshape(())?.to_device(device)).transpose()
 }

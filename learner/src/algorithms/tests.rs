@@ -7,6 +7,7 @@ use crate::train::agent::Agent;
 use candle_core::Device;
 use quad_dataset::Batch;
 use quad_policy::Precision;
+use quad_protocol::Origin;
 use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 
@@ -52,6 +53,10 @@ fn variants() -> Vec<(Definition, toml::Table)> {
 fn agent(definition: Definition, table: &toml::Table, setting: &Setting) -> Agent {
     let algorithm = (definition.read)(table).unwrap().start(setting).unwrap();
     Agent::new(definition, algorithm, setting.device.clone())
+}
+
+fn origin() -> Origin {
+    Origin { environment: "hopper".to_owned(), seed: 0, step: 0, episodes: 10 }
 }
 
 /// Batch number `step`.
@@ -108,7 +113,7 @@ fn a_state_that_does_not_fit_is_refused() {
     for bytes in [&b""[..], b"nonsense", &saved[..saved.len() - 1]] {
         assert!(!refused(quad.0, &quad.1, bytes).is_empty());
     }
-    let policy = agent(quad.0, &quad.1, &setting).policy().unwrap().bytes;
+    let policy = agent(quad.0, &quad.1, &setting).policy(&origin()).unwrap();
     assert!(refused(quad.0, &quad.1, &policy).contains("counters"));
 }
 
@@ -118,9 +123,9 @@ fn the_seed_alone_decides_the_weights() {
         let run = |seed| {
             let setting = setting(seed, &Device::Cpu);
             let mut agent = agent(definition, &table, &setting);
-            let first = agent.policy().unwrap().bytes;
+            let first = agent.policy(&origin()).unwrap();
             train(&mut agent, 3, setting.batch_size);
-            (first, agent.policy().unwrap().bytes)
+            (first, agent.policy(&origin()).unwrap())
         };
         let (first, last) = run(1);
         assert!((first.clone(), last.clone()) == run(1) && first != last);
@@ -190,7 +195,7 @@ fn a_policy_with_a_nan_is_not_handed_over() {
         batch.observations[0] = f32::NAN;
         agent.update(&batch).unwrap();
         train(&mut agent, 4, setting.batch_size);
-        let error = agent.policy().unwrap_err().to_string();
+        let error = agent.policy(&origin()).unwrap_err().to_string();
         assert!(error.contains("tensor") && error.contains("not finite"), "{error}");
     }
 }

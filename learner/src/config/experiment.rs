@@ -10,11 +10,10 @@ use toml::{Table, Value};
 use super::hyperparameters;
 use super::presets::Preset;
 use super::schedule::Schedule;
-use crate::algorithms::{Definition, Hyperparameters};
+use crate::algorithms::Definition;
 
-/// Most episodes in one evaluation, and most candidates per state: far above any use, low enough for evaluators' memory.
+/// Most episodes in one evaluation: far above any use.
 const MOST_EPISODES: u64 = 10_000;
-const MOST_CANDIDATES: u64 = 1_000;
 /// Most transitions in a batch: far above any use, too.
 const MOST_BATCH: u64 = 1 << 20;
 /// TOML's integers are 64 bits with a sign, so larger ones could not be saved with the run.
@@ -37,8 +36,6 @@ pub struct Experiment {
     pub eval_interval: u64,
     /// Episodes per evaluation.
     pub episodes: u32,
-    /// Actions sampled per state in an evaluation, N_a of Eq. 25.
-    pub candidates: u32,
     /// Seed of initial weights, batches, noise and the evaluations' episodes.
     pub seed: u64,
     /// Transitions per gradient step, B.
@@ -84,13 +81,17 @@ impl Experiment {
         Ok(value.unwrap_or(&self.algorithm))
     }
 
-    /// The algorithm's hyper-parameters.
+    /// The algorithm as people read it: its name, its variant where there are several, and candidates where its policy draws some.
     ///
     /// # Errors
-    /// They are not usable, which is found when an experiment is resolved.
-    pub fn hyperparameters(&self) -> anyhow::Result<Box<dyn Hyperparameters>> {
-        let read = (self.definition()?.read)(&self.agent);
-        read.with_context(|| format!("algorithm {}", self.algorithm)).hint(KEYS)
+    /// As [`Self::definition`].
+    pub fn method(&self) -> anyhow::Result<String> {
+        let key = self.definition()?.variant;
+        let named =
+            |key: &str| self.agent.get(key).map(|value| format!(", {key} {}", value.to_string().trim_matches('"')));
+        let variant = key.and_then(named).unwrap_or_default();
+        let candidates = self.agent.get("candidates").map(|count| format!(", {count} candidates")).unwrap_or_default();
+        Ok(format!("{}{variant}{candidates}", self.algorithm))
     }
 
     /// How many gradient steps there are, and which are evaluated.
@@ -101,15 +102,14 @@ impl Experiment {
     /// The figures that tell runs apart, in one line.
     ///
     /// # Errors
-    /// As [`Self::hyperparameters`].
+    /// As [`Self::definition`].
     pub fn summary(&self) -> anyhow::Result<String> {
-        let Self { steps, eval_interval, episodes, candidates, seed, batch_size, .. } = self;
+        let Self { steps, eval_interval, episodes, seed, batch_size, .. } = self;
         let evaluations = match eval_interval {
             0 => "no evaluations".to_owned(),
-            _ => format!("{episodes} episodes with {candidates} candidates every {eval_interval}"),
+            _ => format!("{episodes} episodes every {eval_interval}"),
         };
-        let agent = self.hyperparameters()?.summary();
-        Ok(format!("{agent}; seed {seed}, {steps} steps of batch {batch_size}; {evaluations}"))
+        Ok(format!("{}; seed {seed}, {steps} steps of batch {batch_size}; {evaluations}", self.method()?))
     }
 
     pub(super) fn validate(&self) -> anyhow::Result<()> {
@@ -118,18 +118,12 @@ impl Experiment {
             ("eval_interval", self.eval_interval, 0, MOST),
             ("seed", self.seed, 0, MOST),
             ("episodes", self.episodes.into(), 1, MOST_EPISODES),
-            ("candidates", self.candidates.into(), 1, MOST_CANDIDATES),
             ("batch_size", self.batch_size.into(), 1, MOST_BATCH),
         ] {
             ensure!((least..=most).contains(&value), "{field} is {value}, but must be from {least} to {most}");
         }
-        let samples = self.hyperparameters()?.samples_candidates();
-        let candidates = self.candidates;
-        ensure!(
-            samples || candidates == 1,
-            "candidates is {candidates}, but the policy of this algorithm does not sample any, so it must be 1"
-        );
-        Ok(())
+        let check = (self.definition()?.check)(&self.agent);
+        check.with_context(|| format!("algorithm {}", self.algorithm)).hint(KEYS)
     }
 }
 

@@ -30,9 +30,7 @@ pub(crate) struct Rules {
     /// Where policies are evaluated.
     pub task: Task,
     /// Seed of what the environment draws once for the whole run.
-    pub instance: u64,
-    /// Actions sampled per state.
-    pub candidates: u32,
+    pub environment_seed: u64,
     /// Most episodes in one job: while as many evaluators as there are could share them, and if many more wait.
     pub job_episodes: [usize; 2],
     /// How long a job may stay without progress. Longer, if there are so many evaluators that they tell it rarely.
@@ -152,9 +150,8 @@ impl Scoreboard {
             step: job.step,
             weights: self.evaluations.get(&job.step)?.weights,
             environment: rules.task.environment.clone(),
-            instance: rules.instance,
+            environment_seed: rules.environment_seed,
             seeds: job.seeds.clone(),
-            candidates: rules.candidates,
             // Often enough to keep the lease.
             progress_milliseconds: among(present, TELL_PROGRESS).min(job.patience / 3).as_millis() as u64,
         })

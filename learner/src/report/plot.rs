@@ -95,7 +95,7 @@ fn draw_run(chart: &mut Chart, run: &RunReport, colour: RGBColor, has_band: bool
         chart.draw_series([Polygon::new(band, colour.mix(0.15))])?;
     }
     let points: Vec<_> = run.evaluations.iter().map(|e| (e.step as f64, e.score.mean)).collect();
-    let label = format!("{} ({}, {} candidates)", run.run, run.variant, run.candidates);
+    let label = format!("{} ({})", run.run, run.variant);
     let legend = move |(x, y)| PathElement::new([(x, y), (x + 20, y)], colour.stroke_width(2));
     chart.draw_series(LineSeries::new(points.clone(), colour.stroke_width(2)))?.label(label).legend(legend);
     chart.draw_series(points.into_iter().map(|point| Circle::new(point, 3, colour.filled())))?;

@@ -11,7 +11,6 @@ use serde::Serialize;
 
 use super::spread::Spread;
 use super::table::{Style, Table};
-use crate::algorithms::Hyperparameters;
 use crate::config::RunConfig;
 use crate::run::{RunDir, ScoreLine};
 
@@ -59,8 +58,6 @@ pub struct RunReport {
     pub variant: String,
     /// The hyper-parameters that matter most.
     pub agent: String,
-    /// Actions sampled per state in an evaluation.
-    pub candidates: u32,
     /// Seed.
     pub seed: u64,
     /// Gradient steps.
@@ -94,13 +91,13 @@ impl RunReport {
     /// There is no run in it, or a file is not what a learner writes.
     pub fn read(path: &Path) -> anyhow::Result<Self> {
         let (dir, config) = RunDir::open(path)?;
-        let agent = config.experiment.hyperparameters();
+        let agent = config.experiment.method();
         let agent = agent.with_context(|| format!("config.toml in {} cannot be used", path.display()))?;
         let variant = config.experiment.variant()?.to_owned();
-        Ok(Self::new(path, config, &*agent, variant, &dir.read_scores()?))
+        Ok(Self::new(path, config, agent, variant, &dir.read_scores()?))
     }
 
-    fn new(path: &Path, config: RunConfig, agent: &dyn Hyperparameters, variant: String, lines: &[ScoreLine]) -> Self {
+    fn new(path: &Path, config: RunConfig, agent: String, variant: String, lines: &[ScoreLine]) -> Self {
         let experiment = &config.experiment;
         let mut by_step: BTreeMap<u64, BTreeMap<u64, &ScoreLine>> = BTreeMap::new();
         for line in lines {
@@ -131,8 +128,7 @@ impl RunReport {
             task: config.run.task.clone(),
             algorithm: experiment.algorithm.clone(),
             variant,
-            agent: agent.summary(),
-            candidates: experiment.candidates,
+            agent,
             seed: experiment.seed,
             steps: experiment.steps,
             normalised: environment::find(&experiment.environment).is_ok(),
@@ -201,8 +197,8 @@ impl RunReport {
             table.push(row);
         }
         let mut text = format!(
-            "{}: task {}, {}, {} candidates, {} steps, seed {}, scored in {}\n\n",
-            self.run, self.task, self.agent, self.candidates, self.steps, self.seed, self.scored_in
+            "{}: task {}, {}, {} steps, seed {}, scored in {}\n\n",
+            self.run, self.task, self.agent, self.steps, self.seed, self.scored_in
         ) + &table.render(Style::Text);
         if self.evaluations.is_empty() {
             text.push_str("(no evaluation has a score yet)\n");

@@ -27,8 +27,6 @@ pub struct GroupReport {
     pub agent: String,
     /// What the paper calls this variant of the algorithm, if it has a row of it.
     pub methods: Vec<&'static str>,
-    /// Actions sampled per state in an evaluation.
-    pub candidates: u32,
     /// Gradient steps that were asked for.
     pub steps: u64,
     /// Where they trained.
@@ -72,12 +70,12 @@ impl GroupReport {
         format!("{seeds} seed{plural}{goals}, {steps} on {device}, scored in {scored_in}")
     }
 
-    /// The variant, and what the paper calls it where it has another name.
+    /// The algorithm, and what the paper calls this variant of it where it has another name.
     pub fn named(&self) -> String {
         let is_other = |method: &&str| !method.eq_ignore_ascii_case(&self.variant);
         match self.methods.iter().any(is_other) {
-            true => format!("{} ({})", self.variant, self.methods.join(", ")),
-            false => self.variant.clone(),
+            true => format!("{} ({})", self.agent, self.methods.join(", ")),
+            false => self.agent.clone(),
         }
     }
 
@@ -140,7 +138,6 @@ fn group(runs: &[&RunReport], differs: Vec<String>, select: Select) -> GroupRepo
         variant: first.variant.clone(),
         agent: first.agent.clone(),
         methods: published::methods(&first.algorithm, &first.variant),
-        candidates: first.candidates,
         steps: first.steps,
         device: first.config.run.device,
         normalised: first.normalised,

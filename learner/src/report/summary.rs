@@ -67,7 +67,7 @@ impl Report {
             Select::Best => &["best evaluation"],
         };
         let texts = ["task", "algorithm"].map(|name| (name, Left));
-        let numbers = ["candidates", "trained for", "seeds"].map(|name| (name, Right));
+        let numbers = ["trained for", "seeds"].map(|name| (name, Right));
         let mut header = Vec::from_iter(texts.into_iter().chain(numbers));
         header.push(("scored in", Left));
         header.extend(scores.iter().map(|name| (*name, Right)));
@@ -79,7 +79,6 @@ impl Report {
             let mut row = vec![
                 g.task.clone(),
                 g.agent.clone(),
-                g.candidates.to_string(),
                 g.steps_in_words(),
                 g.seeds.len().to_string() + &g.goals.map(|goals| format!(", {goals} goals")).unwrap_or_default(),
                 format!("{}{measure}", g.scored_in),
@@ -129,7 +128,7 @@ impl Report {
         let width = published.iter().map(|published| published.remarks.len()).max().unwrap_or(0);
         let number = |value: Option<f64>| value.map(|value| format!("{value:.2}")).unwrap_or_default();
         for g in groups() {
-            let ours = format!("ours: {}, {} candidates", g.named(), g.candidates);
+            let ours = format!("ours: {}", g.named());
             let mut row = |score: Option<Spread>, what: &str| {
                 let [mean, by_n, by_one_less] =
                     [score.map(|s| s.mean), score.and_then(|s| s.population_std), score.and_then(|s| s.std)];

@@ -4,7 +4,7 @@
 use std::collections::BTreeMap;
 use std::time::{Duration, SystemTime, UNIX_EPOCH};
 
-use quad_protocol::{Hash, Origin};
+use quad_protocol::Hash;
 use quad_service::{Beat, hinted};
 use tracing::debug;
 
@@ -22,8 +22,6 @@ pub(super) const RETRY: Duration = Duration::from_secs(2);
 /// State of the thread.
 pub(super) struct Snapshots {
     pub outbox: Outbox,
-    /// What snapshots say of their origin; the step is set for each.
-    pub origin: Origin,
     pub run_dir: RunDir,
     /// `metrics.jsonl`.
     pub rows: Log,
@@ -69,12 +67,11 @@ impl Snapshots {
 
     /// Writes a snapshot; only then is its evaluation opened and the snapshot published.
     fn snapshot(&mut self, trained: &TrainedPolicy) -> anyhow::Result<()> {
-        let TrainedPolicy { step, policy, evaluate } = trained;
-        let tensors = Origin { step: *step, ..self.origin.clone() }.attach(&policy.bytes)?;
-        let hash = Hash::of(&tensors);
-        self.metrics.evaluation.snapshot_bytes.set(tensors.len() as i64);
+        let TrainedPolicy { step, file, evaluate } = trained;
+        let hash = Hash::of(file);
+        self.metrics.evaluation.snapshot_bytes.set(file.len() as i64);
         match self.known.get(step) {
-            None => self.run_dir.write_snapshot(*step, &tensors)?,
+            None => self.run_dir.write_snapshot(*step, file)?,
             Some(known) if *known == hash => {}
             // It has scores already: neither overwritten nor published.
             Some(known) => {
@@ -82,7 +79,7 @@ impl Snapshots {
             }
         }
         if *evaluate {
-            self.weights.publish(*step, policy.kind, hash, tensors)?;
+            self.weights.publish(*step, hash, file.clone())?;
             self.metrics.evaluation.snapshots_published.inc();
             self.events.send(Event::Published { step: *step }).ok();
         }

@@ -7,7 +7,6 @@ use std::thread::JoinHandle;
 use std::time::Duration;
 
 use quad_dataset::{Task, Transitions};
-use quad_protocol::Origin;
 use quad_service::Health;
 
 use super::coordinator::{Coordinator, EvaluationPlan};
@@ -71,11 +70,11 @@ impl Threads {
         let Past { checkpoint, snapshots: known, scores: earlier } = past;
         let experiment = &config.experiment;
         let task = Task::new(&experiment.environment, transitions.observation_dim(), transitions.action_dim());
-        let coordinator = coordinator(&life, experiment, &task, earlier, metrics, events);
+        let coordinator = coordinator(&life, experiment, task, earlier, metrics, events);
         for (&step, &hash) in &known {
             coordinator.open(step, hash)?;
         }
-        let weights = Weights::new(life.run, life.incarnation, task.clone(), dir.clone(), coordinator.clone());
+        let weights = Weights::new(life.run, life.incarnation, dir.clone(), coordinator.clone());
         let (services, deliveries) =
             Services::start(coordinator.clone(), weights.clone(), metrics.clone(), events.clone())?;
 
@@ -90,7 +89,6 @@ impl Threads {
         let outbox = Outbox::default();
         let snapshots = Snapshots {
             outbox: outbox.clone(),
-            origin: origin(experiment, &task),
             run_dir: dir.clone(),
             rows,
             weights,
@@ -106,7 +104,7 @@ impl Threads {
         let training = Training {
             experiment: experiment.clone(),
             device: config.run.device,
-            transitions,
+            transitions: Arc::new(transitions),
             checkpoint,
             checkpoint_every,
             seconds_before,
@@ -139,7 +137,7 @@ impl Threads {
 fn coordinator(
     life: &Life,
     experiment: &Experiment,
-    task: &Task,
+    task: Task,
     earlier: BTreeMap<u64, Earlier>,
     metrics: &Metrics,
     events: &Events,
@@ -147,23 +145,11 @@ fn coordinator(
     let rules = Rules {
         run: life.run.clone(),
         incarnation: life.incarnation,
-        task: task.clone(),
-        instance: experiment.seed,
-        candidates: experiment.candidates,
+        task,
+        environment_seed: experiment.seed,
         job_episodes: JOB_EPISODES,
         lease: LEASE,
     };
     let plan = EvaluationPlan { seed: experiment.seed, episodes: experiment.episodes };
     Coordinator::new(rules, plan, earlier, metrics.clone(), events.clone())
-}
-
-/// What snapshots say of their origin, without the step.
-fn origin(experiment: &Experiment, task: &Task) -> Origin {
-    Origin {
-        environment: task.environment.clone(),
-        seed: experiment.seed,
-        step: 0,
-        episodes: experiment.episodes,
-        candidates: experiment.candidates,
-    }
 }

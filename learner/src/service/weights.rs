@@ -3,9 +3,7 @@
 use std::sync::{Arc, Mutex, OnceLock, PoisonError};
 
 use anyhow::Context;
-use quad_dataset::Task;
-use quad_policy::Description;
-use quad_protocol::{Hash, Name, Schema, Snapshot, encode, keys};
+use quad_protocol::{Hash, Name, Snapshot, encode, keys};
 use tracing::debug;
 use zenoh::bytes::ZBytes;
 use zenoh::qos::CongestionControl;
@@ -20,8 +18,6 @@ use crate::run::RunDir;
 pub(super) struct Weights {
     run: Name,
     incarnation: u64,
-    /// The environment that the policies act in.
-    task: Task,
     run_dir: RunDir,
     coordinator: Coordinator,
     /// There as soon as the learner is online.
@@ -31,8 +27,8 @@ pub(super) struct Weights {
 }
 
 impl Weights {
-    pub fn new(run: Name, incarnation: u64, task: Task, run_dir: RunDir, coordinator: Coordinator) -> Self {
-        Self { run, incarnation, task, run_dir, coordinator, session: Arc::default(), newest: Arc::default() }
+    pub fn new(run: Name, incarnation: u64, run_dir: RunDir, coordinator: Coordinator) -> Self {
+        Self { run, incarnation, run_dir, coordinator, session: Arc::default(), newest: Arc::default() }
     }
 
     /// From now on snapshots are published.
@@ -44,8 +40,8 @@ impl Weights {
     ///
     /// # Errors
     /// It is too large to be sent, or the step is known with other weights.
-    pub fn publish(&self, step: u64, kind: &str, hash: Hash, tensors: Vec<u8>) -> anyhow::Result<()> {
-        let bytes = self.message(step, kind, hash, tensors)?;
+    pub fn publish(&self, step: u64, hash: Hash, file: Vec<u8>) -> anyhow::Result<()> {
+        let bytes = self.message(step, hash, file)?;
         *self.newest.lock().unwrap_or_else(PoisonError::into_inner) = Some((step, bytes.clone()));
         // The jobs must exist first: evaluators ask for one as soon as the snapshot arrives.
         self.coordinator.open(step, hash)?;
@@ -70,20 +66,13 @@ impl Weights {
     }
 
     fn read(&self, step: u64, hash: Hash) -> anyhow::Result<ZBytes> {
-        let tensors = self.run_dir.read_snapshot(step)?;
-        anyhow::ensure!(Hash::of(&tensors) == hash, "the file was changed");
-        let kind = Description::read(&tensors)?.kind();
-        self.message(step, kind, hash, tensors)
+        let file = self.run_dir.read_snapshot(step)?;
+        anyhow::ensure!(Hash::of(&file) == hash, "the file was changed");
+        self.message(step, hash, file)
     }
 
-    fn message(&self, step: u64, kind: &str, hash: Hash, tensors: Vec<u8>) -> anyhow::Result<ZBytes> {
-        let schema = Schema {
-            environment: self.task.environment.clone(),
-            observation_dim: self.task.observation_dim as u32,
-            action_dim: self.task.action_dim as u32,
-            policy: kind.to_owned(),
-        };
-        let snapshot = Snapshot { run: self.run.clone(), incarnation: self.incarnation, step, schema, hash, tensors };
+    fn message(&self, step: u64, hash: Hash, file: Vec<u8>) -> anyhow::Result<ZBytes> {
+        let snapshot = Snapshot { run: self.run.clone(), incarnation: self.incarnation, step, hash, file };
         Ok(encode(&snapshot).context("the snapshot cannot be sent to evaluators")?.into())
     }
 }

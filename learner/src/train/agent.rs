@@ -1,10 +1,10 @@
 //! An algorithm at work in a run: counts its updates, hands over its policy, and saves and loads its whole state.
 
 use super::pool::run_awake;
-use crate::algorithms::{Algorithm, AlgorithmError, Definition, Metric, Minibatch};
+use crate::algorithms::{Algorithm, AlgorithmError, Context, Definition, Metric};
 use candle_core::Device;
-use quad_dataset::Batch;
-use quad_policy::{PolicyError, check_finite, read_tensors};
+use quad_policy::{Header, PolicyError, check_finite, read_tensors};
+use quad_protocol::Origin;
 use safetensors::SafeTensors;
 use serde::{Deserialize, Serialize};
 use std::collections::HashMap;
@@ -29,15 +29,6 @@ struct Counters {
     step: u64,
 }
 
-/// A policy as a file.
-#[derive(Debug)]
-pub struct PolicyFile {
-    /// What kind of policy it is, e.g. `diffusion`.
-    pub kind: &'static str,
-    /// A safetensors file that says so, too, and which shapes its networks have.
-    pub bytes: Vec<u8>,
-}
-
 /// A saved state that cannot be gone on from.
 #[derive(Debug, thiserror::Error)]
 pub enum StateError {
@@ -58,9 +49,18 @@ pub enum StateError {
 }
 
 impl Agent {
-    /// At step 0.
-    pub fn new(definition: Definition, algorithm: Box<dyn Algorithm>, device: Device) -> Self {
-        Self { definition, algorithm, device, step: 0 }
+    /// At step 0, with the hyper-parameters of this table.
+    ///
+    /// # Errors
+    /// They cannot be used, or candle fails.
+    pub fn new(definition: Definition, table: &toml::Table, context: Context) -> Result<Self, AlgorithmError> {
+        let device = context.device.clone();
+        Ok(Self { definition, algorithm: (definition.start)(table, context)?, device, step: 0 })
+    }
+
+    /// How many items updates draw from.
+    pub fn items(&self) -> usize {
+        self.algorithm.items()
     }
 
     /// What an update measures.
@@ -73,36 +73,36 @@ impl Agent {
         self.step
     }
 
-    /// One update. Gives the values of the metrics, in their order.
+    /// One update on the items of these numbers. Gives the values of the metrics, in their order.
     ///
     /// # Errors
-    /// The batch does not fit the networks, or candle fails.
-    pub fn update(&mut self, batch: &Batch) -> Result<Vec<f32>, AlgorithmError> {
-        let batch = Minibatch::new(batch, &self.device)?;
+    /// Candle fails.
+    pub fn update(&mut self, items: &[u32]) -> Result<Vec<f32>, AlgorithmError> {
         let (algorithm, step) = (&mut self.algorithm, self.step);
         let values = match self.device.is_cpu() {
-            true => run_awake(|| algorithm.update(step, &batch))?,
-            false => algorithm.update(step, &batch)?,
+            true => run_awake(|| algorithm.update(step, items))?,
+            false => algorithm.update(step, items)?,
         };
         self.step += 1;
         Ok(values)
     }
 
-    /// The policy as it is now.
+    /// The file of the policy as it is now, which says that it is from `origin`, at the step that is reached.
     ///
     /// # Errors
     /// A weight that is not finite.
-    pub fn policy(&self) -> Result<PolicyFile, AlgorithmError> {
-        let (description, tensors) = self.algorithm.policy()?;
-        Ok(PolicyFile { kind: description.kind(), bytes: description.to_safetensors(&tensors)? })
+    pub fn policy(&self, origin: &Origin) -> Result<Vec<u8>, AlgorithmError> {
+        let (policy, tensors) = self.algorithm.policy()?;
+        let origin = Origin { step: self.step, ..origin.clone() };
+        Ok(Header { policy, origin }.to_safetensors(&tensors)?)
     }
 
     /// Everything that decides the future of the run, as one safetensors file: the same bytes for the same state.
     ///
     /// # Errors
     /// A number that is not finite: a state with no future.
-    pub fn save(&self) -> Result<Vec<u8>, AlgorithmError> {
-        let mut tensors = self.algorithm.state()?;
+    pub fn save(&mut self) -> Result<Vec<u8>, AlgorithmError> {
+        let mut tensors = self.algorithm.parts().save()?;
         for (name, tensor) in &mut tensors {
             check_finite(name, tensor)?;
             *tensor = tensor.to_device(&Device::Cpu)?;
@@ -127,7 +127,7 @@ impl Agent {
             return Err(StateError::Algorithm { found: counters.algorithm, expected: self.definition.name });
         }
         let mut tensors = read_tensors(bytes)?;
-        self.algorithm.load(&mut tensors)?;
+        self.algorithm.parts().load(&mut tensors)?;
         if let Some(name) = tensors.into_keys().next() {
             return Err(PolicyError::Unexpected(name).into());
         }

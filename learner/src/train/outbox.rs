@@ -57,7 +57,7 @@ impl Outbox {
             beat.alive();
             waiting = self.shared.1.wait_timeout(waiting, GLANCE).unwrap_or_else(PoisonError::into_inner).0;
         }
-        waiting.bytes += policy.policy.bytes.len();
+        waiting.bytes += policy.file.len();
         waiting.snapshots.push_back(policy);
         self.shared.1.notify_all();
     }
@@ -105,7 +105,7 @@ impl Outbox {
     /// What was taken is on the disk: makes room for more.
     pub fn done(&self, work: &Work) {
         if let Work::Snapshot(policy) = work {
-            self.lock().bytes -= policy.policy.bytes.len();
+            self.lock().bytes -= policy.file.len();
             self.shared.1.notify_all();
         }
     }

@@ -3,7 +3,6 @@
 use serde::ser::SerializeMap;
 use serde::{Serialize, Serializer};
 
-use super::agent::PolicyFile;
 use crate::algorithms::Metric;
 
 /// The policy after a gradient step.
@@ -11,8 +10,8 @@ use crate::algorithms::Metric;
 pub(crate) struct TrainedPolicy {
     /// After which step.
     pub step: u64,
-    /// What it is, and its weights.
-    pub policy: PolicyFile,
+    /// Its file.
+    pub file: Vec<u8>,
     /// Whether it is to be evaluated, or only kept.
     pub evaluate: bool,
 }

@@ -3,8 +3,9 @@
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant};
 
-use quad_dataset::{Batch, BatchSampler, Transitions};
+use quad_dataset::BatchSampler;
 use quad_policy::PolicyError;
+use quad_protocol::Origin;
 use quad_service::Beat;
 use tracing::debug;
 
@@ -38,6 +39,8 @@ pub(crate) struct Outlets<'a> {
     pub metrics: &'a TrainingMetrics,
     /// Takes rows, snapshots and checkpoints.
     pub outbox: &'a Outbox,
+    /// Where snapshots say that they are from; the step is set for each.
+    pub origin: &'a Origin,
     /// Set by the main loop to end training early.
     pub stop: &'a AtomicBool,
     /// Told after every step.
@@ -79,20 +82,17 @@ impl TrainError {
 /// Trains until all steps are done or it is told to stop. Either way a checkpoint of the last step is handed over.
 pub(crate) fn train(
     agent: &mut Agent,
-    transitions: &Transitions,
     sampler: &mut BatchSampler,
     plan: Plan,
     outlets: &Outlets<'_>,
 ) -> Result<Outcome, TrainError> {
     let start = Instant::now();
-    let mut batch = Batch::default();
     let mut mean = RowMean::new(agent.metrics());
     let mut next_checkpoint = start + plan.checkpoint_every;
     while agent.step() < plan.schedule.steps {
         let begin = Instant::now();
         let step = agent.step() + 1;
-        sampler.next(transitions, &mut batch);
-        let values = agent.update(&batch).map_err(|source| TrainError::at(step, source))?;
+        let values = agent.update(sampler.next_items()).map_err(|source| TrainError::at(step, source))?;
         check_finite(step, agent.metrics(), &values)?;
         let updated = Instant::now();
         outlets.beat.alive();
@@ -118,20 +118,20 @@ pub(crate) fn train(
 }
 
 /// Hands over the policy if it is to be evaluated, or if it is the last.
-fn hand_over_policy(agent: &Agent, schedule: Schedule, outlets: &Outlets<'_>) -> Result<(), TrainError> {
+fn hand_over_policy(agent: &mut Agent, schedule: Schedule, outlets: &Outlets<'_>) -> Result<(), TrainError> {
     let (step, begin) = (agent.step(), Instant::now());
     let evaluate = schedule.is_evaluated(step);
     if evaluate || step == schedule.steps {
         debug!(step, "snapshot");
-        let policy = agent.policy().map_err(|source| TrainError::at(step, source))?;
+        let file = agent.policy(outlets.origin).map_err(|source| TrainError::at(step, source))?;
         outlets.metrics.saving_seconds.inc_by(begin.elapsed().as_secs_f64());
-        outlets.outbox.snapshot(TrainedPolicy { step, policy, evaluate }, outlets.stop, outlets.beat);
+        outlets.outbox.snapshot(TrainedPolicy { step, file, evaluate }, outlets.stop, outlets.beat);
     }
     Ok(())
 }
 
 /// Hands over the whole state. Gives the time that it took to copy it, in which nothing was trained.
-fn hand_over_state(agent: &Agent, outlets: &Outlets<'_>) -> Result<Duration, TrainError> {
+fn hand_over_state(agent: &mut Agent, outlets: &Outlets<'_>) -> Result<Duration, TrainError> {
     let (step, begin) = (agent.step(), Instant::now());
     let state = agent.save().map_err(|source| TrainError::at(step, source))?;
     let took = begin.elapsed();

@@ -4,15 +4,16 @@ use std::sync::Arc;
 use std::sync::atomic::AtomicBool;
 use std::time::Duration;
 
-use anyhow::Context;
+use anyhow::{Context, anyhow};
 use quad_dataset::{BatchSampler, Transitions};
+use quad_protocol::{Origin, Snapshot};
 use quad_service::{Beat, hinted};
 
 use super::agent::Agent;
 use super::metrics::TrainingMetrics;
 use super::outbox::Outbox;
 use super::steps::{Outlets, Plan, TrainError, train};
-use crate::algorithms::Setting;
+use crate::algorithms::Context as Learning;
 use crate::config::{Device, Experiment};
 use crate::run::Checkpoint;
 
@@ -20,11 +21,14 @@ const DIVERGED: &str = "the same configuration would diverge again: try a smalle
                         agent.actor_learning_rate, a smaller agent.gradient_clip, or look for outliers with \
                         `learner datasets inspect`; begin anew with --fresh";
 
+const TOO_LARGE: &str = "take smaller networks or fewer critics; or train without evaluations (--eval-interval 0) and score the \
+                         last snapshot by `evaluator score`";
+
 /// Everything that the thread takes along.
 pub(crate) struct Training {
     pub experiment: Experiment,
     pub device: Device,
-    pub transitions: Transitions,
+    pub transitions: Arc<Transitions>,
     /// Where an earlier life of the run has left off.
     pub checkpoint: Option<Checkpoint>,
     /// Least time between two checkpoints.
@@ -42,15 +46,24 @@ impl Training {
     pub fn run(self, beat: &Beat) -> anyhow::Result<()> {
         let mut agent = self.agent()?;
         let experiment = &self.experiment;
+        let origin = Origin {
+            environment: experiment.environment.clone(),
+            seed: experiment.seed,
+            step: agent.step(),
+            episodes: experiment.episodes,
+        };
+        if experiment.eval_interval > 0 {
+            check_size(agent.policy(&origin)?.len())?;
+        }
         let batch_size = experiment.batch_size as usize;
-        let mut sampler = BatchSampler::new(self.transitions.len(), batch_size, experiment.seed, agent.step());
-        let outlets = Outlets { metrics: &self.metrics, outbox: &self.outbox, stop: &self.stop, beat };
+        let mut sampler = BatchSampler::new(agent.items(), batch_size, experiment.seed, agent.step());
+        let outlets = Outlets { metrics: &self.metrics, outbox: &self.outbox, origin: &origin, stop: &self.stop, beat };
         let plan = Plan {
             schedule: experiment.schedule(),
             checkpoint_every: self.checkpoint_every,
             seconds_before: self.seconds_before,
         };
-        let outcome = train(&mut agent, &self.transitions, &mut sampler, plan, &outlets).map_err(|error| {
+        let outcome = train(&mut agent, &mut sampler, plan, &outlets).map_err(|error| {
             let diverged = matches!(error, TrainError::Diverged { .. });
             self.metrics.diverged.set(diverged.into());
             if diverged { hinted(error, DIVERGED) } else { error.into() }
@@ -62,17 +75,15 @@ impl Training {
     /// At the step of the checkpoint, or at step 0.
     fn agent(&self) -> anyhow::Result<Agent> {
         let experiment = &self.experiment;
-        let setting = Setting {
-            observation_dim: self.transitions.observation_dim(),
-            action_dim: self.transitions.action_dim(),
+        let context = Learning {
+            transitions: self.transitions.clone(),
             batch_size: experiment.batch_size as usize,
             total_steps: experiment.steps,
             seed: experiment.seed,
             precision: experiment.precision,
             device: self.device.open()?,
         };
-        let algorithm = experiment.hyperparameters()?.start(&setting)?;
-        let mut agent = Agent::new(experiment.definition()?, algorithm, setting.device);
+        let mut agent = Agent::new(experiment.definition()?, &experiment.agent, context)?;
         if let Some(Checkpoint { step, state }) = &self.checkpoint {
             let advice = "begin anew with --fresh, or go on with the version of the learner that wrote it";
             agent
@@ -82,4 +93,13 @@ impl Training {
         }
         Ok(agent)
     }
+}
+
+/// That evaluators can be sent a policy's file of so many bytes: they could not at the first evaluation, hours later, either.
+fn check_size(bytes: usize) -> anyhow::Result<()> {
+    let most = Snapshot::MOST_FILE;
+    if bytes <= most {
+        return Ok(());
+    }
+    Err(hinted(anyhow!("the policy's file has {bytes} bytes, and evaluators can be sent at most {most}"), TOO_LARGE))
 }

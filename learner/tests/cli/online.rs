@@ -21,7 +21,8 @@ async fn while_a_learner_waits_for_the_token_of_another_one_to_go_it_hears_that_
     let _token = other.liveliness().declare_token(token).await.unwrap();
 
     let mut learner = Command::new(env!("CARGO_BIN_EXE_learner"));
-    learner.args(["train", "--task", "hopper-demo", "--set", "batch_size=4", "--agent", "hidden=8"]);
+    learner.args(["train", "--task", "hopper-demo", "--set", "batch_size=4"]);
+    learner.args(["--agent", "actor.hidden=[8]", "--agent", "critic.hidden=[8]"]);
     learner.args(["--agent", "critic_learning_rate=1e30", "--connect", &endpoint]);
     learner.arg("--dataset").arg(&dataset).arg("--run-dir").arg(folder.path().join("run"));
     let output = tokio::task::spawn_blocking(move || learner.output().unwrap()).await.unwrap();

@@ -56,6 +56,11 @@ fn quad_has_the_values_of_tables_3_and_4_for_each_row() {
         ] {
             assert_eq!(value(&row, key), Some(word.into()), "{name}: {key}");
         }
+        for network in ["actor", "critic"] {
+            // B.1: three layers.
+            let expected = toml::toml! { hidden = [256, 256, 256] activation = "mish" };
+            assert_eq!(value(&row, &format!("agent.{network}")), Some(expected.into()), "{name}: {network}");
+        }
         let rate = if name.starts_with("antmaze-large") { 1e-3 } else { 3e-4 };
         for (key, expected) in [
             ("agent.tau", Some(tau)),
@@ -65,18 +70,17 @@ fn quad_has_the_values_of_tables_3_and_4_for_each_row() {
             ("agent.eta.initial", eta.or(Some(1.0))),
             ("agent.diffusion_steps", Some(5.0)),
             ("agent.critics", Some(10.0)),
-            ("agent.hidden", Some(256.0)),
             ("agent.actor_learning_rate", Some(rate)),
             ("agent.critic_learning_rate", Some(rate)),
             ("agent.eta.rate", Some(0.001)),
             ("agent.ema_rate", Some(0.005)),
             ("agent.actor_ema_every", Some(5.0)),
+            ("agent.candidates", Some(10.0)),
             ("agent.samples", Some(10.0)), // DAC's, as are the next three
             ("agent.gamma", Some(0.99)),
             ("agent.eta.minimum", Some(0.001)),
             ("agent.eta.maximum", Some(100.0)),
             ("batch_size", Some(256.0)),
-            ("candidates", Some(10.0)),
             ("steps", Some(2_000_000.0)),
             ("eval_interval", Some(20_000.0)),
             ("episodes", Some(10.0)),
@@ -131,12 +135,14 @@ fn tasks_and_algorithms_are_listed_with_what_their_authors_give() {
         let words = |line: &str| line.split_whitespace().map(str::to_owned).collect::<Vec<_>>();
         assert!(tasks.iter().any(|line| words(line) == words(row)), "{row} is missing in\n{list}");
     }
-    let folder = std::fs::read_dir(concat!(env!("CARGO_MANIFEST_DIR"), "/../presets")).unwrap();
-    let files = folder.map(|file| file.unwrap().path().file_stem().unwrap().to_str().unwrap().to_owned());
-    for name in files.filter(|name| name != "tasks") {
-        assert!(algorithms.lines().any(|line| line.starts_with(&format!("{name} "))), "{name} is missing in\n{list}");
+    let algorithms: Vec<&str> = algorithms.lines().skip(1).collect();
+    for row in &algorithms {
+        let name = row.split_whitespace().next().unwrap();
+        let file = format!("{}/../presets/{name}.toml", env!("CARGO_MANIFEST_DIR"));
+        let file: Table = std::fs::read_to_string(file).unwrap().parse().unwrap();
+        assert!(row.contains(file["about"].as_str().unwrap()), "{row}");
     }
-    assert!(algorithms.contains("*-v0, *-v2"), "{list}");
+    assert!(algorithms[0].starts_with("quad ") && algorithms[0].ends_with("*-v0, *-v2"), "{list}");
 }
 
 #[test]

@@ -1,18 +1,20 @@
 //! The training loop: what it hands over and when, and how it ends.
 
+use std::sync::Arc;
 use std::sync::atomic::AtomicBool;
 use std::time::Duration;
 
 use candle_core::Device;
 use quad_dataset::{BatchSampler, D4rlWriter, Metadata, ReadOptions, RewardRule, Row, Transitions, environment};
 use quad_policy::Precision;
+use quad_protocol::Origin;
 use quad_service::{Beat, Health};
 
 use super::agent::Agent;
 use super::outbox::{Outbox, Work};
 use super::results::{self, Outcome};
 use super::steps::{Outlets, Plan, TrainError, train};
-use super::{Registrar, TrainingMetrics};
+use super::{Registrar, Training, TrainingMetrics};
 use crate::algorithms::{Setting, named};
 use crate::config::{Schedule, resolve};
 use crate::run::Checkpoint;
@@ -105,12 +107,14 @@ fn run_of(
     let make = Registrar { registry: prometheus::Registry::new() };
     let metrics = TrainingMetrics::new(&make, plan.schedule.steps, definition.metrics).unwrap();
     let outbox = Outbox::default();
-    let outlets = Outlets { metrics: &metrics, outbox: &outbox, stop: &AtomicBool::new(stop), beat: &beat() };
+    let origin = Origin { environment: "hopper".to_owned(), seed: 0, step: 0, episodes: 10 };
+    let (stop, beat) = (&AtomicBool::new(stop), &beat());
+    let outlets = Outlets { metrics: &metrics, outbox: &outbox, origin: &origin, stop, beat };
     // Nothing takes what it hands over, as with a disk that hangs: training must end all the same.
     let outcome = train(&mut agent, &transitions, &mut sampler, plan, &outlets);
     let mut result = Result { outcome, snapshots: Vec::new(), checkpoint: None, rows: Vec::new(), metrics };
     outbox.close();
-    while let Some(work) = outbox.next(&beat()) {
+    while let Some(work) = outbox.next(beat) {
         match work {
             Work::Snapshot(policy) => result.snapshots.push((policy.step, policy.evaluate)),
             Work::Checkpoint(checkpoint) => result.checkpoint = Some(checkpoint),
@@ -206,5 +210,35 @@ fn divergence_is_an_error_that_says_where_and_what() {
         let error = result.outcome.unwrap_err();
         assert!(matches!(error, TrainError::Diverged { step: 1..10, .. }), "{error}");
         assert!(result.snapshots.is_empty(), "nothing broken is handed to evaluation");
+    }
+}
+
+/// Networks whose policy no evaluator can be sent are refused before the first step, and trained if none is to be sent.
+#[test]
+fn a_policy_that_is_too_large_to_send_is_refused_at_the_start() {
+    // Two networks with two layers of 2048 × 2048 numbers each: 64 MiB, and a little more.
+    let large = toml::toml! { steps = 1 batch_size = 1 agent = { hidden = 2048, critics = 1, samples = 1 } };
+    for (eval_interval, refused) in [(1, true), (0, false)] {
+        let mut experiment = resolve("hopper-demo", &large).unwrap();
+        experiment.eval_interval = eval_interval;
+        let make = Registrar { registry: prometheus::Registry::new() };
+        let metrics = TrainingMetrics::new(&make, 1, experiment.definition().unwrap().metrics).unwrap();
+        let training = Training {
+            experiment,
+            device: crate::config::Device::Cpu,
+            transitions: transitions(),
+            checkpoint: None,
+            checkpoint_every: Duration::ZERO,
+            seconds_before: 0.0,
+            metrics: metrics.clone(),
+            outbox: Outbox::default(),
+            stop: Arc::default(),
+        };
+        let result = training.run(&beat());
+        assert_eq!((result.is_err(), metrics.gradient_steps.get()), (refused, u64::from(!refused)));
+        if let Err(error) = result {
+            let with_hint = format!("{error:#?}");
+            assert!(with_hint.contains("can be sent at most") && with_hint.contains("smaller networks"), "{with_hint}");
+        }
     }
 }

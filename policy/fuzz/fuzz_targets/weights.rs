@@ -8,14 +8,13 @@ use std::path::Path;
 use candle_core::{DType, Device, Tensor};
 use libfuzzer_sys::fuzz_target;
 use quad_policy::{
-    ActionNoise, Description, DiffusionPolicy, DiffusionShape, Ensemble, GaussianPolicy, GaussianShape, Layout,
-    NoisePredictor, Precision, Weights, load_policy,
+    Choice, DiffusionPolicy, DiffusionShape, Ensemble, GaussianPolicy, GaussianShape, Header, Layout, NoisePredictor,
+    PolicyConfig, Precision, Rule, Weights, load_policy,
 };
 
 const STATES: usize = 2;
-const CANDIDATES: usize = 2;
-/// Policies that take more than this for an action are only loaded.
-const MOST_PRODUCTS: u64 = 1 << 20;
+/// Policies that take more memory than this for an action take much time, too: they are only loaded. Bytes.
+const MOST_MEMORY: u64 = 1 << 20;
 
 /// Policies for the fuzzer to begin with, where cargo-fuzz lets it look for some.
 fn write_seeds() {
@@ -28,12 +27,20 @@ fn write_seeds() {
     let shape = DiffusionShape { observation_dim: 2, action_dim: 1, hidden: 2, critics: 2, diffusion_steps: 2 };
     let actor = NoisePredictor::new(shape.actor(), halves(shape.actor().layout()), Precision::F32);
     let critics = Ensemble::new(shape.critics(), halves(shape.critics().layout()), Precision::F32);
-    let diffusion = DiffusionPolicy::tensors(&actor, &critics).unwrap();
-    let diffusion = Description::Diffusion(shape).to_safetensors(&diffusion).unwrap();
+    let value = Ensemble::new(shape.value(), halves(shape.value().layout()), Precision::F32);
+    let diffusion = |rule: Rule| {
+        let choice = Choice { rule, ..Choice::best_of(2) };
+        let value = Some(&value).filter(|_| choice.needs_value());
+        let tensors = DiffusionPolicy::tensors(&actor, &critics, value).unwrap();
+        Header { policy: PolicyConfig::Diffusion { shape, choice }, origin: () }.to_safetensors(&tensors).unwrap()
+    };
+    let (best, nearest) = (diffusion(Rule::Best), diffusion(Rule::Nearest));
+    let softmax = diffusion(Rule::Softmax { temperature: 0.5 });
     let shape = GaussianShape { observation_dim: 2, action_dim: 1, hidden: 2 };
     let actor = Ensemble::new(shape.actor(), halves(shape.actor().layout()), Precision::F32);
-    let gaussian = Description::Gaussian(shape).to_safetensors(&GaussianPolicy::tensors(&actor).unwrap()).unwrap();
-    for (name, file) in [("diffusion", diffusion), ("gaussian", gaussian)] {
+    let tensors = GaussianPolicy::tensors(&actor).unwrap();
+    let gaussian = Header { policy: PolicyConfig::Gaussian { shape }, origin: () }.to_safetensors(&tensors).unwrap();
+    for (name, file) in [("best", best), ("nearest", nearest), ("softmax", softmax), ("gaussian", gaussian)] {
         fs::write(corpus.join(name), file).unwrap();
     }
 }
@@ -41,13 +48,13 @@ fn write_seeds() {
 fuzz_target!(init: write_seeds(), |file: &[u8]| {
     let Ok(policy) = load_policy(file, Precision::F32) else { return };
     // As an evaluator asks before its largest job.
-    policy.cost(256, 256);
-    if policy.cost(STATES, CANDIDATES).products > MOST_PRODUCTS {
+    policy.memory(256);
+    if policy.memory(STATES) > MOST_MEMORY {
         return;
     }
     let observations = vec![0.5; STATES * policy.observation_dim()];
     let mut actions = vec![0.0; STATES * policy.action_dim()];
-    let mut noise = [1, 2].map(ActionNoise::new);
+    let mut states = [1, 2].map(|seed| policy.begin(seed));
     // That a number is not finite is an answer, too.
-    policy.act(&observations, CANDIDATES, &mut noise, &mut actions).ok();
+    policy.act(&observations, &mut states, &mut actions).ok();
 });

@@ -9,9 +9,8 @@ fn name() -> Name {
 /// One of each kind and variant, with all of its fields filled.
 pub fn frames() -> Vec<Vec<u8>> {
     let text = || "hopper".to_owned();
-    let tensors: Vec<u8> = (0..100).collect();
-    let weights = Hash::of(&tensors);
-    let schema = Schema { environment: text(), observation_dim: 11, action_dim: 3, policy: "diffusion".to_owned() };
+    let file: Vec<u8> = (0..100).collect();
+    let weights = Hash::of(&file);
     let episodes = vec![EpisodeScore { seed: 1, episode_return: 2.0, length: 3, score: 4.0 }; 3];
     let job = Job {
         id: 1,
@@ -20,9 +19,8 @@ pub fn frames() -> Vec<Vec<u8>> {
         step: 3,
         weights,
         environment: text(),
-        instance: 4,
+        environment_seed: 4,
         seeds: vec![1, 2, 3],
-        candidates: 10,
         progress_milliseconds: 300,
     };
     let progress = Progress {
@@ -39,7 +37,7 @@ pub fn frames() -> Vec<Vec<u8>> {
     };
     let environments = vec![text(), "walker2d".to_owned()];
     vec![
-        encode(&Snapshot { run: name(), incarnation: 1, step: 2, schema, hash: weights, tensors }).unwrap(),
+        encode(&Snapshot { run: name(), incarnation: 1, step: 2, hash: weights, file }).unwrap(),
         encode(&JobRequest::Claim { evaluator: name(), attempt: 9, environments }).unwrap(),
         encode(&JobRequest::HandBack { evaluator: name(), job: 1, failed: Some(text()) }).unwrap(),
         encode(&JobReply::Job(job)).unwrap(),

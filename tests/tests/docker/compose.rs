@@ -17,8 +17,9 @@ pub const TRAINING: Duration = Duration::from_secs(1800);
 const PAUSE: Duration = Duration::from_millis(300);
 
 /// What makes a gradient step and an episode so light that a run of many evaluations takes seconds.
-pub const LIGHT: &str = "--agent hidden=64 --agent critics=2 --agent diffusion_steps=2 --agent candidates=5 --set batch_size=16 \
-                         --episodes 4 --checkpoint-seconds 1";
+pub const LIGHT: &str = "--agent actor.hidden=[64,64,64] --agent critic.hidden=[64,64,64] --agent critics=2 \
+                         --agent diffusion_steps=2 --agent candidates=5 --set batch_size=16 --episodes 4 \
+                         --checkpoint-seconds 1";
 
 /// A Compose project of its own, on ports that Docker chooses; gone with its volumes when dropped. There is one at a time,
 /// so that each has the machine to itself.

@@ -28,7 +28,7 @@ async fn watch(learner: &Learner) -> (Session, Arc<Mutex<Vec<(u64, bool)>>>) {
     let listener = move |sample: zenoh::sample::Sample| {
         let snapshot: Snapshot = decode(&sample.payload().to_bytes()).unwrap();
         let path: PathBuf = folder.join(format!("snapshots/step_{:09}.safetensors", snapshot.step));
-        let kept = fs::read(path).is_ok_and(|bytes| bytes == snapshot.tensors);
+        let kept = fs::read(path).is_ok_and(|bytes| bytes == snapshot.file);
         heard.lock().unwrap().push((snapshot.step, kept));
     };
     let weights = keys::weights(&name("run"));

@@ -30,17 +30,16 @@ fn garbage(real: &[u8]) -> Vec<Vec<u8>> {
 }
 
 /// A job of a run that does not exist.
-fn ghost_job(run: &Name, candidates: u32, environment: &str) -> Vec<u8> {
+fn ghost_job(run: &Name, episodes: u64, environment: &str) -> Vec<u8> {
     encode(&JobReply::Job(Job {
         id: 1,
         run: run.clone(),
         incarnation: 1,
         step: 1,
-        weights: Hash::of(b"no tensors"),
+        weights: Hash::of(b"no policy"),
         environment: environment.to_owned(),
-        instance: 1,
-        seeds: vec![1, 2],
-        candidates,
+        environment_seed: 1,
+        seeds: (0..episodes).collect(),
         progress_milliseconds: 300,
     }))
     .unwrap()
@@ -51,12 +50,12 @@ async fn haunt(session: &Session) -> impl Sized {
     let ghost = name("ghost");
     let answers = [
         b"QUAD nonsense".to_vec(),
-        ghost_job(&ghost, 1, "hopper"), // its weights are no safetensors
-        ghost_job(&ghost, u32::MAX, "hopper"),
+        ghost_job(&ghost, 1, "hopper"), // its weights are no policy
+        ghost_job(&ghost, 100_000, "hopper"),
         ghost_job(&ghost, 1, "moon"),
         ghost_job(&name("another"), 1, "hopper"),
     ];
-    let snapshot = encode(&made_up::snapshot(&ghost, 1, 1, b"no tensors")).unwrap();
+    let snapshot = encode(&made_up::snapshot(&ghost, 1, 1, b"no policy")).unwrap();
     let asked = AtomicUsize::new(0);
     let jobs = keys::jobs(&ghost);
     let queryable = session.declare_queryable("quad/ghost/**").callback(move |query| {
@@ -109,7 +108,7 @@ async fn nonsense_on_every_key_is_counted_and_survived() {
     send_everywhere(&session, payloads).await;
 
     let evaluator_page = evaluator.metrics();
-    for reason in ["hash", "tensors", "job_size", "schema", "other_run"] {
+    for reason in ["hash", "tensors", "job_size", "environment", "other_run"] {
         eventually(&format!("the evaluator counts {reason}"), PATIENCE, || {
             let page = http::metrics(&evaluator_page)?;
             let label = format!("reason=\"{reason}\"");

@@ -34,6 +34,7 @@ fn a_wrong_command_line_exits_with_2() {
         ("evaluator", &["collect", "--env", "hopper"]),
         ("evaluator", &["score"]),
         ("evaluator", &["score", "x", "--candidates", "1,0"]),
+        ("evaluator", &["score", "x", "--rule", "softmax"]),
     ] {
         let output = run(program, arguments);
         let text = String::from_utf8_lossy(&output.stderr);

@@ -31,7 +31,7 @@ fn a_robot_that_we_do_not_know_is_learnt_from() {
     write_log(&dataset);
     let mut command = Command::new(binary("learner"));
     command.args(["train", "--task", "own-data", "--set", "environment=my-robot", "--steps", "20"]);
-    command.args(["--agent", "hidden=32", "--set", "batch_size=64"]);
+    command.args(["--agent", "actor.hidden=[32]", "--agent", "critic.hidden=[32]", "--set", "batch_size=64"]);
     let output = command.arg("--dataset").arg(&dataset).arg("--run-dir").arg(&run_dir).output().unwrap();
     let text = String::from_utf8_lossy(&output.stderr);
     assert_eq!(output.status.code(), Some(0), "{text}");

@@ -7,7 +7,7 @@ mod results;
 mod subject;
 
 use anyhow::Context;
-use quad_policy::{ActionNoise, Precision};
+use quad_policy::Precision;
 use quad_protocol::episode_seeds;
 use rayon::prelude::*;
 use tracing::{info, warn};
@@ -26,34 +26,29 @@ const BATCH: usize = 16;
 /// A file that is no policy of an environment that can be simulated here; nothing is scored then. Or a policy that cannot
 /// act.
 pub(crate) fn score(args: &ScoreArgs) -> anyhow::Result<String> {
-    if args.precision.is_some_and(|wanted| !wanted.is_available()) {
+    if !args.precision.is_available() {
         warn!("{}", Precision::UNAVAILABLE);
     }
-    let subjects =
-        args.snapshots.iter().map(|path| Subject::read(path, args)).collect::<anyhow::Result<Vec<Subject>>>()?;
-    let tasks: Vec<(&Subject, u32)> = subjects
-        .iter()
-        .flat_map(|subject| subject.candidates.iter().map(move |&candidates| (subject, candidates)))
-        .collect();
+    let subjects = args.snapshots.iter().map(|path| Subject::read(path, args)).collect::<anyhow::Result<Vec<_>>>()?;
     info!("scoring {} policies", subjects.len());
-    let scored = tasks.into_par_iter().with_max_len(1).map(|(subject, candidates)| measure(subject, candidates));
-    let scored = scored.collect::<anyhow::Result<Vec<Scored>>>()?;
+    let subjects: Vec<Subject> = subjects.into_iter().flatten().collect();
+    let scored = subjects.par_iter().with_max_len(1).map(measure).collect::<anyhow::Result<Vec<Scored>>>()?;
     Ok(if args.json { serde_json::to_string(&scored)? } else { table(&scored) })
 }
 
 /// Runs a policy's episodes. What one comes to depends on neither the batch it is in nor the number of threads.
-fn measure(subject: &Subject, candidates: u32) -> anyhow::Result<Scored> {
-    let Subject { path, weights, spec, seed, step, episodes, precision, policy, .. } = subject;
+fn measure(subject: &Subject) -> anyhow::Result<Scored> {
+    let Subject { path, weights, spec, seed, step, episodes, policy } = subject;
     let batch = |seeds: &[u64]| -> anyhow::Result<Vec<EpisodeOutcome>> {
-        let mut rollout = Rollout::new(spec, *seed, seeds, ActionNoise::new)?;
+        let mut rollout = Rollout::new(spec, *seed, seeds, |seed| policy.begin(seed))?;
         while !rollout.is_done() {
             rollout
-                .step(|observations, noise, actions| policy.act(observations, candidates as usize, noise, actions))
+                .step(|observations, states, actions| policy.act(observations, states, actions))
                 .with_context(|| format!("{}: the policy cannot act", path.display()))?;
         }
         Ok(rollout.into_outcomes())
     };
-    let seeds = episode_seeds(*seed, step.unwrap_or_default(), *episodes);
+    let seeds = episode_seeds(*seed, *step, *episodes);
     let batches = seeds.par_chunks(BATCH).with_max_len(1).map(batch).collect::<anyhow::Result<Vec<_>>>()?;
     let scored = Scored {
         snapshot: path.clone(),
@@ -61,10 +56,10 @@ fn measure(subject: &Subject, candidates: u32) -> anyhow::Result<Scored> {
         environment: spec.name.clone(),
         step: *step,
         seed: *seed,
-        candidates,
-        precision: precision.arithmetic(),
+        choice: policy.choice(),
+        precision: policy.precision().arithmetic(),
         episodes: batches.iter().flatten().map(Episode::from).collect(),
     };
-    info!("{}, {candidates} candidates: {}", path.display(), Spread::of(&scored.scores()));
+    info!("{}, {}: {}", path.display(), scored.title(), Spread::of(&scored.scores()));
     Ok(scored)
 }

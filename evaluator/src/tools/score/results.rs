@@ -4,11 +4,12 @@ use std::collections::BTreeSet;
 use std::fmt;
 use std::path::PathBuf;
 
+use quad_policy::Choice;
 use serde::Serialize;
 
 use crate::sim::EpisodeOutcome;
 
-/// What one policy came to with one number of candidates.
+/// What one policy came to with one way to choose.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct Scored {
     /// The file.
@@ -17,13 +18,13 @@ pub struct Scored {
     pub weights: String,
     /// Environment that it acted in.
     pub environment: String,
-    /// Gradient step that it was saved after; absent if the file does not say.
-    pub step: Option<u64>,
+    /// Gradient step that it was saved after.
+    pub step: u64,
     /// Seed that the episodes follow from, with the step.
     pub seed: u64,
-    /// Actions sampled per state.
-    pub candidates: u32,
-    /// Arithmetic of the networks, as in `scores.jsonl`.
+    /// How it chose among its candidates; absent if it draws none.
+    pub choice: Option<Choice>,
+    /// Arithmetic of its actions, as in `scores.jsonl`.
     pub precision: String,
     /// In the order of their seeds.
     pub episodes: Vec<Episode>,
@@ -44,6 +45,11 @@ pub struct Episode {
 }
 
 impl Scored {
+    /// How it chose, for people.
+    pub fn title(&self) -> String {
+        self.choice.map_or_else(|| "no candidates".to_owned(), |choice| choice.to_string())
+    }
+
     /// The normalised score of each episode.
     pub fn scores(&self) -> Vec<f64> {
         self.episodes.iter().map(|episode| episode.score).collect()
@@ -85,35 +91,39 @@ impl fmt::Display for Spread {
     }
 }
 
-/// A row for each snapshot, a column for each number of candidates; below, their means if they can be averaged.
+/// A row for each snapshot, a column for each way to choose; below, their means if they can be averaged.
 pub fn table(scored: &[Scored]) -> String {
-    let candidates: BTreeSet<u32> = scored.iter().map(|scored| scored.candidates).collect();
-    let title = |candidates: &u32| format!("{candidates} candidate{}", if *candidates == 1 { "" } else { "s" });
+    let mut titles: Vec<String> = Vec::new();
+    for title in scored.iter().map(Scored::title) {
+        if !titles.contains(&title) {
+            titles.push(title);
+        }
+    }
     let head = ["snapshot", "step", "environment", "episodes"].map(str::to_owned);
-    let mut rows: Vec<Vec<String>> = vec![head.into_iter().chain(candidates.iter().map(title)).collect()];
+    let mut rows: Vec<Vec<String>> = vec![head.into_iter().chain(titles.iter().cloned()).collect()];
 
     let snapshots: Vec<&[Scored]> = scored.chunk_by(|one, next| one.snapshot == next.snapshot).collect();
     for of_one in &snapshots {
         let Scored { snapshot, step, environment, episodes, .. } = &of_one[0];
-        let step = step.map_or_else(|| "?".to_owned(), |step| step.to_string());
-        let head = [snapshot.display().to_string(), step, environment.clone(), episodes.len().to_string()];
-        let score = |candidates: &u32| {
-            let found = of_one.iter().find(|scored| scored.candidates == *candidates);
+        let head = [snapshot.display().to_string(), step.to_string(), environment.clone(), episodes.len().to_string()];
+        let score = |title: &String| {
+            let found = of_one.iter().find(|scored| scored.title() == *title);
             found.map(|scored| Spread::of(&scored.scores()).to_string()).unwrap_or_default()
         };
-        rows.push(head.into_iter().chain(candidates.iter().map(score)).collect());
+        rows.push(head.into_iter().chain(titles.iter().map(score)).collect());
     }
-    let precision = scored.first().map_or("", |scored| &scored.precision);
-    let mut note = format!("normalised score in {precision}, mean ± standard deviation over the episodes");
+    let precisions: BTreeSet<&str> = scored.iter().map(|scored| scored.precision.as_str()).collect();
+    let precisions = Vec::from_iter(precisions).join(" and ");
+    let mut note = format!("normalised score in {precisions}, mean ± standard deviation over the episodes");
     if snapshots.len() > 1 && scored.iter().all(|other| other.environment == scored[0].environment) {
         let head = [format!("mean of {} snapshots", snapshots.len()), String::new(), String::new(), String::new()];
-        let mean = |candidates: &u32| {
-            let with_these = scored.iter().filter(|scored| scored.candidates == *candidates);
+        let mean = |title: &String| {
+            let with_these = scored.iter().filter(|scored| scored.title() == *title);
             let means: Vec<f64> = with_these.map(|scored| Spread::of(&scored.scores()).mean).collect();
             // Of fewer it would be something else than the row says.
             if means.len() == snapshots.len() { Spread::of(&means).to_string() } else { String::new() }
         };
-        rows.push(head.into_iter().chain(candidates.iter().map(mean)).collect());
+        rows.push(head.into_iter().chain(titles.iter().map(mean)).collect());
         note.push_str("; in the last row over the snapshots");
     }
     aligned(&rows) + &note
@@ -145,16 +155,16 @@ mod tests {
             snapshot: Path::new(snapshot).to_owned(),
             weights: String::new(),
             environment: "hopper".to_owned(),
-            step: Some(20),
+            step: 20,
             seed: 1,
-            candidates,
+            choice: Some(Choice::best_of(candidates)),
             precision: "f32-avx2".to_owned(),
             episodes: scores.iter().map(episode).collect(),
         }
     }
 
     #[test]
-    fn a_row_for_each_snapshot_and_a_column_for_each_number_of_candidates() {
+    fn a_row_for_each_snapshot_and_a_column_for_each_way_to_choose() {
         let table =
             table(&[scored("a", 1, &[1.0, 3.0]), scored("a", 10, &[10.0, 10.0]), scored("longer", 1, &[4.0, 4.0])]);
         let lines: Vec<Vec<&str>> = table
@@ -173,5 +183,13 @@ mod tests {
         let table = table(&[scored("a", 1, &[1.0]), other]);
         assert!(!table.contains("mean of"), "{table}");
         assert!(table.contains(" 1.00\n"), "a single episode has no spread: {table}");
+    }
+
+    #[test]
+    fn every_arithmetic_is_named() {
+        let gaussian = Scored { choice: None, precision: "f32-avx2".to_owned(), ..scored("a", 1, &[1.0]) };
+        let diffusion = Scored { precision: "bf16-amx".to_owned(), ..scored("b", 10, &[1.0]) };
+        let table = table(&[gaussian, diffusion]);
+        assert!(table.contains("no candidates  10 candidates") && table.contains("bf16-amx and f32-avx2"), "{table}");
     }
 }

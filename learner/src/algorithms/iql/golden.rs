@@ -5,7 +5,7 @@ use crate::algorithms::golden::{
     Golden, check_update, devices, fresh, golden_batch, golden_setting, golden_table, goldens,
 };
 use candle_core::Device;
-use quad_policy::{ActionNoise, Precision, load_policy};
+use quad_policy::{Header, Precision, load_policy};
 
 #[test]
 fn golden_update() {
@@ -28,14 +28,15 @@ fn check(golden: &Golden, device: &Device) {
     iql.load(&mut state).unwrap();
     assert!(state.is_empty(), "tensors that are not read: {:?}", state.keys());
 
-    let (description, tensors) = iql.policy().unwrap();
-    let policy = load_policy(&description.to_safetensors(&tensors).unwrap(), Precision::F32).unwrap();
+    let (policy, tensors) = iql.policy().unwrap();
+    let file = Header { policy, origin: () }.to_safetensors(&tensors).unwrap();
+    let policy = load_policy(&file, Precision::F32).unwrap();
     let observations = golden.input("select_observations", &Device::Cpu);
     let n = observations.dim(0).unwrap();
     let observations: Vec<f32> = observations.flatten_all().unwrap().to_vec1().unwrap();
-    let mut noise: Vec<_> = (0..n as u64).map(ActionNoise::new).collect();
+    let mut states: Vec<_> = (0..n as u64).map(|seed| policy.begin(seed)).collect();
     let mut actions = vec![0.0; n * policy.action_dim()];
-    policy.act(&observations, 1, &mut noise, &mut actions).unwrap();
+    policy.act(&observations, &mut states, &mut actions).unwrap();
     golden.close("select.actions", &Tensor::new(actions, &Device::Cpu).unwrap());
 
     let values = iql.update(golden.count("/step") as u64, &golden_batch(golden, device)).unwrap();

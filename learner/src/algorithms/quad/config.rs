@@ -1,6 +1,8 @@
 //! QUAD's hyper-parameters: the `[agent]` table of a preset.
 
-use crate::algorithms::algorithm::{self, AgentError, check, check_count, check_positive, check_rate};
+use crate::algorithms::algorithm::{AgentError, Hyperparameters, check, check_layers};
+use crate::algorithms::hyperparameters::{Candidates, Count, NotNegative, Positive, Rate, Share, Steps};
+use quad_policy::MlpConfig;
 use serde::Deserialize;
 
 /// What pulls the policy away from the data.
@@ -30,87 +32,71 @@ pub(super) enum TargetReduce {
 #[serde(deny_unknown_fields)]
 pub(super) struct Eta {
     /// Value at the first step.
-    pub initial: f32,
+    pub initial: NotNegative,
     /// Behaviour-cloning loss b that dual ascent aims at; absent: η stays at `initial`.
-    pub threshold: Option<f32>,
+    pub threshold: Option<Positive>,
     /// Step size α_η of dual ascent.
-    pub rate: f32,
+    pub rate: NotNegative,
     /// Smallest η.
-    pub minimum: f32,
+    pub minimum: NotNegative,
     /// Largest η.
-    pub maximum: f32,
+    pub maximum: NotNegative,
 }
 
 /// Everything that decides what one update does.
 #[derive(Clone, Debug, PartialEq, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub(super) struct Quad {
-    /// Width of the hidden layers of actor and critics.
-    pub hidden: usize,
+    /// The noise predictor's hidden layers.
+    pub actor: MlpConfig,
+    /// The critics' hidden layers.
+    pub critic: MlpConfig,
     /// Ensemble size K.
-    pub critics: usize,
+    pub critics: Count,
     /// Denoising steps T.
-    pub diffusion_steps: usize,
+    pub diffusion_steps: Count,
     /// Discount γ.
-    pub gamma: f32,
+    pub gamma: Share,
     /// Pessimism ρ of the lower confidence bound (Eq. 20).
-    pub rho: f32,
+    pub rho: NotNegative,
     /// What guides the actor.
     pub guidance: Guidance,
     /// Temperature τ of the uncertainty weight (Eq. 24); `inf` gives λ = ν̂²/(ν̂² + δ).
     pub tau: f32,
     /// Stabiliser δ of Eq. 24, on the scale of squared normalised Q-gradients.
-    pub delta: f32,
+    pub delta: Positive,
     /// Next actions sampled per next state for the target, S.
-    pub samples: usize,
+    pub samples: Count,
     /// How their values are combined.
     pub target_reduce: TargetReduce,
+    /// Actions that an evaluated policy draws in each state, N_a (Eq. 25).
+    pub candidates: Candidates,
     /// Behaviour-cloning strength.
     pub eta: Eta,
     /// Adam's learning rate for the actor at the first step; decays to 0 along a cosine.
-    pub actor_learning_rate: f32,
+    pub actor_learning_rate: Positive,
     /// The same for the critics.
-    pub critic_learning_rate: f32,
+    pub critic_learning_rate: Positive,
     /// Global norm at which each network's gradient is clipped.
-    pub gradient_clip: f32,
+    pub gradient_clip: Positive,
     /// EMA rate of both target networks, α_ema.
-    pub ema_rate: f32,
+    pub ema_rate: Rate,
     /// EMA rate of ν̂² (Eq. 23).
-    pub nu_ema_rate: f32,
+    pub nu_ema_rate: Rate,
     /// The target actor follows in updates whose number, from 0, is a multiple of this …
-    pub actor_ema_every: u64,
+    pub actor_ema_every: Steps,
     /// … and above this.
     pub actor_ema_start: u64,
 }
 
-/// Reads and checks the table.
-pub(super) fn read(table: &toml::Table) -> Result<Quad, AgentError> {
-    let config: Quad = algorithm::read(table)?;
-    config.validate()?;
-    Ok(config)
-}
-
-impl Quad {
-    fn validate(&self) -> Result<(), AgentError> {
-        check_count("hidden", self.hidden, 1 << 14)?;
-        check_count("critics", self.critics, 1 << 10)?;
-        check_count("diffusion_steps", self.diffusion_steps, 1000)?;
-        check_count("samples", self.samples, 1 << 10)?;
-        check("gamma", self.gamma, (0.0..=1.0).contains(&self.gamma), "in [0, 1]")?;
-        check("rho", self.rho, self.rho >= 0.0 && self.rho.is_finite(), "at least 0")?;
+impl Hyperparameters for Quad {
+    fn check(&self) -> Result<(), AgentError> {
+        check_layers("actor", &self.actor)?;
+        check_layers("critic", &self.critic)?;
         check("tau", self.tau, self.tau > 0.0, "above 0 (`inf` is allowed)")?;
-        check_positive("delta", self.delta)?;
-        check_positive("actor_learning_rate", self.actor_learning_rate)?;
-        check_positive("critic_learning_rate", self.critic_learning_rate)?;
-        check_positive("gradient_clip", self.gradient_clip)?;
-        check_rate("ema_rate", self.ema_rate)?;
-        check_rate("nu_ema_rate", self.nu_ema_rate)?;
-        check("actor_ema_every", self.actor_ema_every, self.actor_ema_every > 0, "at least 1")?;
-        let Eta { initial, threshold, rate, minimum, maximum } = self.eta;
-        check("eta.minimum", minimum, minimum >= 0.0, "at least 0")?;
-        check("eta.maximum", maximum, maximum >= minimum, "at least eta.minimum")?;
-        check("eta.initial", initial, (minimum..=maximum).contains(&initial), "between eta.minimum and eta.maximum")?;
-        check("eta.rate", rate, rate >= 0.0 && rate.is_finite(), "at least 0")?;
-        threshold.map_or(Ok(()), |threshold| check_positive("eta.threshold", threshold))
+        let Eta { initial, minimum, maximum, .. } = self.eta;
+        check("eta.maximum", *maximum, *maximum >= *minimum, "at least eta.minimum")?;
+        let within = (*minimum..=*maximum).contains(&*initial);
+        check("eta.initial", *initial, within, "between eta.minimum and eta.maximum")
     }
 }

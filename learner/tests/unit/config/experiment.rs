@@ -15,13 +15,14 @@ fn changes_override_the_values_of_the_task() {
 fn what_cannot_be_used_is_named_with_what_can() {
     for (preset, changes, words) in [
         ("hopper-demo", toml! { tau = 3 }, "unknown field `tau`, expected one of `environment`"),
-        ("hopper-demo", toml! { agent.rate = 1.0 }, "unknown field `rate`, expected one of `hidden`, `critics`"),
+        ("hopper-demo", toml! { agent.rate = 1.0 }, "unknown field `rate`, expected one of `actor`, `critic`"),
         ("hopper-demo", toml! { agent.eta.treshold = 1.0 }, "`threshold`"),
         ("hopper-demo", toml! { agent.guidance = "sac" }, "`quad`, `dac`, `none`"),
-        ("hopper-demo", toml! { agent.samples = 0 }, "samples is 0"),
+        ("hopper-demo", toml! { agent.samples = 0 }, "in `samples`"),
         ("hopper-demo", toml! { algorithm = "td3" }, "no algorithm named td3"),
         ("hopper-demo", toml! { episodes = 0 }, "episodes is 0, but must be from 1 to 10000"),
-        ("hopper-demo", toml! { algorithm = "iql" candidates = 2 }, "must be 1"),
+        ("hopper-demo", toml! { agent.candidates = 1001 }, "1001 is not a whole number from 1 to 1000"),
+        ("hopper-demo", toml! { algorithm = "iql" agent.candidates = 2 }, "unknown field `candidates`"),
         ("hopper-demo", toml! { algorithm = "iql" agent.tau = 2 }, "unknown field `tau`"),
         ("hoper-demo", toml! { steps = 1 }, "no task named hoper-demo"),
     ] {

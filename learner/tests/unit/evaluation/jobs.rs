@@ -13,7 +13,7 @@ fn jobs_go_out_oldest_step_first_and_no_episode_twice() {
         [(1000, vec![1, 2, 3, 4, 5]), (1000, vec![6, 7]), (2000, vec![11, 12, 13, 14, 15]), (2000, vec![16, 17])];
     assert_eq!(handed_out, expected);
     assert_eq!((jobs[0].weights, jobs[2].weights), (hash(1000), hash(2000)));
-    assert_eq!((jobs[0].incarnation, jobs[0].candidates), (INCARNATION, 10));
+    assert_eq!((jobs[0].incarnation, jobs[0].environment_seed), (INCARNATION, 5));
     assert!(matches!(bench.claim("e", 0, 0), Claimed::Wait { has_another: false, .. }));
     assert_eq!(bench.board.pending(), 14);
 }

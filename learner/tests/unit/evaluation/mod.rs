@@ -38,8 +38,7 @@ impl Bench {
             run: name("run"),
             incarnation: INCARNATION,
             task: quad_dataset::environment::find("hopper").unwrap().into(),
-            instance: 5,
-            candidates: 10,
+            environment_seed: 5,
             job_episodes: [5, 20],
             lease: LEASE,
         };

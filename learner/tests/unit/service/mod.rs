@@ -6,17 +6,13 @@ mod peers;
 mod scores;
 mod weights;
 
-use std::collections::{BTreeMap, HashMap};
+use std::collections::BTreeMap;
 use std::net::TcpListener;
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
-use quad_protocol::{
-    Hash, Job, JobReply, JobRequest, Message, Name, Origin, ScoreReply, ScoreReport, decode, encode, keys,
-};
+use quad_protocol::{Hash, Job, JobReply, JobRequest, Message, Name, ScoreReply, ScoreReport, decode, encode, keys};
 use quad_service::{Beat, Endpoints, Health, open_session};
-use safetensors::Dtype;
-use safetensors::tensor::TensorView;
 use tokio::sync::Mutex;
 use tokio::sync::mpsc::UnboundedReceiver;
 use zenoh::Session;
@@ -36,7 +32,6 @@ use crate::evaluation::Rules;
 use crate::evaluation::tests::name;
 use crate::run::tests::config;
 use crate::run::{Log, RunDir};
-use crate::train::agent::PolicyFile;
 use crate::train::{Outbox, TrainedPolicy};
 
 const PATIENCE: Duration = Duration::from_secs(20);
@@ -59,22 +54,9 @@ struct Bench {
     _folder: tempfile::TempDir,
 }
 
-/// The networks of a snapshot.
-fn tensors(step: u64) -> Vec<u8> {
-    let bytes = vec![step as u8; 1_000_000];
-    let tensor = TensorView::new(Dtype::U8, vec![bytes.len()], &bytes).unwrap();
-    let shape = "{\"kind\":\"gaussian\",\"observation_dim\":11,\"action_dim\":3,\"hidden\":8}";
-    let metadata = HashMap::from([("policy".to_owned(), shape.to_owned())]);
-    safetensors::serialize([("weights", tensor)], Some(metadata)).unwrap()
-}
-
-fn origin(step: u64) -> Origin {
-    Origin { environment: "hopper".to_owned(), seed: 1, step, episodes: 4, candidates: 3 }
-}
-
-/// The file that is kept and published of them.
+/// The file of a policy, which the learner's threads do not look into.
 fn file(step: u64) -> Vec<u8> {
-    origin(step).attach(&tensors(step)).unwrap()
+    vec![step as u8; 1_000_000]
 }
 
 fn beat() -> Beat {
@@ -103,15 +85,14 @@ impl Bench {
         let rules = Rules {
             run: run.clone(),
             incarnation: INCARNATION,
-            task: task.clone(),
-            instance: 1,
-            candidates: 3,
+            task,
+            environment_seed: 1,
             job_episodes: [2, 2],
             lease,
         };
         let plan = EvaluationPlan { seed: 1, episodes: 4 };
         let coordinator = Coordinator::new(rules, plan, BTreeMap::new(), metrics.clone(), tell.clone());
-        let weights = Weights::new(run.clone(), INCARNATION, task, run_dir.clone(), coordinator.clone());
+        let weights = Weights::new(run.clone(), INCARNATION, run_dir.clone(), coordinator.clone());
         let (services, before) =
             Services::start(coordinator.clone(), weights.clone(), metrics.clone(), tell.clone()).unwrap();
 
@@ -131,7 +112,6 @@ impl Bench {
         let outbox = Outbox::default();
         let snapshots = Snapshots {
             outbox: outbox.clone(),
-            origin: origin(0),
             run_dir: run_dir.clone(),
             rows: run_dir.metrics_log(0).unwrap().0,
             weights,
@@ -157,8 +137,7 @@ impl Bench {
 
     /// Training hands over a snapshot.
     fn train(&self, step: u64) {
-        let policy = PolicyFile { kind: "diffusion", bytes: tensors(step) };
-        self.outbox.snapshot(TrainedPolicy { step, policy, evaluate: true }, &false.into(), &beat());
+        self.outbox.snapshot(TrainedPolicy { step, file: file(step), evaluate: true }, &false.into(), &beat());
     }
 
     async fn snapshot(&mut self, step: u64) {

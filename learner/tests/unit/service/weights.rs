@@ -24,7 +24,7 @@ async fn weights_are_published_and_older_ones_are_answered_from_the_disk() {
     bench.snapshot(step + 10).await;
     for step in [step, step + 10] {
         let snapshot: Snapshot = ask(&client, keys::weights_at(&bench.run, step), None).await.unwrap().unwrap();
-        assert_eq!((snapshot.step, snapshot.hash, snapshot.tensors), (step, Hash::of(&file(step)), file(step)));
+        assert_eq!((snapshot.step, snapshot.hash, snapshot.file), (step, Hash::of(&file(step)), file(step)));
     }
     let missing = ask::<Snapshot>(&client, keys::weights_at(&bench.run, 11), None).await.unwrap();
     assert!(missing.unwrap_err().contains("no snapshot"));

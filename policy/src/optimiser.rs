@@ -1,9 +1,11 @@
-//! Adam and EMA over the weights of a network, each with a fused body for the CPU and one of plain candle operations.
+//! Adam over the weights of a network, with an implementation for the CPU and one of plain candle operations.
 
-use candle_core::backprop::GradStore;
+use crate::error::PolicyError;
+use crate::gradient::Gradients;
+use crate::slices::{has_fast_body, modify, read};
+use crate::weights::{Layout, Tensors, Weights};
 use candle_core::{DType, Result, Tensor};
-use quad_kernels::optimiser::{BETA1, BETA2, EPSILON, adam, ema, norm};
-use quad_policy::{PolicyError, Tensors, Weights, has_fast_body, modify, read};
+use quad_kernels::optimiser::{BETA1, BETA2, EPSILON, adam, norm};
 
 /// Adam (Kingma and Ba 2015), with β = (0.9, 0.999) and ε = 1e-8, for the weights of one network.
 pub struct Adam {
@@ -30,8 +32,8 @@ impl Adam {
     }
 
     /// Moves the weights down the loss that `gradients` are of. Gives the gradient's norm before clipping, `[]`.
-    pub fn step(&mut self, weights: &mut Weights, gradients: &GradStore, step: AdamStep) -> Result<Tensor> {
-        let gradient = weights.gradient(gradients)?;
+    pub fn step(&mut self, weights: &mut Weights, gradients: &Gradients, step: AdamStep) -> Result<Tensor> {
+        let gradient = gradients.with_respect_to(weights)?;
         self.descend(weights, &gradient, step)
     }
 
@@ -74,10 +76,10 @@ impl Adam {
         Ok(size)
     }
 
-    /// The moments by name, like the weights they are of: `adam_m.…` and `adam_v.…`.
-    pub fn tensors(&self, weights: &Weights, name: &str) -> Result<Tensors> {
-        let mut tensors = weights.layout().split(&self.moments.get(0)?, &format!("adam_m.{name}"))?;
-        tensors.extend(weights.layout().split(&self.moments.get(1)?, &format!("adam_v.{name}"))?);
+    /// The moments by name, like the weights of this layout that they are of: `adam_m.…` and `adam_v.…`.
+    pub fn tensors(&self, layout: &Layout, name: &str) -> Result<Tensors> {
+        let mut tensors = layout.split(&self.moments.get(0)?, &format!("adam_m.{name}"))?;
+        tensors.extend(layout.split(&self.moments.get(1)?, &format!("adam_v.{name}"))?);
         Ok(tensors)
     }
 
@@ -85,30 +87,12 @@ impl Adam {
     ///
     /// # Errors
     /// A moment that is missing or does not fit.
-    pub fn load(
-        &mut self,
-        weights: &Weights,
-        tensors: &mut Tensors,
-        name: &str,
-    ) -> std::result::Result<(), PolicyError> {
-        let first = weights.layout().join(tensors, &format!("adam_m.{name}"))?;
-        let second = weights.layout().join(tensors, &format!("adam_v.{name}"))?;
+    pub fn load(&mut self, layout: &Layout, tensors: &mut Tensors, name: &str) -> std::result::Result<(), PolicyError> {
+        let first = layout.join(tensors, &format!("adam_m.{name}"))?;
+        let second = layout.join(tensors, &format!("adam_v.{name}"))?;
         self.moments = Tensor::stack(&[first, second], 0)?.to_device(self.moments.device())?;
         Ok(())
     }
-}
-
-/// `target = (1 - rate)·target + rate·online`: a target network follows its online network.
-pub fn follow(target: &mut Weights, online: &Weights, rate: f32) -> Result<()> {
-    let online = online.values();
-    if has_fast_body(online.device()) {
-        return read(online, |online: &[f32]| {
-            target.change(|target| modify(target, |target| ema(target, online, rate)))
-        })?;
-    }
-    let online = online.detach();
-    target
-        .change(|target| target.slice_set(&((target * (1.0 - f64::from(rate)))? + (online * f64::from(rate))?)?, 0, 0))
 }
 
 /// A factor that falls from 1 at step 0 to 0 at `total` along a cosine.
@@ -120,8 +104,8 @@ pub fn cosine_decay(step: u64, total: u64) -> f32 {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::shape::{EnsembleShape, MlpConfig};
     use candle_core::Device;
-    use quad_policy::EnsembleShape;
     use rand::{Rng, SeedableRng};
     use rand_chacha::ChaCha8Rng;
 
@@ -134,14 +118,20 @@ mod tests {
 
     /// Enough numbers for several chunks, and no whole number of registers.
     fn weights() -> Weights {
-        let shape = EnsembleShape { members: 3, observation_dim: 5, action_dim: 2, hidden: 77, outputs: 1 };
+        let shape = EnsembleShape {
+            members: 3,
+            observation_dim: 5,
+            action_dim: 2,
+            layers: MlpConfig { hidden: vec![77, 78], ..MlpConfig::default() },
+            outputs: 1,
+        };
         let layout = shape.layout();
         let values = Weights::initial(&layout, &mut ChaCha8Rng::seed_from_u64(0), &Device::Cpu).unwrap();
         Weights::trainable(layout, &values).unwrap()
     }
 
     #[test]
-    fn both_bodies_of_adam_and_ema_do_the_same() {
+    fn both_implementations_of_adam_and_the_ema_do_what_they_should() {
         let mut generator = ChaCha8Rng::seed_from_u64(1);
         for clip in [None, Some(0.3), Some(1e6)] {
             let [mut fast, mut plain] = [weights(), weights()];
@@ -158,7 +148,7 @@ mod tests {
                 close(&fast_adam.moments, &plain_adam.moments);
                 close(fast.values(), plain.values());
             }
-            follow(&mut target, &fast, 0.25).unwrap();
+            target.follow(&fast, 0.25).unwrap();
             close(target.values(), &((before * 0.75).unwrap() + (fast.values() * 0.25).unwrap()).unwrap());
         }
     }

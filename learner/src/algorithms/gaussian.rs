@@ -1,0 +1,62 @@
+//! The Gaussian policy that several algorithms train by weighted regression: its mean is the tanh of a network, its log σ the
+//! same in all states.
+
+use candle_core::{DType, Result, Tensor};
+use quad_policy::{
+    AdamStep, Ensemble, GaussianPolicy, GaussianShape, Gradients, Layout, MlpConfig, Part, PolicyConfig, Start, Tensors, Weights,
+    gaussian_mean,
+};
+
+use super::algorithm::Context;
+use super::parts::{Parts, Trained, ensemble};
+
+/// Bounds of log σ.
+const LOG_STD: (f32, f32) = (-5.0, 2.0);
+
+/// A Gaussian policy in training.
+pub(super) struct Gaussian {
+    shape: GaussianShape,
+    /// The mean is its tanh.
+    mean: Trained<Ensemble>,
+    /// log σ, `[a]`.
+    log_std: Trained<Weights>,
+}
+
+impl Gaussian {
+    pub fn new(layers: &MlpConfig, context: &Context, network: u64) -> Result<Self> {
+        let action_dim = context.action_dim();
+        let shape = GaussianShape { observation_dim: context.observation_dim(), action_dim, actor: layers.clone() };
+        let part =
+            Part { name: "log_std".to_owned(), shape: vec![action_dim], offset: 0, start: Start::Constant(0.0) };
+        let log_std = Tensor::zeros(action_dim, DType::F32, &context.device)?;
+        let log_std = Weights::trainable(Layout::new(vec![part]), &log_std)?;
+        Ok(Self { mean: ensemble(shape.actor(), context, network)?, log_std: Trained::new(log_std)?, shape })
+    }
+
+    /// log π(a|s), `[B]`. The tanh is part of the mean: the density knows nothing of it.
+    pub fn log_probability(&self, observations: &Tensor, actions: &Tensor) -> Result<Tensor> {
+        let log_std = self.log_std.network.values().clamp(LOG_STD.0, LOG_STD.1)?;
+        let error = (actions - gaussian_mean(&self.mean.network, observations)?)?;
+        let square = error.broadcast_div(&log_std.exp()?)?.sqr()?;
+        let half_log_2_pi = 0.5 * (2.0 * std::f64::consts::PI).ln();
+        ((square * -0.5)?.broadcast_sub(&log_std)? - half_log_2_pi)?.sum(1)
+    }
+
+    /// Moves mean and log σ.
+    pub fn descend(&mut self, gradients: &Gradients, step: AdamStep) -> Result<()> {
+        self.mean.descend(gradients, step)?;
+        self.log_std.descend(gradients, step)?;
+        Ok(())
+    }
+
+    /// The policy that acts by the mean.
+    pub fn policy(&self) -> Result<(PolicyConfig, Tensors)> {
+        let tensors = GaussianPolicy::tensors(&self.mean.network)?;
+        Ok((PolicyConfig::Gaussian { shape: self.shape.clone() }, tensors))
+    }
+
+    /// Both parts, called `actor`.
+    pub fn parts<'a>(&'a mut self, parts: Parts<'a>) -> Parts<'a> {
+        parts.trained("actor", &mut self.mean).trained("actor", &mut self.log_std)
+    }
+}

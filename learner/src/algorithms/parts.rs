@@ -1,0 +1,156 @@
+//! An algorithm's state as a list of named parts, by which it is saved and loaded.
+
+use candle_core::{Result, Tensor};
+use quad_policy::{Adam, Ensemble, Gradients, Layout, NoisePredictor, PolicyError, Tensors, Weights, take};
+use quad_policy::{AdamStep, EnsembleShape};
+
+use super::algorithm::Context;
+use super::random::{Purpose, stream};
+
+/// Something that updates change.
+enum Part<'a> {
+    Weights(&'a mut Weights),
+    Adam(&'a mut Adam, Layout),
+    /// A tensor `[]`.
+    Number(&'a mut Tensor),
+    /// The same, which may not be there yet.
+    Maybe(&'a mut Option<Tensor>),
+}
+
+/// Named parts. Names of networks are prefixes of their tensors' names.
+#[derive(Default)]
+pub struct Parts<'a>(Vec<(&'static str, Part<'a>)>);
+
+impl<'a> Parts<'a> {
+    /// The weights of a network.
+    pub(super) fn weights(mut self, name: &'static str, weights: &'a mut Weights) -> Self {
+        self.0.push((name, Part::Weights(weights)));
+        self
+    }
+
+    /// The weights of a network, and its optimiser's moments.
+    pub(super) fn trained<N: Network>(mut self, name: &'static str, trained: &'a mut Trained<N>) -> Self {
+        let Trained { network, adam } = trained;
+        self.0.push((name, Part::Adam(adam, network.weights().layout().clone())));
+        self.weights(name, network.weights_mut())
+    }
+
+    /// A tensor `[]`.
+    pub(super) fn number(mut self, name: &'static str, number: &'a mut Tensor) -> Self {
+        self.0.push((name, Part::Number(number)));
+        self
+    }
+
+    /// A tensor `[]` that may not be there yet.
+    pub(super) fn maybe(mut self, name: &'static str, number: &'a mut Option<Tensor>) -> Self {
+        self.0.push((name, Part::Maybe(number)));
+        self
+    }
+
+    /// All tensors by name.
+    ///
+    /// # Errors
+    /// Candle fails.
+    pub fn save(self) -> Result<Tensors> {
+        let mut tensors = Tensors::new();
+        for (name, part) in self.0 {
+            match part {
+                Part::Weights(weights) => tensors.extend(weights.tensors(&format!("{name}."))?),
+                Part::Adam(adam, layout) => tensors.extend(adam.tensors(&layout, &format!("{name}."))?),
+                Part::Number(number) | Part::Maybe(Some(number)) => {
+                    tensors.insert(name.to_owned(), number.reshape(1)?);
+                }
+                Part::Maybe(None) => {}
+            }
+        }
+        Ok(tensors)
+    }
+
+    /// Takes each part's tensors out of `tensors`.
+    ///
+    /// # Errors
+    /// A tensor that is missing or does not fit.
+    pub fn load(self, tensors: &mut Tensors) -> std::result::Result<(), PolicyError> {
+        for (name, part) in self.0 {
+            match part {
+                Part::Weights(weights) => weights.load(tensors, &format!("{name}."))?,
+                Part::Adam(adam, layout) => adam.load(&layout, tensors, &format!("{name}."))?,
+                Part::Number(number) => {
+                    *number = take(tensors, name.to_owned(), &[1])?.reshape(())?.to_device(number.device())?;
+                }
+                Part::Maybe(number) if tensors.contains_key(name) => {
+                    *number = Some(take(tensors, name.to_owned(), &[1])?.reshape(())?);
+                }
+                Part::Maybe(number) => *number = None,
+            }
+        }
+        Ok(())
+    }
+}
+
+/// What has weights.
+pub(super) trait Network {
+    fn weights(&self) -> &Weights;
+    fn weights_mut(&mut self) -> &mut Weights;
+}
+
+macro_rules! network {
+    ($type:ty) => {
+        impl Network for $type {
+            fn weights(&self) -> &Weights {
+                <$type>::weights(self)
+            }
+
+            fn weights_mut(&mut self) -> &mut Weights {
+                <$type>::weights_mut(self)
+            }
+        }
+    };
+}
+network!(Ensemble);
+network!(NoisePredictor);
+
+impl Network for Weights {
+    fn weights(&self) -> &Weights {
+        self
+    }
+
+    fn weights_mut(&mut self) -> &mut Weights {
+        self
+    }
+}
+
+/// A network with its optimiser.
+pub(super) struct Trained<N> {
+    pub network: N,
+    adam: Adam,
+}
+
+impl<N: Network> Trained<N> {
+    pub fn new(network: N) -> Result<Self> {
+        Ok(Self { adam: Adam::new(network.weights())?, network })
+    }
+
+    /// Moves the network down the loss that `gradients` are of. Gives the gradient's norm before clipping, `[]`.
+    pub fn descend(&mut self, gradients: &Gradients, step: AdamStep) -> Result<Tensor> {
+        self.adam.step(self.network.weights_mut(), gradients, step)
+    }
+
+    /// An optimiser that begins anew.
+    pub fn restart(&mut self) -> Result<()> {
+        self.adam = Adam::new(self.network.weights())?;
+        Ok(())
+    }
+}
+
+/// The trainable weights that network number `network` of a run begins with.
+pub(super) fn initial(layout: &Layout, context: &Context, network: u64) -> Result<Weights> {
+    let mut generator = stream(context.seed, Purpose::Weights, network);
+    Weights::trainable(layout.clone(), &Weights::initial(layout, &mut generator, &context.device)?)
+}
+
+/// An ensemble to be trained, at its beginning.
+pub(super) fn ensemble(shape: EnsembleShape, context: &Context, network: u64) -> Result<Trained<Ensemble>> {
+    let weights = initial(&shape.layout(), context, network)?;
+    Trained::new(Ensemble::new(shape, weights, context.precision))
+}

@@ -1,0 +1,203 @@
+//! K networks of one shape side by side: layers act(x·W + b), differentiable in x, W and b.
+//!
+//! On the CPU a custom operation of candle's runs all layers, cut into (member, tile of rows) and in parallel; the cut does
+//! not depend on the number of threads, so neither do the results. Elsewhere, and with a norm, plain operations do.
+
+use crate::gradient::KeptGradient;
+use crate::layers::Layers;
+use crate::network::{Input, Network, TILE, rows_of, with_workspace};
+use crate::plain;
+use crate::saved::{Lent, Pool, SavedActivations};
+use crate::slices::{has_fast_body, on_cpu, slice};
+use crate::weights::Weights;
+use candle_core::{CpuStorage, CustomOp2, Layout, Result, Shape, Tensor, bail};
+use quad_kernels::activation::Activation;
+use rayon::prelude::*;
+use std::sync::Arc;
+
+/// Networks over some part of a vector of weights.
+#[derive(Clone)]
+pub(crate) struct Mlp {
+    pub layers: Arc<Layers>,
+    pub activation: Activation,
+    /// Before the names of their tensors.
+    prefix: &'static str,
+    saved: Pool<SavedActivations>,
+}
+
+impl Mlp {
+    pub fn new(layers: Layers, activation: Activation, prefix: &'static str) -> Self {
+        Self { layers: Arc::new(layers), activation, prefix, saved: Pool::default() }
+    }
+
+    /// `x [rows, in]`, or `[K, rows, in]` for inputs of each member's own → `[K, rows, out]`.
+    pub fn forward(&self, weights: &Weights, x: &Tensor) -> Result<Tensor> {
+        let (values, layers) = (weights.values(), &self.layers);
+        let fits = match *x.dims() {
+            [rows, inputs] => rows > 0 && inputs == layers.inputs(),
+            [members, rows, inputs] => members == layers.members() && rows > 0 && inputs == layers.inputs(),
+            _ => false,
+        };
+        if !fits {
+            bail!("{} networks of {} numbers got inputs of shape {:?}", layers.members(), layers.inputs(), x.dims());
+        }
+        if !self.is_fast(weights) {
+            return self.plain_forward(weights, x);
+        }
+        let kept = if values.track_op() { weights.kept_gradient().cloned() } else { None };
+        let saved = (values.track_op() || x.track_op()).then(|| self.saved.lend());
+        values.apply_op2(&x.contiguous()?, Operation { mlp: self.clone(), kept, saved, to_input: x.track_op() })
+    }
+
+    /// Whether the fast implementation serves them.
+    pub fn is_fast(&self, weights: &Weights) -> bool {
+        has_fast_body(weights.values().device()) && !self.layers.norm()
+    }
+
+    /// [`Self::forward`] in plain candle operations.
+    pub fn plain_forward(&self, weights: &Weights, x: &Tensor) -> Result<Tensor> {
+        let tensors = weights.layout().split(weights.values(), "")?;
+        let x = if x.rank() == 2 { x.unsqueeze(0)? } else { x.clone() };
+        plain::mlp(&tensors, self.prefix, &self.layers, self.activation, &x)
+    }
+
+    pub fn network<'a>(&'a self, weights: &'a [f32], member: usize) -> Network<'a> {
+        Network { weights, layers: &self.layers, activation: self.activation, member, rounded: None }
+    }
+
+    /// Forward of plain rows, nothing kept: `K × rows × out`.
+    pub fn run(&self, weights: &[f32], x: &[f32], shared: bool, out: &mut [f32]) {
+        let (inputs, outputs) = (self.layers.inputs(), self.layers.outputs());
+        let rows = out.len() / (self.layers.members() * outputs);
+        out.par_chunks_mut(rows * outputs).enumerate().for_each(|(member, out)| {
+            let network = self.network(weights, member);
+            let x = of_member(x, shared, rows * inputs, member);
+            out.par_chunks_mut(TILE * outputs).enumerate().for_each(|(i, out)| {
+                let x = rows_of(x, i * TILE, TILE, inputs);
+                with_workspace(|work| {
+                    work.with_base(x.len() / inputs * network.width(), 0, |base, _, work| {
+                        network.first_part(x, inputs, base);
+                        let shift = network.bias(0);
+                        network.forward(Input { base, repeat: 1, shift, actions: &[], kernel: &[] }, work, out);
+                    });
+                });
+            });
+        });
+    }
+}
+
+/// A member's inputs: all have the same where these are shared.
+fn of_member(x: &[f32], shared: bool, len: usize, member: usize) -> &[f32] {
+    if shared { x } else { &x[member * len..][..len] }
+}
+
+/// The custom operation of (weights, inputs).
+struct Operation {
+    mlp: Mlp,
+    /// Where the weights' gradient is left, if there is to be one.
+    kept: Option<Arc<KeptGradient>>,
+    /// What the forward pass keeps for the backward pass, if there is to be one.
+    saved: Option<Lent<SavedActivations>>,
+    /// Whether the inputs are to get a gradient.
+    to_input: bool,
+}
+
+impl Operation {
+    fn forward_saving(
+        &self,
+        weights: &[f32],
+        (x, shared): (&[f32], bool),
+        lent: &Lent<SavedActivations>,
+        out: &mut [f32],
+    ) {
+        let layers = &self.mlp.layers;
+        let rows = out.len() / (layers.members() * layers.outputs());
+        let mut saved = lent.lock();
+        saved.resize(layers, rows);
+        saved.tiles(out).into_par_iter().for_each(|mut tile| {
+            let x = of_member(x, shared, rows * layers.inputs(), tile.member);
+            let x = rows_of(x, tile.index * TILE, TILE, layers.inputs());
+            let network = self.mlp.network(weights, tile.member);
+            with_workspace(|work| network.forward_saving(x, &mut tile.activations, work, tile.out));
+        });
+    }
+
+    /// Leaves the weights' gradient where it is kept, and gives that of the inputs, if there is to be one.
+    fn backward(
+        &self,
+        weights: &[f32],
+        (x, shared): (&[f32], bool),
+        gradient: &[f32],
+        saved: &mut SavedActivations,
+    ) -> Result<Option<Vec<f32>>> {
+        let layers = &self.mlp.layers;
+        let (members, inputs) = (layers.members(), layers.inputs());
+        let rows = gradient.len() / (members * layers.outputs());
+        // The copy is cut up; the other is read as a whole.
+        saved.tiles(&mut gradient.to_vec()).into_par_iter().for_each(|mut tile| {
+            let network = self.mlp.network(weights, tile.member);
+            with_workspace(|work| network.backward(tile.out, &mut tile.activations.slope, work));
+        });
+        if let Some(kept) = &self.kept {
+            let input = |member| of_member(x, shared, rows * inputs, member);
+            kept.write(layers.range(), |out| saved.weight_gradients(layers.split_mut(out), input, gradient))?;
+        }
+        if !self.to_input {
+            return Ok(None);
+        }
+        let mut of_members = vec![0.0; members * rows * inputs];
+        of_members.par_chunks_mut(rows * inputs).enumerate().for_each(|(member, out)| {
+            self.mlp.network(weights, member).input_gradient(saved.first_delta(member), (0, inputs), out);
+        });
+        if shared {
+            let (sum, others) = of_members.split_at_mut(rows * inputs);
+            for other in others.chunks_exact(rows * inputs) {
+                sum.iter_mut().zip(other).for_each(|(sum, x)| *sum += x);
+            }
+            of_members.truncate(rows * inputs);
+        }
+        Ok(Some(of_members))
+    }
+}
+
+impl CustomOp2 for Operation {
+    fn name(&self) -> &'static str {
+        "mlp"
+    }
+
+    fn cpu_fwd(
+        &self,
+        weights: &CpuStorage,
+        weights_layout: &Layout,
+        x: &CpuStorage,
+        x_layout: &Layout,
+    ) -> Result<(CpuStorage, Shape)> {
+        let (weights, x) = (slice(weights, weights_layout)?, slice(x, x_layout)?);
+        let (members, outputs) = (self.mlp.layers.members(), self.mlp.layers.outputs());
+        let (shared, rows) = (x_layout.dims().len() == 2, x_layout.dims()[x_layout.dims().len() - 2]);
+        let mut out = vec![0.0; members * rows * outputs];
+        match &self.saved {
+            Some(saved) => self.forward_saving(weights, (x, shared), saved, &mut out),
+            None => self.mlp.run(weights, x, shared, &mut out),
+        }
+        Ok((CpuStorage::F32(out), (members, rows, outputs).into()))
+    }
+
+    fn bwd(
+        &self,
+        weights: &Tensor,
+        x: &Tensor,
+        _: &Tensor,
+        gradient: &Tensor,
+    ) -> Result<(Option<Tensor>, Option<Tensor>)> {
+        let Some(saved) = &self.saved else { return Ok((None, None)) };
+        let (x, gradient) = (x.contiguous()?, gradient.contiguous()?);
+        let of_input = {
+            let held = [weights, &x, &gradient].map(Tensor::storage_and_layout);
+            let [w, input, g] = held.each_ref().map(|(storage, layout)| on_cpu(storage, layout));
+            self.backward(w?, (input?, x.rank() == 2), g?, &mut saved.lock())?
+        };
+        let of_input = of_input.map(|numbers| Tensor::from_vec(numbers, x.shape(), x.device())).transpose()?;
+        Ok((None, of_input))
+    }
+}
