@@ -25,7 +25,7 @@ VARIANTS = ("align-iql",)
 
 
 def make_config(variant, size):
-    networks = implicit.value_networks(size) | {"actor": shape([HIDDEN[size]] * 3)}
+    networks = implicit.value_networks(size) | {"actor": shape([HIDDEN[size]] * 3, "silu")}
     return implicit.make_config("align-iql", size, networks | AGENT | RATES)
 
 

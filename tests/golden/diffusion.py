@@ -15,7 +15,7 @@ def predict_noise(actor, states, noisy_actions, t, activation):
     frequencies = jnp.exp(-jnp.arange(8) * math.log(10_000) / 7)
     angles = t[..., None] * frequencies
     features = jnp.concatenate([jnp.cos(angles), jnp.sin(angles)], -1)
-    time = mlp(actor, "time.", activation, features)
+    time = mlp(actor, "time.", "mish", features)
     return mlp(actor, "trunk.", activation, jnp.concatenate([states, noisy_actions, time], -1))
 
 

@@ -10,6 +10,7 @@ use quad_dataset::{EnvironmentSpec, environment};
 use quad_service::parse_endpoint;
 
 use crate::config::{hyperparameters, presets, tasks};
+use crate::report::Select;
 
 pub use train::TrainArgs;
 
@@ -130,6 +131,9 @@ pub struct ReportArgs {
     /// Print the summaries as Markdown
     #[arg(long, conflicts_with = "json")]
     pub markdown: bool,
+    /// Which evaluations of a run are its score
+    #[arg(long, value_enum, default_value = "last")]
+    pub select: Select,
     /// Also draw the learning curves of all the folders into one SVG file
     #[arg(long, value_name = "FILE")]
     pub plot: Option<PathBuf>,

@@ -67,7 +67,7 @@ fn report(args: &ReportArgs) -> anyhow::Result<()> {
     // What else lies beside runs, where a user writes `runs/*`, does not keep them from being read.
     let (runs, others): (Vec<_>, Vec<_>) = args.dirs.iter().cloned().partition(|dir| RunDir::is_occupied(dir));
     let dirs = if runs.is_empty() { &args.dirs } else { &runs };
-    let report = Report::read(dirs)?;
+    let report = Report::read(dirs, args.select)?;
     for other in &others {
         warn!("there is no run in {}", other.display());
     }

@@ -6,16 +6,20 @@ use quad_dataset::catalogue::{self, Checksum};
 
 use super::published::{self, SEEDS};
 use super::run::RunReport;
+use super::selection::Select;
 use crate::config::settings::{self, Settings, differences};
 use crate::config::{self, Experiment, hyperparameters, tasks};
 
 /// Of runs that differ in their seed alone. `scored_in` is the precision of their scores.
-pub fn departures(runs: &[&RunReport], scored_in: &str) -> Vec<String> {
+pub fn departures(runs: &[&RunReport], scored_in: &str, select: Select) -> Vec<String> {
     let Some(run) = runs.first() else { return Vec::new() };
     let ours = &run.config.experiment;
     let Ok(task) = tasks::named(&run.task) else { return Vec::new() };
     let Ok(paper) = as_published(run) else { return Vec::new() };
     let mut departures = Vec::new();
+    if select == Select::Best {
+        departures.push("the best evaluation of each run, not the mean of its last five".to_owned());
+    }
     departures.extend(ours.definition().and_then(|known| hyperparameters::not_given(&known, task)).ok().flatten());
     if !is_trained_on(run, paper.dataset.as_deref()) {
         let name = |dataset: &Option<String>| dataset.clone().unwrap_or_else(|| "not named".to_owned());

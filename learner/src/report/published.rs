@@ -17,6 +17,17 @@ pub struct Published {
     pub score: Printed,
     /// Where it stands.
     pub source: &'static str,
+    /// What the figure does not show.
+    pub remarks: Vec<Remark>,
+}
+
+/// What is known to be wrong or peculiar of a figure.
+#[derive(Clone, Debug, PartialEq, Serialize)]
+pub struct Remark {
+    /// What it is, in words.
+    pub reason: String,
+    /// Whether the figure is the best of several, by the very returns that it reports.
+    pub selected: bool,
 }
 
 /// A figure as it is printed.
@@ -34,6 +45,7 @@ struct Tables {
     method: Vec<Method>,
     /// By task and method: the mean, and where there is one the deviation.
     scores: BTreeMap<String, BTreeMap<String, Vec<f64>>>,
+    remark: Vec<KnownRemark>,
 }
 
 #[derive(Deserialize)]
@@ -46,6 +58,36 @@ struct Method {
     variant: Option<String>,
 }
 
+/// A remark on figures of some methods.
+#[derive(Deserialize)]
+#[serde(deny_unknown_fields)]
+struct KnownRemark {
+    methods: Vec<String>,
+    /// How the names of its tasks begin; empty: any task.
+    #[serde(default)]
+    tasks: Vec<String>,
+    /// By task, the figure with which the reason ends; empty: it ends with none.
+    #[serde(default)]
+    instead: BTreeMap<String, f64>,
+    reason: String,
+    #[serde(default)]
+    selected: bool,
+}
+
+impl KnownRemark {
+    /// The remark, if it is about this figure.
+    fn on(&self, method: &str, task: &str) -> Option<Remark> {
+        let is_of_task = match (self.tasks.is_empty(), self.instead.is_empty()) {
+            (true, true) => true,
+            (true, false) => self.instead.contains_key(task),
+            (false, _) => self.tasks.iter().any(|start| task.starts_with(start)),
+        };
+        let instead = self.instead.get(task).map(|figure| format!(" {figure:.1}")).unwrap_or_default();
+        let is_on = is_of_task && self.methods.iter().any(|known| known == method);
+        is_on.then(|| Remark { reason: format!("{}{instead}", self.reason), selected: self.selected })
+    }
+}
+
 #[allow(clippy::expect_used)] // The tables are part of the program; the test here reads them.
 static TABLES: LazyLock<Tables> =
     LazyLock::new(|| toml::from_str(include_str!("../../published.toml")).expect("the embedded tables are valid"));
@@ -56,7 +98,8 @@ pub fn scores(task: &str) -> Vec<Published> {
     let published = |method: &'static Method| {
         let figures = scores?.get(&method.name)?;
         let score = Printed { mean: *figures.first()?, std: figures.get(1).copied() };
-        Some(Published { method: &method.name, score, source: &method.source })
+        let remarks = TABLES.remark.iter().filter_map(|known| known.on(&method.name, task)).collect();
+        Some(Published { method: &method.name, score, source: &method.source, remarks })
     };
     TABLES.method.iter().filter_map(published).collect()
 }

@@ -149,6 +149,12 @@ impl RunReport {
         self.missing.is_empty()
     }
 
+    /// Its complete evaluation with the largest score.
+    pub fn best(&self) -> Option<&EvaluationReport> {
+        let complete = self.evaluations.iter().filter(|evaluation| evaluation.complete);
+        complete.max_by(|one, other| one.score.mean.total_cmp(&other.score.mean))
+    }
+
     /// How many of the planned evaluations have all their scores.
     pub fn evaluations_complete(&self) -> usize {
         self.evaluations_planned() - self.missing.len()

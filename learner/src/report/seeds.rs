@@ -8,6 +8,7 @@ use serde::Serialize;
 use super::departures::departures;
 use super::published::{self, Published};
 use super::run::{RunReport, joined};
+use super::selection::Select;
 use super::spread::Spread;
 use crate::config::Device;
 use crate::config::settings::{self, Settings, differences};
@@ -44,6 +45,9 @@ pub struct GroupReport {
     pub mean_last_5: Option<Spread>,
     /// The same of `mean_last_50000_steps`.
     pub mean_last_50000_steps: Option<Spread>,
+    /// The score of each run's best evaluation, over the runs; absent unless that is what counts.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub best: Option<Spread>,
     /// Runs that are counted although evaluations of them are missing, each with how many there are.
     pub unfinished: Vec<String>,
     /// Runs that are not counted, each with the reason.
@@ -83,7 +87,7 @@ impl GroupReport {
 }
 
 /// Sorts runs into groups, in the order in which they are given.
-pub fn groups(runs: &[RunReport]) -> Vec<GroupReport> {
+pub fn groups(runs: &[RunReport], select: Select) -> Vec<GroupReport> {
     let mut groups: Vec<(Settings, Vec<&RunReport>)> = Vec::new();
     for run in runs {
         let mut settings = settings::of_run(&run.config);
@@ -102,10 +106,10 @@ pub fn groups(runs: &[RunReport]) -> Vec<GroupReport> {
         let value = |key: &String| own.get(key).map_or_else(|| format!("no {key}"), |value| format!("{key} = {value}"));
         keys.into_iter().map(value).collect()
     };
-    groups.iter().enumerate().map(|(index, (_, runs))| group(runs, differs(index))).collect()
+    groups.iter().enumerate().map(|(index, (_, runs))| group(runs, differs(index), select)).collect()
 }
 
-fn group(runs: &[&RunReport], differs: Vec<String>) -> GroupReport {
+fn group(runs: &[&RunReport], differs: Vec<String>, select: Select) -> GroupReport {
     let mut counted: Vec<&RunReport> = Vec::new();
     let mut left_out = Vec::new();
     for run in runs {
@@ -142,10 +146,11 @@ fn group(runs: &[&RunReport], differs: Vec<String>) -> GroupReport {
         mean_last_3: over(|run| run.mean_last_3),
         mean_last_5: over(|run| run.mean_last_5),
         mean_last_50000_steps: over(|run| run.mean_last_50000_steps),
+        best: over(|run| run.best().map(|best| best.score.mean)).filter(|_| select == Select::Best),
         unfinished: unfinished.map(|run| format!("in {} {}", run.dir.display(), run.how_complete())).collect(),
         left_out,
         differs,
-        departures: if published.is_empty() { Vec::new() } else { departures(&counted, &scored_in) },
+        departures: if published.is_empty() { Vec::new() } else { departures(&counted, &scored_in, select) },
         scored_in,
         published,
     }

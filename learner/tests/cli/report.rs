@@ -16,13 +16,17 @@ struct Reported {
 }
 
 fn report(runs: &[Run]) -> Reported {
+    report_with(runs, &[])
+}
+
+fn report_with(runs: &[Run], flags: &[&str]) -> Reported {
     let folder = tempfile::tempdir().unwrap();
     let paths: Vec<_> = ('a'..='z').take(runs.len()).map(|name| folder.path().join(name.to_string())).collect();
     runs.iter().zip(&paths).for_each(|(run, path)| run.write(path));
     let picture = folder.path().join("curve.svg");
-    let print = |flags: &[&str]| {
+    let print = |form: &[&str]| {
         let paths = paths.iter().map(|path| path.to_str().unwrap());
-        printed(&["report"].into_iter().chain(paths).chain(flags.iter().copied()).collect::<Vec<_>>())
+        printed(&["report"].into_iter().chain(paths).chain(flags.iter().chain(form).copied()).collect::<Vec<_>>())
     };
     let json = serde_json::from_str(&print(&["--json", "--plot", picture.to_str().unwrap()])).unwrap();
     Reported { json, text: print(&[]), markdown: print(&["--markdown"]), picture: fs::read_to_string(picture).unwrap() }
@@ -185,6 +189,39 @@ fn the_papers_protocol_stands_beside_the_papers_figures() {
     reported.has_row(&["DAC's code", "divides by the number of seeds n"]);
     assert!(!reported.text.contains("Not the paper's"), "{}", reported.text);
     assert!(reported.markdown.contains("\n| --- |"), "{}", reported.markdown);
+}
+
+#[test]
+fn what_is_known_of_the_papers_figures_stands_below_them() {
+    let reported = report(&paper("antmaze-large-diverse-v0", 20_000, |_| 50.0));
+    let published = reported.group()["published"].as_array().unwrap();
+    let of = |method: &str| published.iter().find(|figure| figure["method"] == method).unwrap();
+    assert_eq!((&of("QUAD")["remarks"], &of("DQL")["remarks"][0]["selected"]), (&json!([]), &json!(true)));
+    reported.has_row(&["AlignIQL", " 54.0 bcd "]);
+    reported.has_row(&["DTQL", " 66.4 de "]);
+    reported.says(&["\n- a (DQL): selected by test returns: most likely the best of a run's"]);
+    reported.has_row(&["- d (AlignIQL, DTQL): AlignIQL's and DTQL's most likely changed places"]);
+    reported.has_row(&["CQL", " 14.9 h "]);
+    reported.has_row(&["- h (CQL): ", "CORL", " 20.5"]);
+}
+
+#[test]
+fn the_best_evaluation_counts_only_where_it_is_asked_for_and_the_report_says_so() {
+    // Of seed s the best evaluation has 1000 + s, at 20,000 steps.
+    let runs = paper(HOPPER, 200_000, |step| if step == 20_000 { 1000.0 } else { 50.0 });
+    let [last, best] = [&[][..], &["--select", "best"]].map(|flags| report_with(&runs, flags));
+    assert_eq!((&last.json["select"], &last.group()["best"]), (&json!("last"), &Value::Null));
+    assert_eq!((&best.json["select"], &best.group()["best"]["mean"]), (&json!("best"), &json!(1001.5)));
+    assert_eq!(best.group()["departures"][0], "the best evaluation of each run, not the mean of its last five");
+    let reasons = ["Selected: of each run its best complete evaluation counts", "it is optimistic"];
+    best.says(&reasons);
+    best.says(&["such selection stands behind those of DQL, EQL, Onestep-RL, as far as is known"]);
+    best.has_row(&["task", "best evaluation"]);
+    best.has_row(&["ours: quad", " 1001.50 ", "best evaluation of each run; 4 seeds"]);
+    assert!(best.text.contains("mean score of the best evaluation, after 20000 steps: 1003.00"), "{}", best.text);
+    for words in reasons.into_iter().chain(["1001.50", "such selection", "after 20000 steps"]) {
+        assert!(!last.text.contains(words) && !last.markdown.contains(words), "{words} in\n{}", last.text);
+    }
 }
 
 #[test]

@@ -38,3 +38,30 @@ fn every_score_has_a_method_and_the_papers_own_has_a_deviation() {
         assert!(published[0].method == "QUAD" && published[0].score.std.is_some(), "{preset}");
     }
 }
+
+#[test]
+fn every_remark_is_on_a_figure_and_says_something_else_than_it() {
+    for known in &TABLES.remark {
+        for method in &known.methods {
+            let figures = TABLES.scores.iter().filter(|(_, scores)| scores.contains_key(method));
+            assert!(figures.clone().any(|(task, _)| known.on(method, task).is_some()), "{method}: {}", known.reason);
+            for (task, instead) in &known.instead {
+                let printed = TABLES.scores.get(task).and_then(|scores| scores.get(method)?.first());
+                assert!(printed.is_some_and(|printed| printed != instead), "{method}, {task}: {instead}");
+            }
+        }
+    }
+}
+
+/// Each is a line below a table, and has a letter there.
+#[test]
+fn the_remarks_of_a_task_are_few_and_short() {
+    for task in TABLES.scores.keys() {
+        let remarks: Vec<_> = scores(task).into_iter().flat_map(|published| published.remarks).collect();
+        assert!((3..=12).contains(&remarks.len()), "{task}: {}", remarks.len());
+        assert!(remarks.iter().any(|remark| remark.selected), "{task}");
+        for Remark { reason, .. } in remarks {
+            assert!(reason.len() < 130 && !reason.ends_with('.') && !reason.contains('\n'), "{reason}");
+        }
+    }
+}
