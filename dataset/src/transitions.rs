@@ -233,6 +233,8 @@ impl Transitions {
         let (o, a) = (self.observation_dim, self.action_dim);
         batch.clear();
         batch.size = indices.len();
+        batch.observations.reserve(batch.size * o);
+        batch.next_observations.reserve(batch.size * o);
         for &index in indices {
             let row = self.rows[index as usize] as usize;
             batch.observations.extend_from_slice(&self.observations[row * o..(row + 1) * o]);
