@@ -209,6 +209,11 @@ pub(super) fn smaller(values: &Tensor) -> Result<Tensor> {
     values.min(0)? + (values.sum(0)? * 0.0)?
 }
 
+/// The largest along a dimension, which is no more. (A maximum would drop a NaN; zero times the sum does not.)
+pub(super) fn largest(values: &Tensor, dimension: usize) -> Result<Tensor> {
+    values.max(dimension)? + (values.sum(dimension)? * 0.0)?
+}
+
 /// Tensors `[]` as numbers; from a GPU in one copy, because each copy waits for the GPU.
 pub(super) fn numbers(x: &[&Tensor]) -> Result<Vec<f32>> {
     match x.iter().all(|x| x.device().is_cpu()) {

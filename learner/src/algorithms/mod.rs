@@ -4,6 +4,8 @@
 //! [`ALGORITHMS`] and its values for each task in `presets/`.
 
 mod algorithm;
+mod diffusion;
+mod dql;
 mod gaussian;
 mod hyperparameters;
 mod iql;
@@ -15,7 +17,7 @@ pub use algorithm::{AgentError, Algorithm, AlgorithmError, Context, Definition, 
 pub use parts::Parts;
 
 /// All algorithms, the one that learns unless another is asked for first.
-pub const ALGORITHMS: [Definition; 2] = [quad::DEFINITION, iql::DEFINITION];
+pub const ALGORITHMS: [Definition; 3] = [quad::DEFINITION, iql::DEFINITION, dql::DEFINITION];
 
 /// The algorithm of that name.
 pub fn named(name: &str) -> Option<Definition> {
