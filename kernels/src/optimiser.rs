@@ -33,6 +33,8 @@ struct Update {
     scale: f32,
     /// Learning rate over the first moment's bias correction.
     rate: f32,
+    /// Of the parameters themselves.
+    decay: f32,
     /// 1/sqrt of the second moment's bias correction.
     correction: f32,
 }
@@ -46,7 +48,8 @@ fn adam_chunk(update: Update, parameters: &mut [f32], first: &mut [f32], second:
         let g = g * update.scale;
         *m = OLD[0] * *m + NEW[0] * g;
         *v = OLD[1] * *v + NEW[1] * g * g;
-        *p -= update.rate * *m / (v.sqrt() * update.correction + EPSILON);
+        // In one subtraction: a decay by itself would be too small a part of the parameter to change it.
+        *p -= update.rate * *m / (v.sqrt() * update.correction + EPSILON) + update.decay * *p;
     }
 }
 
@@ -82,19 +85,20 @@ pub fn norm(x: &[f32]) -> f32 {
 }
 
 /// Adam's step number `count`, from 1, along a gradient g that is first multiplied by `scale`:
-/// m = β1·m + (1 - β1)·g, v = β2·v + (1 - β2)·g², p -= rate · m/(1 - β1^count) / (√(v/(1 - β2^count)) + ε).
+/// m = β1·m + (1 - β1)·g, v = β2·v + (1 - β2)·g², p -= rate · m/(1 - β1^count) / (√(v/(1 - β2^count)) + ε) + rate·decay·p.
 pub fn adam(
     parameters: &mut [f32],
     (first, second): (&mut [f32], &mut [f32]),
     gradient: &[f32],
     scale: f32,
-    rate: f32,
+    (rate, decay): (f32, f32),
     count: u64,
 ) {
     let count = count as f64;
     let update = Update {
         scale,
         rate: (f64::from(rate) / (1.0 - BETA1.powf(count))) as f32,
+        decay: rate * decay,
         correction: (1.0 / (1.0 - BETA2.powf(count)).sqrt()) as f32,
     };
     parameters

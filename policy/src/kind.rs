@@ -119,6 +119,7 @@ fn check_header(file: &[u8]) -> Result<(), PolicyError> {
 mod tests {
     use super::*;
     use crate::ensemble::Ensemble;
+    use crate::shape::MlpConfig;
     use crate::weights::Weights;
     use candle_core::{DType, Tensor};
     use std::fmt::Write;
@@ -153,7 +154,8 @@ mod tests {
     }
     /// The file of a Gaussian policy that is from `origin`.
     fn gaussian(origin: &str) -> Vec<u8> {
-        let shape = GaussianShape { observation_dim: 3, action_dim: 1, hidden: 4 };
+        let actor = MlpConfig { hidden: vec![4], ..MlpConfig::default() };
+        let shape = GaussianShape { observation_dim: 3, action_dim: 1, actor };
         let layout = shape.actor().layout();
         let values = Tensor::zeros(layout.count(), DType::F32, &Device::Cpu).unwrap();
         let actor = Ensemble::new(shape.actor(), Weights::constant(layout, values), Precision::F32);
@@ -168,7 +170,9 @@ mod tests {
         let header = Header::<String>::read(&file).unwrap();
         assert_eq!(header.origin, "\"a run\"");
         let json = serde_json::to_string(&header.policy).unwrap();
-        assert_eq!(json, r#"{"kind":"gaussian","shape":{"observation_dim":3,"action_dim":1,"hidden":4}}"#);
+        let actor = r#"{"hidden":[4],"activation":"mish","norm":false,"initial":"xavier"}"#;
+        let shape = format!(r#"{{"observation_dim":3,"action_dim":1,"actor":{actor}}}"#);
+        assert_eq!(json, format!(r#"{{"kind":"gaussian","shape":{shape}}}"#));
         let newer = json.replace("hidden", "width");
         assert!(serde_json::from_str::<PolicyConfig>(&newer).is_err(), "what is not known is not ignored");
         let tensor = Tensor::zeros(1, DType::F32, &Device::Cpu).unwrap();

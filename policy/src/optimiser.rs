@@ -7,10 +7,13 @@ use crate::weights::{Layout, Tensors, Weights};
 use candle_core::{DType, Result, Tensor};
 use quad_kernels::optimiser::{BETA1, BETA2, EPSILON, adam, norm};
 
-/// Adam (Kingma and Ba 2015), with β = (0.9, 0.999) and ε = 1e-8, for the weights of one network.
+/// Adam (Kingma and Ba 2015), with β = (0.9, 0.999) and ε = 1e-8, for the weights of one network; with a weight decay it is
+/// AdamW (Loshchilov and Hutter 2019).
 pub struct Adam {
     /// Running means of the gradient and of its square, `[2, P]`.
     moments: Tensor,
+    /// What each step takes off the weights, relative to them and to its rate.
+    decay: f32,
 }
 
 /// One step's numbers.
@@ -27,8 +30,13 @@ pub struct AdamStep {
 impl Adam {
     /// For weights that have not moved yet.
     pub fn new(weights: &Weights) -> Result<Self> {
+        Self::decaying(weights, 0.0)
+    }
+
+    /// The same with a weight decay.
+    pub fn decaying(weights: &Weights, decay: f32) -> Result<Self> {
         let values = weights.values();
-        Ok(Self { moments: Tensor::zeros((2, values.elem_count()), DType::F32, values.device())? })
+        Ok(Self { moments: Tensor::zeros((2, values.elem_count()), DType::F32, values.device())?, decay })
     }
 
     /// Moves the weights down the loss that `gradients` are of. Gives the gradient's norm before clipping, `[]`.
@@ -49,12 +57,12 @@ impl Adam {
         let len = gradient.elem_count();
         let size = read(gradient, norm)?;
         let scale = step.clip.map_or(1.0, |clip| (clip / size).min(1.0));
-        let AdamStep { rate, count, .. } = step;
+        let (rates, count) = ((step.rate, self.decay), step.count);
         read(gradient, |gradient: &[f32]| {
             modify(&self.moments, |moments| {
                 let moments = moments.split_at_mut(len);
                 weights
-                    .change(|weights| modify(weights, |weights| adam(weights, moments, gradient, scale, rate, count)))
+                    .change(|weights| modify(weights, |weights| adam(weights, moments, gradient, scale, rates, count)))
             })
         })???;
         Tensor::new(size, gradient.device())
@@ -70,7 +78,12 @@ impl Adam {
         let second = ((self.moments.get(1)? * BETA2)? + (gradient.sqr()? * (1.0 - BETA2))?)?;
         let unbiased = (&first / (1.0 - BETA1.powf(step.count as f64)))?;
         let deviation = (&second / (1.0 - BETA2.powf(step.count as f64)))?.sqrt()?;
-        let change = ((unbiased / (deviation + f64::from(EPSILON))?)? * f64::from(step.rate))?;
+        let change = (unbiased / (deviation + f64::from(EPSILON))?)?;
+        let change = match self.decay {
+            0.0 => change,
+            decay => (change + (weights.values().detach() * f64::from(decay))?)?,
+        };
+        let change = (change * f64::from(step.rate))?;
         self.moments = Tensor::stack(&[first, second], 0)?;
         weights.change(|weights| weights.slice_set(&(weights - change)?, 0, 0))?;
         Ok(size)
@@ -133,9 +146,10 @@ mod tests {
     #[test]
     fn both_implementations_of_adam_and_the_ema_do_what_they_should() {
         let mut generator = ChaCha8Rng::seed_from_u64(1);
-        for clip in [None, Some(0.3), Some(1e6)] {
+        for (clip, decay) in [(None, 0.0), (Some(0.3), 0.0), (Some(1e6), 0.0), (None, 0.5)] {
             let [mut fast, mut plain] = [weights(), weights()];
-            let [mut fast_adam, mut plain_adam] = [Adam::new(&fast).unwrap(), Adam::new(&plain).unwrap()];
+            let [mut fast_adam, mut plain_adam] =
+                [&fast, &plain].map(|weights| Adam::decaying(weights, decay).unwrap());
             let mut target = fast.copy().unwrap();
             let before = target.values().copy().unwrap();
             for count in 1..4 {

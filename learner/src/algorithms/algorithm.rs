@@ -24,8 +24,11 @@ pub struct Definition {
     /// Checks its hyper-parameters, the `[agent]` table of a preset.
     pub check: fn(&toml::Table) -> std::result::Result<(), AgentError>,
     /// The algorithm at step 0, of such a table.
-    pub start: fn(&toml::Table, Context) -> std::result::Result<Box<dyn Algorithm>, AlgorithmError>,
+    pub start: fn(&toml::Table, Context) -> Started,
 }
+
+/// An algorithm, or why it cannot start.
+pub type Started = std::result::Result<Box<dyn Algorithm>, AlgorithmError>;
 
 /// A number that an update measures. Gauges, `metrics.jsonl`, the progress display and docs/metrics.md derive from it.
 #[derive(Clone, Copy, Debug)]
@@ -207,6 +210,11 @@ pub(super) fn check(
 /// The smaller of the critics' values, `[K, B]` → `[B]`. (A minimum would drop a NaN; zero times the sum does not.)
 pub(super) fn smaller(values: &Tensor) -> Result<Tensor> {
     values.min(0)? + (values.sum(0)? * 0.0)?
+}
+
+/// The largest along a dimension, which is no more. (A maximum would drop a NaN; zero times the sum does not.)
+pub(super) fn largest(values: &Tensor, dimension: usize) -> Result<Tensor> {
+    values.max(dimension)? + (values.sum(dimension)? * 0.0)?
 }
 
 /// Tensors `[]` as numbers; from a GPU in one copy, because each copy waits for the GPU.

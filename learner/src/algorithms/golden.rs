@@ -5,11 +5,15 @@ mod reader;
 
 use std::sync::Arc;
 
-use super::algorithm::{Algorithm, Context, Definition, Metric, Minibatch};
+use super::algorithm::{Algorithm, Context, Definition, Metric, Minibatch, smaller};
+use super::diffusion::Denoising;
 use super::parts::Parts;
 use candle_core::{Device, Tensor};
 use quad_dataset::{Arrays, Transitions};
-use quad_policy::{Header, Precision, Tensors, load_policy};
+use quad_policy::{
+    Choice, Ensemble, Header, Layout, NoisePredictor, PolicyConfig, Precision, Tensors, Weights, load_policy,
+    read_tensors,
+};
 pub(super) use reader::{Golden, fresh, goldens, make};
 
 /// Where updates are tested: on the CPU, and on a GPU with the feature `cuda`. Without a GPU that share is skipped,
@@ -79,6 +83,17 @@ pub(super) fn table(golden: &Golden) -> toml::Table {
     toml::Table::try_from(&golden.config["agent"]).unwrap()
 }
 
+/// The noise of sampled actions, `[T, states, samples, a]` in a golden folder, one row for each action.
+pub(super) fn chain_noise(golden: &Golden, name: &str, device: &Device) -> Tensor {
+    golden.input(name, device).flatten(1, golden.inputs[name].rank() - 2).unwrap()
+}
+
+/// How a golden folder makes the actions of its batch noisy.
+pub(super) fn denoising(golden: &Golden, device: &Device) -> Denoising {
+    let t: Vec<i64> = golden.inputs["t"].to_vec1().unwrap();
+    Denoising { t: t.into_iter().map(|t| t as u32).collect(), epsilon: golden.input("epsilon", device) }
+}
+
 /// The batch of a golden folder.
 pub(super) fn batch(golden: &Golden, context: &Context) -> Minibatch {
     context.batch(&items(golden)).unwrap()
@@ -112,4 +127,40 @@ pub(super) fn check_actions(golden: &Golden, algorithm: &dyn Algorithm) {
     let mut actions = vec![0.0; states.len() * policy.action_dim()];
     policy.act(&observations, &mut states, &mut actions).unwrap();
     golden.close("select.actions", &Tensor::new(actions, &Device::Cpu).unwrap());
+}
+
+/// What a published diffusion policy makes of a golden folder's states and noise.
+pub(super) struct Drawn {
+    pub choice: Choice,
+    /// Candidates, `[states · N_a, a]`.
+    pub candidates: Tensor,
+    /// The smaller of the critics' values of each, `[states, N_a]`.
+    pub q: Tensor,
+    /// V of each state, if the policy has it, `[states]`.
+    pub v: Option<Tensor>,
+}
+
+/// Checks that the networks of a published diffusion policy draw and value candidates as a golden folder expects.
+pub(super) fn check_candidates(golden: &Golden, algorithm: &dyn Algorithm) -> Drawn {
+    let (policy, tensors) = algorithm.policy().unwrap();
+    let file = Header { policy: policy.clone(), origin: () }.to_safetensors(&tensors).unwrap();
+    load_policy(&file, Precision::F32).unwrap();
+    let PolicyConfig::Diffusion { shape, choice } = policy else { panic!("{policy:?}") };
+    let mut tensors = read_tensors(&file).unwrap();
+    let mut weights = |layout: Layout, prefix: &str| {
+        let values = layout.join(&mut tensors, prefix).unwrap();
+        Weights::constant(layout, values)
+    };
+    let actor = NoisePredictor::new(shape.actor(), weights(shape.actor().layout(), "actor."), Precision::F32);
+    let critics = Ensemble::new(shape.critics(), weights(shape.critics().layout(), "critic."), Precision::F32);
+    let value = shape.value().map(|of| Ensemble::new(of.clone(), weights(of.layout(), "value."), Precision::F32));
+
+    let observations = golden.input("select_observations", &Device::Cpu);
+    let candidates = actor.sample(&observations, &chain_noise(golden, "select_noise", &Device::Cpu)).unwrap();
+    let q = smaller(&critics.values(&observations, &candidates).unwrap()).unwrap();
+    golden.close("select.candidates", &candidates);
+    golden.close("select.q", &q);
+    let q = q.reshape((observations.dim(0).unwrap(), ())).unwrap();
+    let v = value.map(|value| value.state_values(&observations).unwrap().squeeze(0).unwrap());
+    Drawn { choice, candidates, q, v }
 }

@@ -12,7 +12,7 @@ use super::algorithm::{
 use super::gaussian::Gaussian;
 use super::hyperparameters::{Positive, Quantile, Rate, Share};
 use super::parts::{Parts, Trained, ensemble};
-use candle_core::{DType, Result};
+use candle_core::{DType, Result, Tensor};
 use quad_policy::{AdamStep, Ensemble, EnsembleShape, Gradients, MlpConfig, PolicyConfig, Tensors, cosine_decay};
 use serde::Deserialize;
 
@@ -125,6 +125,13 @@ impl Iql {
     }
 }
 
+/// Mean of |expectile − 1(u < 0)|·u² (Eq. 5), `[]`: least where u is, by so much, as often above as below 0.
+pub(super) fn expectile_loss(u: &Tensor, expectile: f32) -> Result<Tensor> {
+    let expectile = f64::from(expectile);
+    let side = u.lt(0f32)?.to_dtype(DType::F32)?.affine(1.0 - 2.0 * expectile, expectile)?;
+    (side * u.sqr()?)?.mean_all()
+}
+
 impl Algorithm for Iql {
     fn items(&self) -> usize {
         self.context.transitions.len()
@@ -133,13 +140,11 @@ impl Algorithm for Iql {
     fn update(&mut self, step: u64, items: &[u32]) -> Result<Vec<f32>> {
         let (batch, count) = (self.context.batch(items)?, step + 1);
         let adam = |rate: f32| AdamStep { rate, clip: None, count };
-        let expectile = f64::from(*self.config.expectile);
 
         // V(s) towards an expectile of the smaller Q̂(s, a), Eq. 5.
         let q = smaller(&self.target_critics.values(&batch.observations, &batch.actions)?)?;
         let u = (&q - self.value.network.state_values(&batch.observations)?.squeeze(0)?)?;
-        let side = u.lt(0f32)?.to_dtype(DType::F32)?.affine(1.0 - 2.0 * expectile, expectile)?;
-        let value_loss = (side * u.sqr()?)?.mean_all()?;
+        let value_loss = expectile_loss(&u, *self.config.expectile)?;
         self.value.descend(&Gradients::of(&value_loss)?, adam(*self.config.value_learning_rate))?;
 
         // The policy towards actions of the data, the more so the better they are, Eq. 7.

@@ -4,6 +4,9 @@
 //! [`ALGORITHMS`] and its values for each task in `presets/`.
 
 mod algorithm;
+mod align_iql;
+mod diffusion;
+mod dql;
 mod gaussian;
 mod hyperparameters;
 mod iql;
@@ -15,7 +18,7 @@ pub use algorithm::{AgentError, Algorithm, AlgorithmError, Context, Definition, 
 pub use parts::Parts;
 
 /// All algorithms, the one that learns unless another is asked for first.
-pub const ALGORITHMS: [Definition; 2] = [quad::DEFINITION, iql::DEFINITION];
+pub const ALGORITHMS: [Definition; 4] = [quad::DEFINITION, iql::DEFINITION, align_iql::DEFINITION, dql::DEFINITION];
 
 /// The algorithm of that name.
 pub fn named(name: &str) -> Option<Definition> {

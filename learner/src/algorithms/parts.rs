@@ -146,7 +146,12 @@ pub(super) struct Trained<N> {
 
 impl<N: Network> Trained<N> {
     pub fn new(network: N) -> Result<Self> {
-        Ok(Self { adam: Adam::new(network.weights())?, network })
+        Self::decaying(network, 0.0)
+    }
+
+    /// A network whose weights decay: AdamW.
+    pub fn decaying(network: N, decay: f32) -> Result<Self> {
+        Ok(Self { adam: Adam::decaying(network.weights(), decay)?, network })
     }
 
     /// Moves the network down the loss that `gradients` are of. Gives the gradient's norm before clipping, `[]`.

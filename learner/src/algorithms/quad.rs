@@ -7,8 +7,9 @@ mod config;
 mod golden;
 mod metrics;
 
-use super::algorithm::{Algorithm, AlgorithmError, Context, Definition, Minibatch, numbers, read};
-use super::parts::{Parts, Trained, ensemble, initial};
+use super::algorithm::{Algorithm, AlgorithmError, Context, Definition, Minibatch, largest, numbers, read};
+use super::diffusion::{Denoising, chain_noise, noise_predictor};
+use super::parts::{Parts, Trained, ensemble};
 use super::random::{Purpose, stream};
 use candle_core::{DType, Result, Tensor};
 use candle_nn::loss::mse;
@@ -18,8 +19,6 @@ use quad_policy::{
     AdamStep, Choice, DiffusionPolicy, DiffusionShape, Ensemble, Gradients, NoisePredictor, PolicyConfig, Reverse,
     Tensors, cosine_decay, mean_and_variance,
 };
-use rand::Rng;
-use rand_distr::{Distribution, StandardNormal};
 
 /// What the learner has to know of it.
 pub(super) const DEFINITION: Definition = Definition {
@@ -50,12 +49,10 @@ pub(super) struct Quad {
 
 /// The random numbers of one update.
 struct Noise {
-    /// Of the sampled next actions, `[T, B·S, a]`: a^T, then the reverse steps' noise from t = T down to 2.
+    /// Of the sampled next actions, `[T, B·S, a]`.
     next: Tensor,
-    /// Denoising step of each transition, in 1..=T, `[B]`.
-    t: Vec<u32>,
-    /// ε of Eq. 5, `[B, a]`.
-    epsilon: Tensor,
+    /// t and ε of Eq. 5.
+    denoising: Denoising,
 }
 
 /// What the critics say about noisy actions, and how far they are trusted.
@@ -82,13 +79,12 @@ impl Quad {
             diffusion_steps: *config.diffusion_steps,
             reverse: Reverse::ClipClean,
         };
-        let (actor, critics) =
-            (initial(&shape.actor().layout(), &context, 0)?, ensemble(shape.critics(), &context, 1)?);
-        let precision = context.precision;
+        let (actor, target_actor) = noise_predictor(shape.actor(), 0.0, &context, 0)?;
+        let critics = ensemble(shape.critics(), &context, 1)?;
         Ok(Self {
-            target_actor: NoisePredictor::new(shape.actor(), actor.copy()?, precision),
+            actor,
+            target_actor,
             target_critics: critics.network.copy()?,
-            actor: Trained::new(NoisePredictor::new(shape.actor(), actor, precision))?,
             critics,
             eta: Tensor::new(*config.eta.initial, &context.device)?,
             nu_squared: None,
@@ -100,14 +96,10 @@ impl Quad {
 
     fn noise(&self, step: u64) -> Result<Noise> {
         let mut generator = stream(self.context.seed, Purpose::Noise, step);
-        let (b, a, device) = (self.context.batch_size, self.shape.action_dim, &self.context.device);
-        let (steps, rows) = (self.shape.diffusion_steps, b * *self.config.samples);
-        let mut normal = |n: usize| -> Vec<f32> { (0..n).map(|_| StandardNormal.sample(&mut generator)).collect() };
-        let (next, epsilon) = (normal(steps * rows * a), normal(b * a));
+        let (actor, b, device) = (self.actor.network.shape(), self.context.batch_size, &self.context.device);
         Ok(Noise {
-            next: Tensor::from_vec(next, (steps, rows, a), device)?,
-            epsilon: Tensor::from_vec(epsilon, (b, a), device)?,
-            t: (0..b).map(|_| generator.random_range(1..=steps as u32)).collect(),
+            next: chain_noise(actor, b * *self.config.samples, &mut generator, device)?,
+            denoising: Denoising::draw(actor, b, &mut generator, device)?,
         })
     }
 
@@ -124,18 +116,16 @@ impl Quad {
         self.target_critics.weights_mut().follow(self.critics.network.weights(), ema_rate)?;
 
         // Lines 8–11: behaviour cloning, pulled along the gradients that the critics agree on (Eq. 5 and 19).
-        let (signal, deviation) =
-            self.actor.network.schedule().noising(&noise.t, self.shape.action_dim, &self.context.device)?;
-        let noisy = ((&batch.actions * signal)? + (&noise.epsilon * &deviation)?)?;
-        let t = Tensor::from_slice(&noise.t, noise.t.len(), &self.context.device)?;
-        let predicted = self.actor.network.predict(&batch.observations, &noisy, &t)?;
-        let bc_loss = mse(&predicted, &noise.epsilon)?;
+        let epsilon = &noise.denoising.epsilon;
+        let noisy = noise.denoising.noisy(self.actor.network.schedule(), &batch.actions)?;
+        let predicted = self.actor.network.predict(&batch.observations, &noisy.actions, &noisy.t)?;
+        let bc_loss = mse(&predicted, epsilon)?;
         let mut actor_loss = (&bc_loss * &self.eta)?;
         let zero = self.eta.zeros_like()?;
         let (mut lambda_mean, mut delta_share) = (zero.clone(), zero.clone());
         if self.config.guidance != Guidance::None {
-            let guide = self.guide(batch, &noisy, &predicted.detach())?;
-            let pull = (guide.gradient * deviation)?.broadcast_mul(&guide.lambda.unsqueeze(1)?)?;
+            let guide = self.guide(batch, &noisy.actions, &predicted.detach())?;
+            let pull = (guide.gradient * &noisy.deviation)?.broadcast_mul(&guide.lambda.unsqueeze(1)?)?;
             actor_loss = (actor_loss + (&predicted * pull)?.mean_all()?)?;
             (lambda_mean, delta_share) = (guide.lambda.mean_all()?, guide.delta_share);
             self.nu_squared = Some(guide.nu_squared);
@@ -147,8 +137,8 @@ impl Quad {
         if let Some(threshold) = self.config.eta.threshold
             && self.config.guidance != Guidance::None
         {
-            let predicted = self.actor.network.detach().predict(&batch.observations, &noisy, &t)?;
-            self.eta = self.ascended_eta((mse(&predicted, &noise.epsilon)? - f64::from(*threshold))?)?;
+            let predicted = self.actor.network.detach().predict(&batch.observations, &noisy.actions, &noisy.t)?;
+            self.eta = self.ascended_eta((mse(&predicted, epsilon)? - f64::from(*threshold))?)?;
         }
         if step.is_multiple_of(*self.config.actor_ema_every) && step > self.config.actor_ema_start {
             self.target_actor.weights_mut().follow(self.actor.network.weights(), ema_rate)?;
@@ -186,8 +176,7 @@ impl Quad {
         let q = q.reshape((self.shape.critics, (), *self.config.samples))?;
         let value = match self.config.target_reduce {
             TargetReduce::Mean => q.mean(2)?,
-            // A maximum would drop a NaN; zero times their sum lets none get lost.
-            TargetReduce::Max => (q.max(2)? + (q.sum(2)? * 0.0)?)?,
+            TargetReduce::Max => largest(&q, 2)?,
         };
         let (mean, variance) = mean_and_variance(&value)?;
         let bound = (mean - (variance.sqrt()? * f64::from(*self.config.rho))?)?;

@@ -194,8 +194,10 @@ fn a_nan_is_never_dropped() {
             let mut agent = agent(definition, &table, &context(0, &Device::Cpu));
             agent.parts().spoil(name);
             let values = train(&mut agent, 8);
+            // AlignIQL acts by its target actor, but learns nothing from it: it is an average of an actor that is watched.
+            let unread = (definition.name, name) == ("align-iql", "target_actor");
             assert!(
-                values.iter().flatten().any(|value| value.is_nan()),
+                unread || values.iter().flatten().any(|value| value.is_nan()),
                 "{}: a NaN in {name} is lost",
                 definition.name
             );

@@ -1,7 +1,10 @@
 //! Tests: the update against an independent implementation (docs/golden.md).
 
 use super::*;
-use crate::algorithms::golden::{Golden, batch, check_update, context, devices, fresh, goldens, load, table};
+use crate::algorithms::diffusion::Noisy;
+use crate::algorithms::golden::{
+    Golden, batch, chain_noise, check_update, context, denoising, devices, fresh, goldens, load, table,
+};
 use crate::algorithms::hyperparameters::{NotNegative, Positive};
 use candle_core::Device;
 
@@ -14,14 +17,7 @@ fn start(golden: &Golden, device: &Device) -> Quad {
 }
 
 fn noise(golden: &Golden, device: &Device) -> Noise {
-    let next = golden.input("next_noise", device);
-    let (steps, b, samples, a) = next.dims4().unwrap();
-    let t: Vec<i64> = golden.inputs["t"].to_vec1().unwrap();
-    Noise {
-        next: next.reshape((steps, b * samples, a)).unwrap(),
-        t: t.into_iter().map(|t| t as u32).collect(),
-        epsilon: golden.input("epsilon", device),
-    }
+    Noise { next: chain_noise(golden, "next_noise", device), denoising: denoising(golden, device) }
 }
 
 fn check(golden: &Golden, device: &Device) {
@@ -67,7 +63,7 @@ fn eta_moves_by_at_most_its_rate_and_stays_within_its_bounds() {
     // ε ten times as large makes a BC loss near 100, which is far above or far below the threshold.
     let moved = |threshold: f32, minimum: f32, maximum: f32| {
         let (batch, mut noise) = (batch(&golden, &context(&golden, &Device::Cpu)), noise(&golden, &Device::Cpu));
-        noise.epsilon = (noise.epsilon * 10.0).unwrap();
+        noise.denoising.epsilon = (noise.denoising.epsilon * 10.0).unwrap();
         let mut quad = start(&golden, &Device::Cpu);
         quad.config.eta = Eta {
             initial: NotNegative(1.0),
@@ -89,7 +85,7 @@ fn the_noise_of_a_step_is_repeatable_and_no_other_steps() {
     let golden = goldens("quad").remove(0);
     let quad = start(&golden, &Device::Cpu);
     let numbers = |step: u64| {
-        let Noise { next, t, epsilon } = quad.noise(step).unwrap();
+        let Noise { next, denoising: Denoising { t, epsilon } } = quad.noise(step).unwrap();
         let [next, epsilon] = [next, epsilon].map(|x| x.flatten_all().unwrap().to_vec1::<f32>().unwrap());
         (next, t, epsilon)
     };
@@ -104,7 +100,7 @@ fn every_denoising_step_is_drawn_equally_often() {
     let golden = goldens("quad").remove(0);
     let quad = start(&golden, &Device::Cpu);
     let mut counts = vec![0; *quad.config.diffusion_steps];
-    (0..1000).for_each(|step| quad.noise(step).unwrap().t.iter().for_each(|t| counts[*t as usize - 1] += 1));
+    (0..1000).for_each(|step| quad.noise(step).unwrap().denoising.t.iter().for_each(|t| counts[*t as usize - 1] += 1));
     let expected = 1000 * quad.context.batch_size / counts.len();
     // Six standard deviations of a binomial count.
     let room = 6.0 * (expected as f64).sqrt();
@@ -133,13 +129,11 @@ fn golden_parts() {
         }
         // Guidance comes from the target critics as the update has just moved them.
         quad.target_critics.weights_mut().load(&mut golden.expected.clone(), "target_critic.").unwrap();
-        let (signal, deviation) =
-            quad.actor.network.schedule().noising(&noise.t, quad.shape.action_dim, &device).unwrap();
-        let noisy = ((&batch.actions * signal).unwrap() + (&noise.epsilon * deviation).unwrap()).unwrap();
+        let Noisy { actions: noisy, t, .. } =
+            noise.denoising.noisy(quad.actor.network.schedule(), &batch.actions).unwrap();
         golden.close("noisy_actions", &noisy);
         let gradients = quad.target_critics.action_gradients(&batch.observations, &noisy).unwrap();
         golden.close("critic_action_gradients", &gradients);
-        let t = Tensor::new(noise.t.as_slice(), &device).unwrap();
         let predicted = quad.actor.network.predict(&batch.observations, &noisy, &t).unwrap().detach();
         let guide = quad.guide(&batch, &noisy, &predicted).unwrap();
         let mean = gradients.mean(0).unwrap().broadcast_div(&golden.expected["q_scale"]).unwrap();
