@@ -2,7 +2,7 @@
 """Prints the table of deploy/results.sh, as Markdown: python3 deploy/results.py RUN...
 
 A run's number is the mean score of its snapshots in score.json; the table has their mean ± sample standard deviation over
-the seeds. Runs without a score.json are left out.
+the seeds, and how many these are where there are not three. Runs without a score.json are left out.
 """
 
 import json
@@ -11,52 +11,48 @@ import sys
 from collections import defaultdict
 from pathlib import Path
 
-# Title, guidance and number of candidates.
-COLUMNS = [
-    ("BC, 1", "none", 1),
-    ("BC, best of 10", "none", 10),
-    ("DAC, 1", "dac", 1),
-    ("DAC, best of 10", "dac", 10),
-    ("QUAD, 1", "quad", 1),
-    ("QUAD, best of 10", "quad", 10),
-]
-
 
 def spread(values):
     """Mean ± sample standard deviation; nothing of nothing."""
     if not values:
         return ""
+    seeds = "" if len(values) == 3 else f" ({len(values)})"
     mean = f"{statistics.fmean(values):.1f}"
-    return f"{mean} ± {statistics.stdev(values):.1f}" if len(values) > 1 else mean
+    return (f"{mean} ± {statistics.stdev(values):.1f}" if len(values) > 1 else mean) + seeds
 
 
 def row(*cells):
     print("|", " | ".join(cells), "|")
 
 
+def chosen(choice):
+    """How a policy chose, in a word or two."""
+    if choice is None:
+        return "mean"
+    return str(choice["candidates"])
+
+
 def main(runs):
-    scores = defaultdict(list)  # by file, guidance and candidates: a number for each seed
-    files = {}
-    settings = set()
-    for run in map(Path, runs):
+    scores = defaultdict(list)  # by method, candidates and file: a number for each seed
+    files, settings = {}, set()
+    for run in sorted(map(Path, runs)):
         if not (run / "score.json").exists():
             continue
-        file, guidance, _ = run.name.rsplit("-", 2)
+        file, method, _ = run.parts[-3:]
         means = defaultdict(list)  # by candidates: a number for each snapshot
         for scored in json.loads((run / "score.json").read_text()):
             episodes = [episode["score"] for episode in scored["episodes"]]
-            means[scored["choice"]["candidates"]].append(statistics.fmean(episodes))
+            means[chosen(scored["choice"])].append(statistics.fmean(episodes))
             settings.add(f"{len(episodes)} episodes each in {scored['precision']}")
         for candidates, of_snapshots in means.items():
-            scores[file, guidance, candidates].append(statistics.fmean(of_snapshots))
-        report = json.loads((run / "report.json").read_text())
-        files[file] = (f"{report['dataset_score']:.1f}", f"{report['steps']:,}")
+            scores[method, candidates, file].append(statistics.fmean(of_snapshots))
+        files[file] = f"{json.loads((run / 'report.json').read_text())['dataset_score']:.1f}"
 
-    row("file", "its episodes", "steps", *(title for title, *_ in COLUMNS), "seeds")
-    row(*["---"] * (4 + len(COLUMNS)))
-    for file, about in sorted(files.items()):
-        numbers = [scores[file, guidance, candidates] for _, guidance, candidates in COLUMNS]
-        row(file, *about, *map(spread, numbers), str(max(map(len, numbers))))
+    row("method", "candidates", *files)
+    row(*["---"] * (2 + len(files)))
+    row("its episodes", "", *files.values())
+    for method, candidates in dict.fromkeys(key[:2] for key in scores):
+        row(method, candidates, *(spread(scores[method, candidates, file]) for file in files))
     print("\nNormalised score: mean of a run's last snapshots,", " or ".join(sorted(settings)) + "; ± over the seeds.")
 
 

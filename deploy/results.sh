@@ -1,13 +1,14 @@
 #!/usr/bin/env bash
-# What the demonstration's setting learns from some files, and which part of it is owed to the choice among candidates, which
-# to guidance: trains behaviour cloning, DAC and QUAD on each, scores their last five snapshots with one candidate and with
-# the best of ten on the same episodes, and prints one table (Markdown) of all that was ever trained this way.
+# What the algorithms learn in the demonstration's setting from some files: trains each on each, scores their last five
+# snapshots on the same episodes, and prints one table (Markdown) of all that was ever trained this way.
 #
-#   deploy/results.sh [--seeds "0 1 2"] FILE...
+#   deploy/results.sh [--seeds "0 1 2"] [--methods "bc quad iql"] [--candidates 1,10] FILE...
 #
 #   deploy/results.sh data/hopper-demo.hdf5          the demonstration's own file, which is recorded if it is not there
-#   deploy/results.sh --seeds 0 walker2d*.hdf5 antmaze_umaze*.hdf5
+#   deploy/results.sh --methods "bc dac quad" --candidates 1,10 walker2d*.hdf5
 #
+# A method is the name of an algorithm, or of one of QUAD's variants: bc (behaviour cloning) and dac. With --candidates policies
+# that draw several actions are scored with so many of them, else as their algorithm has it.
 # A file's name begins with its environment: hopper, halfcheetah, walker2d, antmaze_umaze or antmaze_medium. Runs go to
 # runs/results. What is done already is skipped, so it can be interrupted and run in pieces. One run per core at a time,
 # each on one thread.
@@ -18,10 +19,19 @@ cd "$(dirname "$0")/.."
 BIN=target/release
 EVALUATIONS=5
 EPISODES=20
-CANDIDATES=1,10
+CANDIDATES=
 
 seeds="0 1 2"
-[ "${1:-}" != --seeds ] || { seeds=${2:-}; shift 2; }
+methods="bc quad iql align-iql dql ivr xql onestep"
+while [ $# -gt 1 ]; do
+  case $1 in
+    --seeds) seeds=$2 ;;
+    --methods) methods=$2 ;;
+    --candidates) CANDIDATES=$2 ;;
+    *) break ;;
+  esac
+  shift 2
+done
 if [ $# -eq 0 ] || [ -z "$seeds" ]; then usage >&2; exit 2; fi
 
 # task FILE: the demonstration in the environment that the file's name begins with.
@@ -36,16 +46,27 @@ task() {
   esac
 }
 
-# run FILE GUIDANCE SEED: trains with an evaluator beside it, then scores the last snapshots.
+# flags METHOD: its algorithm, and what is changed in it.
+flags() {
+  case $1 in
+    bc) echo --agent guidance=none ;;
+    dac) echo --agent guidance=dac ;;
+    *) echo --algorithm "$1" ;;
+  esac
+}
+
+# run FILE METHOD SEED: trains with an evaluator beside it, then scores the last snapshots. Evaluations have one episode: they
+# are there for the snapshots.
 run() {
-  local file=$1 guidance=$2 seed=$3 task run learner endpoint evaluator snapshots
+  local file=$1 method=$2 seed=$3 task run learner endpoint evaluator snapshots
   task=$(task "$file")
-  run=runs/results/$(basename "$file" .hdf5)-$guidance-seed$seed
+  run=runs/results/$(basename "$file" .hdf5)/$method/$seed
   [ ! -e "$run/score.json" ] || return 0
   if [ ! -e "$run/report.json" ]; then
     rm -rf "$run"
     mkdir -p "$run"
-    start_learner "$run" --task "$task" --dataset "$file" --agent "guidance=$guidance" --seed "$seed" \
+    # shellcheck disable=SC2046 # Several words.
+    start_learner "$run" --task "$task" --dataset "$file" $(flags "$method") --episodes 1 --seed "$seed" \
       >"$run/learner.log" 2>&1 || { cat "$run/learner.log" >&2; return 1; }
     $BIN/evaluator serve --connect "$endpoint" --metrics 127.0.0.1:0 >"$run/evaluator.log" 2>&1 &
     evaluator=$!
@@ -55,13 +76,13 @@ run() {
   fi
   # Their names are in the order of their steps.
   mapfile -t snapshots < <(printf '%s\n' "$run"/snapshots/*.safetensors | tail -n "$EVALUATIONS")
-  $BIN/evaluator score --json --episodes "$EPISODES" --candidates "$CANDIDATES" "${snapshots[@]}" \
+  $BIN/evaluator score --json --episodes "$EPISODES" ${CANDIDATES:+--candidates "$CANDIDATES"} "${snapshots[@]}" \
     >"$run/score.json.partial" 2>"$run/score.log" || { tail -n 5 "$run/score.log" >&2; return 1; }
   mv "$run/score.json.partial" "$run/score.json"
   say "$run is done"
 }
 # xargs runs it in other shells.
-export -f run task start_learner say die
+export -f run task flags start_learner say die
 export NAME BIN EVALUATIONS EPISODES CANDIDATES RAYON_NUM_THREADS=1
 
 for file; do
@@ -78,10 +99,10 @@ done
 
 for seed in $seeds; do
   for file; do
-    for guidance in none dac quad; do
-      printf '%s\0%s\0%s\0' "$file" "$guidance" "$seed"
+    for method in $methods; do
+      printf '%s\0%s\0%s\0' "$file" "$method" "$seed"
     done
   done
 done | xargs -0 -P "$(nproc)" -n 3 bash -euc 'run "$@"' run
 
-python3 deploy/results.py runs/results/*
+python3 deploy/results.py runs/results/*/*/*
