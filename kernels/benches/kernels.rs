@@ -109,7 +109,7 @@ fn products(criterion: &mut Criterion) {
     }
 }
 
-/// The way back through a layer.
+/// The backward pass through a layer.
 fn transposed(criterion: &mut Criterion) {
     for (m, k, n) in [(128, 256, 256), (128, 128, 128)] {
         let shape = Shape { m, k: n, n: k };

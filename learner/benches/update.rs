@@ -190,7 +190,7 @@ fn parts_of(group: &mut BenchmarkGroup<'_, WallTime>, experiment: &Experiment, s
     let step = AdamStep { rate: 1e-9, clip: Some(1.0), count: 1 };
     let gradient = regress(&critics)?.copy()?;
     bench(group, "critic optimiser", || critic_adam.descend(critics.weights_mut(), &gradient, step));
-    bench(group, "critic EMA", || target_critics.weights_mut().follow(critics.weights(), 0.005));
+    bench(group, "critic EMA", || target_critics.weights_mut().ema_update(critics.weights(), 0.005));
     bench(group, "Q-gradients' scale", || target_critics.values(&observations, &actions));
     bench(group, "Q-gradients", || target_critics.action_gradients(&observations, &actions));
     let t = Tensor::from_iter((0..b).map(|i| (i % steps + 1) as u32), observations.device())?;
@@ -210,7 +210,7 @@ fn parts_of(group: &mut BenchmarkGroup<'_, WallTime>, experiment: &Experiment, s
     let gradient = clone(&actor)?.copy()?;
     bench(group, "actor optimiser and EMA", || {
         actor_adam.descend(actor.weights_mut(), &gradient, step)?;
-        target_actor.weights_mut().follow(actor.weights(), 0.005)
+        target_actor.weights_mut().ema_update(actor.weights(), 0.005)
     });
     Ok(())
 }

@@ -1,7 +1,7 @@
 //! How a policy that samples chooses among the actions that it has drawn in a state.
 
+use crate::episode::EpisodeState;
 use crate::error::PolicyError;
-use crate::policy::EpisodeState;
 use serde::{Deserialize, Serialize};
 use std::fmt;
 use std::str::FromStr;

@@ -3,12 +3,14 @@
 
 use crate::choice::{Choice, Rule};
 use crate::ensemble::Ensemble;
-use crate::error::PolicyError;
+use crate::episode::EpisodeState;
+use crate::error::{PolicyError, check_range};
+use crate::mlp_config::MlpConfig;
 use crate::noise_predictor::NoisePredictor;
-use crate::policy::{EpisodeState, Policy, check_range};
+use crate::policy::Policy;
 use crate::precision::Precision;
 use crate::schedule::Reverse;
-use crate::shape::{EnsembleShape, MlpConfig, NoiseShape, tile_numbers};
+use crate::shape::{EnsembleShape, NoiseShape, tile_numbers};
 use crate::slices::read;
 use crate::weights::{Layout, Tensors, Weights};
 use candle_core::{Device, Tensor};

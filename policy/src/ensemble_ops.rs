@@ -1,8 +1,9 @@
 //! What an ensemble computes without keeping anything: custom operations of (weights, observations, actions) on the CPU, cut
 //! into (member, tile of rows), in parallel.
 
+use crate::layers::TILE;
 use crate::mlp::Mlp;
-use crate::network::{Input, Network, TILE, rows_of, with_workspace};
+use crate::network::{Input, Network, rows_of, with_workspace};
 use crate::operation::{Arguments, Operation};
 use candle_core::{Result, Shape};
 use quad_kernels::product::Rounded;

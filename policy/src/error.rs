@@ -63,3 +63,11 @@ pub enum PolicyError {
     #[error("candle failed")]
     Candle(#[from] candle_core::Error),
 }
+
+/// Widest hidden layer, most critics and most denoising steps that are believed.
+const MOST: usize = u16::MAX as usize;
+
+/// That a number of a shape is within 1..=65535.
+pub(crate) fn check_range(field: &'static str, value: usize) -> Result<(), PolicyError> {
+    if (1..=MOST).contains(&value) { Ok(()) } else { Err(PolicyError::Range { field, value }) }
+}

@@ -1,10 +1,12 @@
 //! The Gaussian policy: its mean, tanh of a network of the state, is the action. Nothing is sampled.
 
 use crate::ensemble::Ensemble;
-use crate::error::PolicyError;
-use crate::policy::{EpisodeState, Policy, check_range};
+use crate::episode::EpisodeState;
+use crate::error::{PolicyError, check_range};
+use crate::mlp_config::MlpConfig;
+use crate::policy::Policy;
 use crate::precision::Precision;
-use crate::shape::{EnsembleShape, MlpConfig};
+use crate::shape::EnsembleShape;
 use crate::slices::read;
 use crate::weights::{Tensors, Weights};
 use candle_core::{Device, Result, Tensor};

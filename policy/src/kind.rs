@@ -119,7 +119,7 @@ fn check_header(file: &[u8]) -> Result<(), PolicyError> {
 mod tests {
     use super::*;
     use crate::ensemble::Ensemble;
-    use crate::shape::MlpConfig;
+    use crate::mlp_config::MlpConfig;
     use crate::weights::Weights;
     use candle_core::{DType, Tensor};
     use std::fmt::Write;

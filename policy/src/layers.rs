@@ -3,9 +3,12 @@
 //! A vector for all weights keeps an optimiser's step at one operation, and each named tensor is one contiguous run of it:
 //! layer after layer the kernels of all members, then their biases, then scales and shifts of the norm, if there is one.
 
-use crate::shape::{Initial, MlpConfig};
+use crate::mlp_config::{Initial, MlpConfig};
 use crate::weights::{Part, Start};
 use std::ops::Range;
+
+/// Rows that one task works on: weights and activations of a tile stay in a core's own cache.
+pub(crate) const TILE: usize = 128;
 
 /// Linear layers for K members: for each K kernels `[in, out]`, then K biases `[out]`.
 #[derive(Clone, Debug)]

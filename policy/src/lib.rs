@@ -2,19 +2,22 @@
 //!
 //! # Layout
 //!
-//! - [`Ensemble`] (`ensemble`): K networks side by side, as critics, value functions or means; [`NoisePredictor`]
-//!   (`noise_predictor`): ε_θ and the sampler; [`Schedule`] (`schedule`): the noise schedule and one reverse step.
-//!   Each works on candle's tensors, and has two implementations: a custom operation for the CPU, and plain operations
-//!   (`plain`) that run on any device.
-//! - [`Weights`] (`weights`): a network's weights as one vector with named tensors in it, and their gradient.
-//! - [`Policy`] (`policy`): what any policy can do, and what it carries through an episode. `kind` reads one from a file whose
-//!   [`Header`] says what it is: [`DiffusionPolicy`] (`diffusion`, one of N_a samples by its [`Choice`], in `choice`) or
-//!   [`GaussianPolicy`] (`gaussian`, a mean).
+//! - [`MlpConfig`] (`mlp_config`): a network's hidden layers, a line of configuration; `shape`: what goes in and comes out.
+//! - `mlp`: K networks of layers act(x·W + b) as one operation of candle's, with gradients to x, W and b. It has a fast
+//!   implementation for the CPU, and a plain one (`plain`) that runs on any device and has layer norm.
+//! - [`Ensemble`] (`ensemble`): such networks as critics, value functions or means; [`NoisePredictor`] (`noise_predictor`):
+//!   ε_θ; [`Schedule`] (`schedule`): the noise schedule and one reverse step. What they compute without a gradient is fused
+//!   over whole networks: `sampler`, `ensemble_ops`.
+//! - [`Weights`] (`weights`): a network's weights as one vector with named tensors in it; [`Gradients`] (`gradient`) of a loss
+//!   with respect to them; [`Adam`] (`optimiser`).
+//! - [`Policy`] (`policy`): what any policy can do; [`EpisodeState`] (`episode`): what it carries through an episode. `kind`
+//!   reads one from a file whose [`Header`] says what it is: [`DiffusionPolicy`] (`diffusion`, one of N_a samples by its
+//!   [`Choice`], in `choice`) or [`GaussianPolicy`] (`gaussian`, a mean).
 //! - [`Precision`] (`precision`): how exactly networks are evaluated that no gradient is taken of.
-//! - Below: `ensemble_ops` and `noise_ops` (those custom operations, which `operation` gives to candle), `shape` and
-//!   `layers` (where each layer lies in the vector), `network` (one network on one tile of rows, over the crate `kernels`),
-//!   `saved` (what a forward pass keeps for the backward pass), `rounded` (kernels rounded once), `slices` (candle's tensors
-//!   as slices), `statistics` (mean and variance over an ensemble).
+//! - Below: `layers` (where each layer lies in the vector), `network` (one network on one tile of rows, over the crate
+//!   `kernels`), `saved` and `kept_gradient` (what forward and backward passes leave), `operation` (candle's custom
+//!   operations), `rounded` (kernels rounded once), `slices` (candle's tensors as slices), `statistics` (mean and variance
+//!   over an ensemble).
 //!
 //! Everything that draws random numbers takes them as an argument or from a seeded generator.
 
@@ -24,6 +27,7 @@ mod choice;
 mod diffusion;
 mod ensemble;
 mod ensemble_ops;
+mod episode;
 mod error;
 mod gaussian;
 #[cfg(test)]
@@ -33,9 +37,11 @@ mod gradient;
 #[cfg(test)]
 #[allow(clippy::unwrap_used)]
 mod implementations;
+mod kept_gradient;
 mod kind;
 mod layers;
 mod mlp;
+mod mlp_config;
 mod network;
 mod noise_predictor;
 mod operation;
@@ -55,16 +61,18 @@ mod weights;
 pub use choice::{Choice, Reduce, Rule};
 pub use diffusion::{DiffusionPolicy, DiffusionShape};
 pub use ensemble::Ensemble;
+pub use episode::EpisodeState;
 pub use error::PolicyError;
 pub use gaussian::{GaussianPolicy, GaussianShape, gaussian_mean};
 pub use gradient::Gradients;
 pub use kind::{Header, PolicyConfig, load_policy, read_tensors};
+pub use mlp_config::{Initial, MlpConfig};
 pub use noise_predictor::NoisePredictor;
 pub use optimiser::{Adam, AdamStep, cosine_decay};
-pub use policy::{EpisodeState, Policy};
+pub use policy::Policy;
 pub use precision::Precision;
 pub use quad_kernels::activation::Activation;
 pub use schedule::{Reverse, Schedule};
-pub use shape::{EnsembleShape, Initial, MlpConfig, NoiseShape};
+pub use shape::{EnsembleShape, NoiseShape};
 pub use statistics::mean_and_variance;
 pub use weights::{Layout, Part, Start, Tensors, Weights, check_finite, take};

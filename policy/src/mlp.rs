@@ -3,12 +3,12 @@
 //! On the CPU a custom operation of candle's runs all layers, cut into (member, tile of rows) and in parallel; the cut does
 //! not depend on the number of threads, so neither do the results. Elsewhere, and with a norm, plain operations do.
 
-use crate::gradient::KeptGradient;
-use crate::layers::Layers;
-use crate::network::{Input, Network, TILE, rows_of, with_workspace};
+use crate::kept_gradient::KeptGradient;
+use crate::layers::{Layers, TILE};
+use crate::network::{Input, Network, rows_of, with_workspace};
 use crate::plain;
 use crate::saved::{Lent, Pool, SavedActivations};
-use crate::slices::{has_fast_body, on_cpu, slice};
+use crate::slices::{has_fast_implementation, on_cpu, slice};
 use crate::weights::Weights;
 use candle_core::{CpuStorage, CustomOp2, Layout, Result, Shape, Tensor, bail};
 use quad_kernels::activation::Activation;
@@ -51,7 +51,7 @@ impl Mlp {
 
     /// Whether the fast implementation serves them.
     pub fn is_fast(&self, weights: &Weights) -> bool {
-        has_fast_body(weights.values().device()) && !self.layers.norm()
+        has_fast_implementation(weights.values().device()) && !self.layers.norm()
     }
 
     /// [`Self::forward`] in plain candle operations.

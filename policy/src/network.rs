@@ -3,16 +3,14 @@
 //! Forward passes that nothing is kept of take the first layer apart: the state's part is computed once per state, whatever
 //! number of actions is tried in it, and the action's few columns are fused with the activation.
 
-use crate::layers::Layers;
+use crate::layers::{Layers, TILE};
 use quad_kernels::Buffer;
 use quad_kernels::activation::{Activation, activate, activate_with_slope, multiply};
 use quad_kernels::narrow::{FirstLayer, dots, first_layer, scale_by_combination};
 use quad_kernels::product::{Rounded, product, product_transposed};
 use std::cell::RefCell;
 
-/// Rows that one task works on: weights and activations of a tile stay in a core's own cache.
-pub(crate) const TILE: usize = 128;
-/// The same within a task whose products are rounded: these are so fast that activations must be in the nearest cache.
+/// Rows of a tile that are worked on together in a task whose products are rounded: these are so fast that activations must be in the nearest cache.
 const BLOCK: usize = 32;
 
 /// One member of the networks in a vector of weights.

@@ -5,7 +5,7 @@ use crate::operation::OnCpu;
 use crate::plain;
 use crate::precision::Precision;
 use crate::rounded::RoundedOnce;
-use crate::sampler::Sample;
+use crate::sampler::{Parts, Sample};
 use crate::schedule::Schedule;
 use crate::shape::{NoiseShape, TIME_FEATURES};
 use crate::weights::Weights;
@@ -20,18 +20,6 @@ pub struct NoisePredictor {
     weights: Weights,
     precision: Precision,
     rounded: RoundedOnce<Option<Vec<Rounded>>>,
-}
-
-/// What does not change in training.
-pub(crate) struct Parts {
-    pub shape: NoiseShape,
-    /// Embeds a denoising step.
-    pub time: Mlp,
-    /// Over [s, a^t, embedding].
-    pub trunk: Mlp,
-    pub schedule: Schedule,
-    /// Sinusoids of t = 1..T, `T × 16`.
-    pub features: Vec<f32>,
 }
 
 /// cos(t·f_k), then sin(t·f_k), with f_k = exp(-k·ln(10000)/7) for k = 0..7, of t = 1..T.

@@ -2,7 +2,7 @@
 
 use crate::error::PolicyError;
 use crate::gradient::Gradients;
-use crate::slices::{has_fast_body, modify, read};
+use crate::slices::{has_fast_implementation, modify, read};
 use crate::weights::{Layout, Tensors, Weights};
 use candle_core::{DType, Result, Tensor};
 use quad_kernels::optimiser::{BETA1, BETA2, EPSILON, adam, norm};
@@ -47,7 +47,7 @@ impl Adam {
 
     /// [`Self::step`] along a gradient.
     pub fn descend(&mut self, weights: &mut Weights, gradient: &Tensor, step: AdamStep) -> Result<Tensor> {
-        match has_fast_body(gradient.device()) {
+        match has_fast_implementation(gradient.device()) {
             true => self.fused_step(weights, gradient, step),
             false => self.plain_step(weights, gradient, step),
         }
@@ -117,7 +117,8 @@ pub fn cosine_decay(step: u64, total: u64) -> f32 {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::shape::{EnsembleShape, MlpConfig};
+    use crate::mlp_config::MlpConfig;
+    use crate::shape::EnsembleShape;
     use candle_core::Device;
     use rand::{Rng, SeedableRng};
     use rand_chacha::ChaCha8Rng;
@@ -162,7 +163,7 @@ mod tests {
                 close(&fast_adam.moments, &plain_adam.moments);
                 close(fast.values(), plain.values());
             }
-            target.follow(&fast, 0.25).unwrap();
+            target.ema_update(&fast, 0.25).unwrap();
             close(target.values(), &((before * 0.75).unwrap() + (fast.values() * 0.25).unwrap()).unwrap());
         }
     }

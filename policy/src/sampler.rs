@@ -1,14 +1,28 @@
 //! The sampler's work on the CPU: a custom operation of (weights, observations, noise) that runs the whole reverse process for
 //! one tile of rows after the other, so that activations stay in a core's cache; tiles run in parallel.
 
-use crate::network::{Input, Network, TILE, rows_of, with_workspace};
-use crate::noise_predictor::Parts;
+use crate::layers::TILE;
+use crate::mlp::Mlp;
+use crate::network::{Input, Network, rows_of, with_workspace};
 use crate::operation::{Arguments, Operation};
+use crate::schedule::Schedule;
 use crate::shape::{NoiseShape, TIME_EMBEDDING};
 use candle_core::{Result, Shape};
 use quad_kernels::product::{Rounded, product};
 use rayon::prelude::*;
 use std::sync::Arc;
+
+/// What does not change in training.
+pub(crate) struct Parts {
+    pub shape: NoiseShape,
+    /// Embeds a denoising step.
+    pub time: Mlp,
+    /// Over [s, a^t, embedding].
+    pub trunk: Mlp,
+    pub schedule: Schedule,
+    /// Sinusoids of t = 1..T, `T × 16`.
+    pub features: Vec<f32>,
+}
 
 /// The custom operation of (weights, observations, noise) that draws actions.
 pub(crate) struct Sample {

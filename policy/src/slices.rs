@@ -5,7 +5,7 @@ use std::cell::Cell;
 use candle_core::{CpuStorage, Device, Error, InplaceOp1, Layout, Result, Storage, Tensor};
 
 /// Whether operations on this device have a fast implementation: on the CPU, unless the feature `plain` says otherwise.
-pub fn has_fast_body(device: &Device) -> bool {
+pub fn has_fast_implementation(device: &Device) -> bool {
     device.is_cpu() && !cfg!(feature = "plain")
 }
 

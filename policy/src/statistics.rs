@@ -1,12 +1,12 @@
 //! Mean and variance over the members of an ensemble.
 
-use crate::slices::{has_fast_body, slice};
+use crate::slices::{has_fast_implementation, slice};
 use candle_core::{CpuStorage, CustomOp1, Layout, Result, Shape, Tensor};
 
 /// Mean and population variance over the first dimension: `[K, …]` → twice `[…]`, as constants.
 pub fn mean_and_variance(x: &Tensor) -> Result<(Tensor, Tensor)> {
     let x = x.detach();
-    if !has_fast_body(x.device()) {
+    if !has_fast_implementation(x.device()) {
         return plain_mean_and_variance(&x);
     }
     // Candle's own sums over a leading dimension take ten times as long.

@@ -1,8 +1,8 @@
 //! The weights of a network: one flat vector, with named tensors in it.
 
 use crate::error::PolicyError;
-use crate::gradient::KeptGradient;
-use crate::slices::{has_fast_body, modify};
+use crate::kept_gradient::KeptGradient;
+use crate::slices::{has_fast_implementation, modify};
 use candle_core::{DType, Device, Result, Tensor, Var};
 use rand::Rng;
 use rand_distr::{Distribution, StandardNormal};
@@ -152,7 +152,8 @@ impl Weights {
     /// Weights that gradients are taken of: a variable of candle's.
     pub fn trainable(layout: Layout, values: &Tensor) -> Result<Self> {
         let values = Var::from_tensor(values)?.into_inner();
-        let kept = if has_fast_body(values.device()) { Some(Arc::new(KeptGradient::new(&values)?)) } else { None };
+        let kept =
+            if has_fast_implementation(values.device()) { Some(Arc::new(KeptGradient::new(&values)?)) } else { None };
         Ok(Self { layout, values, kept, changes: 0 })
     }
 
@@ -220,10 +221,10 @@ impl Weights {
         self.kept.as_ref()
     }
 
-    /// Moves them towards `online`, as a target network follows its online network: `w = (1 - rate)·w + rate·online`.
-    pub fn follow(&mut self, online: &Self, rate: f32) -> Result<()> {
+    /// The EMA update of a target network: `w = (1 - rate)·w + rate·online`.
+    pub fn ema_update(&mut self, online: &Self, rate: f32) -> Result<()> {
         let online = online.values.detach();
-        if has_fast_body(online.device()) {
+        if has_fast_implementation(online.device()) {
             return crate::slices::read(&online, |online: &[f32]| {
                 self.change(|mine| modify(mine, |mine| quad_kernels::optimiser::ema(mine, online, rate)))
             })?;

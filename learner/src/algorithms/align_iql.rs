@@ -156,7 +156,7 @@ impl AlignIql {
         let bc_loss = (predicted - &noise.epsilon)?.sqr()?.sum(1)?.mean_all()?;
         let rate = *self.config.actor_learning_rate * cosine_decay(step, self.context.total_steps);
         self.actor.descend(&Gradients::of(&bc_loss)?, adam(rate))?;
-        self.target_actor.weights_mut().follow(self.actor.network.weights(), *self.config.actor_ema_rate)?;
+        self.target_actor.weights_mut().ema_update(self.actor.network.weights(), *self.config.actor_ema_rate)?;
 
         // V(s) towards an expectile of the smaller Q̂(s, a), IQL's Eq. 5.
         let q = smaller(&self.target_critics.values(&batch.observations, &batch.actions)?)?;
@@ -170,7 +170,7 @@ impl AlignIql {
         let targets = batch.target(*self.config.gamma, &next)?;
         let critic_loss = self.critics.network.squared_error(&batch.observations, &batch.actions, &targets)?;
         self.critics.descend(&Gradients::of(&critic_loss)?, adam(*self.config.critic_learning_rate))?;
-        self.target_critics.weights_mut().follow(self.critics.network.weights(), *self.config.ema_rate)?;
+        self.target_critics.weights_mut().ema_update(self.critics.network.weights(), *self.config.ema_rate)?;
 
         let v = value.state_values(&batch.observations)?.squeeze(0)?;
         let mut metrics = numbers(&[

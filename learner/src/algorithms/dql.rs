@@ -176,9 +176,9 @@ impl Dql {
 
         // Targets.
         if step.is_multiple_of(*self.config.actor_ema_every) && step >= self.config.actor_ema_start {
-            self.target_actor.weights_mut().follow(self.actor.network.weights(), *self.config.actor_ema_rate)?;
+            self.target_actor.weights_mut().ema_update(self.actor.network.weights(), *self.config.actor_ema_rate)?;
         }
-        self.target_critics.weights_mut().follow(self.critics.network.weights(), *self.config.ema_rate)?;
+        self.target_critics.weights_mut().ema_update(self.critics.network.weights(), *self.config.ema_rate)?;
 
         numbers(&[
             &targets.mean_all()?,

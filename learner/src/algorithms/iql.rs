@@ -165,7 +165,7 @@ impl Algorithm for Iql {
         let error = self.critics.network.squared_error(&batch.observations, &batch.actions, &targets)?;
         let critic_loss = (error * CRITICS as f64)?;
         self.critics.descend(&Gradients::of(&critic_loss)?, adam(*self.config.critic_learning_rate))?;
-        self.target_critics.weights_mut().follow(self.critics.network.weights(), *self.config.ema_rate)?;
+        self.target_critics.weights_mut().ema_update(self.critics.network.weights(), *self.config.ema_rate)?;
 
         let mut metrics = numbers(&[
             &targets.mean_all()?,

@@ -113,7 +113,7 @@ impl Quad {
         let critic_loss = self.critics.network.squared_error(&batch.observations, &batch.actions, &targets)?;
         let adam = AdamStep { rate: *self.config.critic_learning_rate * decay, clip, count };
         let critic_gradient_norm = self.critics.descend(&Gradients::of(&critic_loss)?, adam)?;
-        self.target_critics.weights_mut().follow(self.critics.network.weights(), ema_rate)?;
+        self.target_critics.weights_mut().ema_update(self.critics.network.weights(), ema_rate)?;
 
         // Lines 8–11: behaviour cloning, pulled along the gradients that the critics agree on (Eq. 5 and 19).
         let epsilon = &noise.denoising.epsilon;
@@ -141,7 +141,7 @@ impl Quad {
             self.eta = self.ascended_eta((mse(&predicted, epsilon)? - f64::from(*threshold))?)?;
         }
         if step.is_multiple_of(*self.config.actor_ema_every) && step > self.config.actor_ema_start {
-            self.target_actor.weights_mut().follow(self.actor.network.weights(), ema_rate)?;
+            self.target_actor.weights_mut().ema_update(self.actor.network.weights(), ema_rate)?;
         }
 
         let nu_squared = self.nu_squared.as_ref().unwrap_or(&zero);

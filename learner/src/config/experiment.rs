@@ -8,7 +8,6 @@ use serde::{Deserialize, Serialize};
 use toml::{Table, Value};
 
 use super::hyperparameters;
-use super::presets::Preset;
 use super::schedule::Schedule;
 use crate::algorithms::Definition;
 
@@ -52,15 +51,6 @@ pub struct Experiment {
 /// For a key that is too few or too many, or of a wrong type. What serde says of it lists the keys that there are.
 pub(super) const KEYS: &str = "`learner presets TASK` prints every key; on the command line --set KEY=VALUE changes one, and \
                                --agent KEY=VALUE one below [agent]";
-
-/// Reads a preset (the name of a task, or a path that ends in `.toml`), lays changes over it, checks every range. The
-/// changes may name another `algorithm` than the preset.
-///
-/// # Errors
-/// There is no such preset, or something in it or in the changes cannot be used.
-pub fn resolve(preset: &str, changes: &Table) -> anyhow::Result<Experiment> {
-    Preset::read(preset)?.resolve(changes)
-}
 
 impl Experiment {
     /// The algorithm.

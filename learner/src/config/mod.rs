@@ -22,8 +22,9 @@ pub(crate) mod tables;
 pub(crate) mod tasks;
 
 pub use device::Device;
-pub use experiment::{Experiment, resolve};
+pub use experiment::Experiment;
 pub(crate) use nearest::did_you_mean;
 pub(crate) use presets::Preset;
+pub use presets::resolve;
 pub use run_config::{DatasetInfo, RunConfig, RunInfo};
 pub use schedule::Schedule;

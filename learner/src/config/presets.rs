@@ -96,3 +96,12 @@ pub fn is_path(preset: &str) -> bool {
 fn word(value: &Value) -> String {
     value.as_str().map_or_else(|| value.to_string(), str::to_owned)
 }
+/// Reads a preset (the name of a task, or a path that ends in `.toml`), lays changes over it, checks every range. The
+/// changes may name another `algorithm` than the preset.
+///
+/// # Errors
+/// There is no such preset, or something in it or in the changes cannot be used.
+pub fn resolve(preset: &str, changes: &Table) -> anyhow::Result<Experiment> {
+    Preset::read(preset)?.resolve(changes)
+}
+
