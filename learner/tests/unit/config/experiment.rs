@@ -1,6 +1,7 @@
 //! Tests of `config/experiment.rs`.
 
 use super::*;
+use crate::config::resolve;
 use toml::toml;
 
 #[test]
