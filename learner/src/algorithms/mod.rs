@@ -6,7 +6,9 @@
 mod algorithm;
 mod gaussian;
 mod hyperparameters;
+mod in_sample;
 mod iql;
+mod ivr;
 mod parts;
 mod quad;
 mod random;
@@ -15,7 +17,7 @@ pub use algorithm::{AgentError, Algorithm, AlgorithmError, Context, Definition, 
 pub use parts::Parts;
 
 /// All algorithms, the one that learns unless another is asked for first.
-pub const ALGORITHMS: [Definition; 2] = [quad::DEFINITION, iql::DEFINITION];
+pub const ALGORITHMS: [Definition; 3] = [quad::DEFINITION, iql::DEFINITION, ivr::DEFINITION];
 
 /// The algorithm of that name.
 pub fn named(name: &str) -> Option<Definition> {
