@@ -12,12 +12,13 @@ mod ivr;
 mod parts;
 mod quad;
 mod random;
+mod xql;
 
 pub use algorithm::{AgentError, Algorithm, AlgorithmError, Context, Definition, Metric, Minibatch};
 pub use parts::Parts;
 
 /// All algorithms, the one that learns unless another is asked for first.
-pub const ALGORITHMS: [Definition; 3] = [quad::DEFINITION, iql::DEFINITION, ivr::DEFINITION];
+pub const ALGORITHMS: [Definition; 4] = [quad::DEFINITION, iql::DEFINITION, ivr::DEFINITION, xql::DEFINITION];
 
 /// The algorithm of that name.
 pub fn named(name: &str) -> Option<Definition> {
