@@ -9,6 +9,7 @@ mod hyperparameters;
 mod in_sample;
 mod iql;
 mod ivr;
+mod onestep;
 mod parts;
 mod quad;
 mod random;
@@ -18,7 +19,8 @@ pub use algorithm::{AgentError, Algorithm, AlgorithmError, Context, Definition, 
 pub use parts::Parts;
 
 /// All algorithms, the one that learns unless another is asked for first.
-pub const ALGORITHMS: [Definition; 4] = [quad::DEFINITION, iql::DEFINITION, ivr::DEFINITION, xql::DEFINITION];
+pub const ALGORITHMS: [Definition; 5] =
+    [quad::DEFINITION, iql::DEFINITION, ivr::DEFINITION, onestep::DEFINITION, xql::DEFINITION];
 
 /// The algorithm of that name.
 pub fn named(name: &str) -> Option<Definition> {
