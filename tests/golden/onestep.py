@@ -25,7 +25,7 @@ VARIANTS = {"onestep-behavior": 300, "onestep-critic": 501, "onestep-policy": 17
 
 def make_config(variant, size):
     hidden, activation = SIZES[size]["hidden"], "mish" if size == "hopper" else "relu"
-    networks = dict.fromkeys(("behavior", "critic", "actor"), shape([hidden, hidden], activation))
+    networks = dict.fromkeys(("behavior", "critic"), shape([hidden, hidden], activation))
     return implicit.make_config("onestep", size, networks | AGENT) | {"step": VARIANTS[variant]}
 
 
@@ -38,7 +38,7 @@ def phase_of(config):
     return ("critic", step) if step < agent["critic_steps"] else ("actor", step - agent["critic_steps"])
 
 
-# Networks: all are ensembles of one.
+# Networks: all are ensembles of one; the actor has the behaviour's shape.
 
 
 def gaussian(policy, states, activation):
@@ -93,11 +93,12 @@ def update(config, state, inputs):
     s, a = inputs["observations"], inputs["actions"]
     metrics = "behavior_loss", "critic_loss", "q_mean", "actor_loss", "advantage_mean", "weight_mean", "clipped_share"
     out = state | dict.fromkeys(metrics, 0.0)
-    activation, rate = agent[name]["activation"], agent["learning_rate"]
+    activation, rate = agent["critic" if name == "critic" else "behavior"]["activation"], agent["learning_rate"]
 
     if name == "behavior":
         out["behavior_loss"], gradients = policy_gradient(state[name], s, a, np.ones(len(s)), activation)
-        return out | adam_step(state, name, gradients, rate, step), None
+        out |= adam_step(state, name, gradients, rate, step)
+        return out | {"actor": out["behavior"]}, None
 
     if name == "critic":
         out["targets"] = targets = targets_of(config, state, inputs)
@@ -119,8 +120,8 @@ def update(config, state, inputs):
 
 def act(config, state, inputs):
     """The mean of the policy, which is β until the policy's own phase, as it is before the update."""
-    name = "actor" if phase_of(config)[0] == "actor" else "behavior"
-    mean, _ = fast_gaussian(state[name], inputs["select_observations"], config["agent"][name]["activation"])
+    activation = config["agent"]["behavior"]["activation"]
+    mean, _ = fast_gaussian(state["actor"], inputs["select_observations"], activation)
     return {"select.actions": mean}
 
 
@@ -136,7 +137,8 @@ def random_state(config, rng, size):
     # A σ of about a half: where σ is small, losses are huge.
     last = f"{len(agent['behavior']['hidden'])}.bias"
     state["behavior"][last] = single(state["behavior"][last] + np.repeat([0.0, 1.0], a))
-    state["actor"] = near(rng, state["behavior"])
+    learns = phase_of(config)[0] == "actor"
+    state["actor"] = near(rng, state["behavior"]) if learns else dict(state["behavior"])
     state["target_critic"] = near(rng, state["critic"])
     for name in "behavior", "critic", "actor":
         state |= random_moments(rng, name, state[name])

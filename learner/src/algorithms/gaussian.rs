@@ -32,13 +32,10 @@ impl Gaussian {
         Ok(Self { mean: ensemble(shape.actor(), context, network)?, log_std: Trained::new(log_std)?, shape })
     }
 
-    /// log π(a|s), `[B]`. The tanh is part of the mean: the density knows nothing of it.
+    /// log π(a|s), `[B]`.
     pub fn log_probability(&self, observations: &Tensor, actions: &Tensor) -> Result<Tensor> {
         let log_std = self.log_std.network.values().clamp(LOG_STD.0, LOG_STD.1)?;
-        let error = (actions - gaussian_mean(&self.mean.network, observations)?)?;
-        let square = error.broadcast_div(&log_std.exp()?)?.sqr()?;
-        let half_log_2_pi = 0.5 * (2.0 * std::f64::consts::PI).ln();
-        ((square * -0.5)?.broadcast_sub(&log_std)? - half_log_2_pi)?.sum(1)
+        log_density(actions, &gaussian_mean(&self.mean.network, observations)?, &log_std)
     }
 
     /// Moves mean and log σ.
@@ -58,4 +55,12 @@ impl Gaussian {
     pub fn parts<'a>(&'a mut self, parts: Parts<'a>) -> Parts<'a> {
         parts.trained("actor", &mut self.mean).trained("actor", &mut self.log_std)
     }
+}
+
+/// log π(a|s), `[B]`, of actions and means `[B, a]`; log σ is `[B, a]`, or `[a]` in all states. The tanh is part of the mean:
+/// the density knows nothing of it.
+pub(super) fn log_density(actions: &Tensor, mean: &Tensor, log_std: &Tensor) -> Result<Tensor> {
+    let square = (actions - mean)?.broadcast_div(&log_std.exp()?)?.sqr()?;
+    let half_log_2_pi = 0.5 * (2.0 * std::f64::consts::PI).ln();
+    ((square * -0.5)?.broadcast_sub(log_std)? - half_log_2_pi)?.sum(1)
 }

@@ -9,16 +9,28 @@ mod diffusion;
 mod dql;
 mod gaussian;
 mod hyperparameters;
+mod in_sample;
 mod iql;
+mod ivr;
+mod onestep;
 mod parts;
 mod quad;
 mod random;
+mod xql;
 
 pub use algorithm::{AgentError, Algorithm, AlgorithmError, Context, Definition, Metric, Minibatch};
 pub use parts::Parts;
 
 /// All algorithms, the one that learns unless another is asked for first.
-pub const ALGORITHMS: [Definition; 4] = [quad::DEFINITION, iql::DEFINITION, align_iql::DEFINITION, dql::DEFINITION];
+pub const ALGORITHMS: [Definition; 7] = [
+    quad::DEFINITION,
+    iql::DEFINITION,
+    align_iql::DEFINITION,
+    dql::DEFINITION,
+    ivr::DEFINITION,
+    onestep::DEFINITION,
+    xql::DEFINITION,
+];
 
 /// The algorithm of that name.
 pub fn named(name: &str) -> Option<Definition> {

@@ -55,7 +55,8 @@ fn variants() -> Vec<(Definition, toml::Table)> {
     let mut variants = Vec::new();
     let of_quad = ["quad", "dac", "none"].map(|guidance| ("quad", toml! { agent.guidance = guidance }));
     let others = ALGORITHMS.iter().filter(|known| known.name != "quad").map(|known| (known.name, toml::Table::new()));
-    for (algorithm, mut changes) in of_quad.into_iter().chain(others) {
+    let of_ivr = [("ivr", toml! { agent.divergence = "exponential" })];
+    for (algorithm, mut changes) in of_quad.into_iter().chain(others).chain(of_ivr) {
         changes.insert("algorithm".to_owned(), algorithm.into());
         let mut experiment = resolve("hopper-demo", &changes).unwrap();
         for (key, value) in &mut experiment.agent {

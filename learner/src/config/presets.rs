@@ -104,4 +104,3 @@ fn word(value: &Value) -> String {
 pub fn resolve(preset: &str, changes: &Table) -> anyhow::Result<Experiment> {
     Preset::read(preset)?.resolve(changes)
 }
-

@@ -1,0 +1,215 @@
+//! What IQL and its kin share: they never ask for the value of an action that is not in the data. V(s) is fitted to the target
+//! critics' smaller value, a Gaussian policy is cloned from the data with weights, and twin critics move towards r + γ·V(s').
+//! An algorithm of this kind is its [`Losses`].
+
+use super::algorithm::{
+    AgentError, Algorithm, Context, Hyperparameters, Metric, Minibatch, check_layers, numbers, smaller,
+};
+use super::gaussian::Gaussian;
+use super::hyperparameters::{Positive, Rate, Share};
+use super::parts::{Parts, Trained, ensemble};
+use candle_core::{DType, Result, Tensor};
+use quad_policy::{AdamStep, Ensemble, EnsembleShape, Gradients, MlpConfig, PolicyConfig, Tensors, cosine_decay};
+use serde::Deserialize;
+
+/// Critics, of whose values the smaller counts.
+const CRITICS: usize = 2;
+/// Largest weight of an action of the data.
+const MOST_WEIGHT: f64 = 100.0;
+
+/// What the metrics of one algorithm say of its own equations.
+pub(super) struct Helps {
+    pub targets: &'static str,
+    pub value_loss: &'static str,
+    pub critic_loss: &'static str,
+    pub actor_loss: &'static str,
+}
+
+/// In the order of the values that an update gives.
+pub(super) const fn metrics(helps: Helps) -> [Metric; 9] {
+    [
+        Metric { name: "q_mean", label: "", help: helps.targets },
+        Metric { name: "v_mean", label: "V", help: "Mean over the batch of the value V(s) after its step." },
+        Metric { name: "value_loss", label: "value loss", help: helps.value_loss },
+        Metric { name: "critic_loss", label: "critic loss", help: helps.critic_loss },
+        Metric { name: "actor_loss", label: "actor loss", help: helps.actor_loss },
+        Metric {
+            name: "advantage_mean",
+            label: "",
+            help: "Mean over the batch of the advantage A = min_k Q̂_k(s, a) − V(s).",
+        },
+        Metric { name: "weight_mean", label: "", help: "Mean over the batch of the weights in the actor's loss." },
+        Metric {
+            name: "clipped_share",
+            label: "",
+            help: "Share of the batch, 0 to 1, whose weight is clipped at 100.",
+        },
+        Metric { name: "learning_rate", label: "", help: "The actor's learning rate; falls to 0 along a cosine." },
+    ]
+}
+
+/// The hyper-parameters that all have.
+#[derive(Deserialize)]
+pub(super) struct Common {
+    actor: MlpConfig,
+    critic: MlpConfig,
+    value: MlpConfig,
+    /// Discount γ.
+    gamma: Share,
+    actor_learning_rate: Positive,
+    critic_learning_rate: Positive,
+    value_learning_rate: Positive,
+    /// EMA rate of the target critics.
+    ema_rate: Rate,
+}
+
+/// The equations of one algorithm; its hyper-parameters hold them.
+pub(super) trait Losses: Hyperparameters + Send {
+    fn common(&self) -> &Common;
+
+    /// The loss `[]` that V is moved down, of `q`, the smaller Q̂(s, a), and `v`, V(s); both `[B]`.
+    fn value_loss(&self, q: &Tensor, v: &Tensor) -> Result<Tensor>;
+
+    /// The weights of actions with these advantages, `[B]`, before they are clipped at 0 and 100.
+    fn weights(&self, advantages: &Tensor) -> Result<Tensor>;
+
+    /// The loss `[]` that the critics are moved down, of `q`, Q_k(s, a), `[2, B]`, and the targets y, `[B]`.
+    fn critic_loss(&self, q: &Tensor, targets: &Tensor) -> Result<Tensor> {
+        q.broadcast_sub(targets)?.sqr()?.mean_all()? * CRITICS as f64
+    }
+
+    /// States and actions that V is fitted to in update number `step`, where they are not the batch's.
+    fn pairs(&self, _: &Context, _step: u64, _: &Minibatch) -> Result<Option<(Tensor, Tensor)>> {
+        Ok(None)
+    }
+
+    /// Steps that V makes in an update.
+    fn value_steps(&self) -> u64 {
+        1
+    }
+}
+
+impl Common {
+    pub fn check(&self) -> std::result::Result<(), AgentError> {
+        check_layers("actor", &self.actor)?;
+        check_layers("critic", &self.critic)?;
+        check_layers("value", &self.value)
+    }
+}
+
+/// Such an algorithm in the middle of a run.
+pub(super) struct InSample<L> {
+    pub losses: L,
+    pub context: Context,
+    /// V.
+    value: Trained<Ensemble>,
+    /// Q_1 and Q_2, and their EMA Q̂.
+    critics: Trained<Ensemble>,
+    target_critics: Ensemble,
+    actor: Gaussian,
+}
+
+impl<L: Losses> InSample<L> {
+    pub fn new(losses: L, context: Context) -> Result<Self> {
+        let (observation_dim, action_dim) = (context.observation_dim(), context.action_dim());
+        let shape = |members, action_dim, layers: &MlpConfig| EnsembleShape {
+            members,
+            observation_dim,
+            action_dim,
+            layers: layers.clone(),
+            outputs: 1,
+        };
+        let common = losses.common();
+        let critics = ensemble(shape(CRITICS, action_dim, &common.critic), &context, 1)?;
+        Ok(Self {
+            value: ensemble(shape(1, 0, &common.value), &context, 2)?,
+            target_critics: critics.network.copy()?,
+            critics,
+            actor: Gaussian::new(&common.actor, &context, 0)?,
+            losses,
+            context,
+        })
+    }
+
+    /// Update number `step`; `pairs` are what [`Losses::pairs`] gives.
+    pub fn step(&mut self, step: u64, batch: &Minibatch, pairs: Option<(Tensor, Tensor)>) -> Result<Vec<f32>> {
+        let (common, count) = (self.losses.common(), step + 1);
+        let adam = |rate: f32, count: u64| AdamStep { rate, clip: None, count };
+
+        // V(s) towards the smaller Q̂(s, a).
+        let q = smaller(&self.target_critics.values(&batch.observations, &batch.actions)?)?;
+        let (states, fitted) = match &pairs {
+            Some((states, actions)) => (states, smaller(&self.target_critics.values(states, actions)?)?),
+            None => (&batch.observations, q.clone()),
+        };
+        let mut value_loss = q.mean_all()?;
+        let steps = self.losses.value_steps();
+        for i in 1..=steps {
+            value_loss = self.losses.value_loss(&fitted, &self.value.network.state_values(states)?.squeeze(0)?)?;
+            let adam = adam(*common.value_learning_rate, step * steps + i);
+            self.value.descend(&Gradients::of(&value_loss)?, adam)?;
+        }
+
+        // The policy towards actions of the data, the more so the better they are.
+        let value = self.value.network.detach();
+        let v = value.state_values(&batch.observations)?.squeeze(0)?;
+        let advantage = (&q - &v)?;
+        let weight = self.losses.weights(&advantage)?;
+        let clipped = weight.gt(MOST_WEIGHT)?.to_dtype(DType::F32)?;
+        let weight = weight.clamp(0.0, MOST_WEIGHT)?;
+        let log_probability = self.actor.log_probability(&batch.observations, &batch.actions)?;
+        let actor_loss = (&weight * log_probability)?.mean_all()?.neg()?;
+        let rate = *common.actor_learning_rate * cosine_decay(step, self.context.total_steps);
+        self.actor.descend(&Gradients::of(&actor_loss)?, adam(rate, count))?;
+
+        // Q(s, a) towards r + γ·V(s').
+        let next = value.state_values(&batch.next_observations)?.squeeze(0)?;
+        let targets = batch.target(*common.gamma, &next)?;
+        let values = self.critics.network.values(&batch.observations, &batch.actions)?;
+        let critic_loss = self.losses.critic_loss(&values, &targets)?;
+        self.critics.descend(&Gradients::of(&critic_loss)?, adam(*common.critic_learning_rate, count))?;
+        self.target_critics.weights_mut().ema_update(self.critics.network.weights(), *common.ema_rate)?;
+
+        let mut metrics = numbers(&[
+            &targets.mean_all()?,
+            &v.mean_all()?,
+            &value_loss,
+            &critic_loss,
+            &actor_loss,
+            &advantage.mean_all()?,
+            &weight.mean_all()?,
+            &clipped.mean_all()?,
+        ])?;
+        metrics.push(rate);
+        Ok(metrics)
+    }
+}
+
+impl<L: Losses> Algorithm for InSample<L> {
+    fn items(&self) -> usize {
+        self.context.transitions.len()
+    }
+
+    fn update(&mut self, step: u64, items: &[u32]) -> Result<Vec<f32>> {
+        let batch = self.context.batch(items)?;
+        let pairs = self.losses.pairs(&self.context, step, &batch)?;
+        self.step(step, &batch, pairs)
+    }
+
+    fn policy(&self) -> Result<(PolicyConfig, Tensors)> {
+        self.actor.policy()
+    }
+
+    fn parts(&mut self) -> Parts<'_> {
+        let parts = Parts::default()
+            .trained("value", &mut self.value)
+            .trained("critic", &mut self.critics)
+            .weights("target_critic", self.target_critics.weights_mut());
+        self.actor.parts(parts)
+    }
+}
+
+/// −max(largest z of the batch, −1), `[]`, a constant: exponentials of z that are multiplied by its exponential cannot overflow.
+pub(super) fn scale_down(z: &Tensor) -> Result<Tensor> {
+    z.max(0)?.maximum(-1.0)?.neg().map(|shift| shift.detach())
+}
