@@ -1,13 +1,11 @@
-//! What the learner and an algorithm know of each other: hyper-parameters, a context, an update, a policy to publish, a state
+//! What the learner and an algorithm know of each other: hyper-parameters, an update, a policy to publish, a state
 //! as one list of named parts, and a table of metrics.
 
-use std::sync::Arc;
-
-use candle_core::{Device, Result, Tensor};
-use quad_dataset::{Batch, Transitions};
-use quad_policy::{MlpConfig, PolicyConfig, PolicyError, Precision, Tensors};
+use candle_core::{Result, Tensor};
+use quad_policy::{MlpConfig, PolicyConfig, PolicyError, Tensors};
 use serde::de::DeserializeOwned;
 
+use super::context::Context;
 use super::parts::Parts;
 
 /// What is known of an algorithm before it runs.
@@ -41,45 +39,6 @@ pub struct Metric {
     pub label: &'static str,
 }
 
-/// What an algorithm has to know of a run.
-#[derive(Clone)]
-pub struct Context {
-    /// What it learns from: transitions, their order in episodes, windows of them.
-    pub transitions: Arc<Transitions>,
-    /// Items per update, B.
-    pub batch_size: usize,
-    /// Updates of the whole run; learning rates that decay reach 0 there.
-    pub total_steps: u64,
-    /// Seed of initial weights and noise.
-    pub seed: u64,
-    /// Precision of forward passes without a gradient.
-    pub precision: Precision,
-    /// Where the tensors lie.
-    pub device: Device,
-}
-
-impl Context {
-    /// Numbers in an observation.
-    pub fn observation_dim(&self) -> usize {
-        self.transitions.observation_dim()
-    }
-
-    /// Numbers in an action.
-    pub fn action_dim(&self) -> usize {
-        self.transitions.action_dim()
-    }
-
-    /// The transitions of these numbers as tensors.
-    ///
-    /// # Errors
-    /// Candle fails.
-    pub fn batch(&self, items: &[u32]) -> Result<Minibatch> {
-        let mut batch = Batch::default();
-        self.transitions.gather(items, &mut batch);
-        Minibatch::new(&batch, &self.device)
-    }
-}
-
 /// An algorithm in the middle of a run.
 pub trait Algorithm: Send {
     /// How many items updates draw from: the transitions, unless it says otherwise.
@@ -100,48 +59,6 @@ pub trait Algorithm: Send {
 
     /// Everything that updates change, by name: with the step it decides the future of the run. Saving and loading go by it.
     fn parts(&mut self) -> Parts<'_>;
-}
-
-/// A batch of B transitions as tensors.
-#[derive(Clone, Debug)]
-pub struct Minibatch {
-    /// s, `[B, o]`.
-    pub observations: Tensor,
-    /// a, `[B, a]`.
-    pub actions: Tensor,
-    /// r, `[B]`.
-    pub rewards: Tensor,
-    /// s', `[B, o]`.
-    pub next_observations: Tensor,
-    /// 0 where the episode terminated, else 1; `[B]`.
-    pub masks: Tensor,
-}
-
-impl Minibatch {
-    /// Copies a batch to a device.
-    ///
-    /// # Errors
-    /// Candle fails.
-    pub fn new(batch: &Batch, device: &Device) -> Result<Self> {
-        let b = batch.size;
-        let rows = |numbers: &[f32]| Tensor::from_slice(numbers, (b, numbers.len() / b), device);
-        let column = |numbers: &[f32]| Tensor::from_slice(numbers, b, device);
-        Ok(Self {
-            observations: rows(&batch.observations)?,
-            actions: rows(&batch.actions)?,
-            rewards: column(&batch.rewards)?,
-            next_observations: rows(&batch.next_observations)?,
-            masks: column(&batch.masks)?,
-        })
-    }
-
-    /// y = r + γ·mask·v for values v of s', `[B]`, as constants.
-    ///
-    /// # Errors
-    /// Candle fails.
-    pub fn target(&self, gamma: f32, next: &Tensor) -> Result<Tensor> {
-        Ok((&self.rewards + ((next * &self.masks)? * f64::from(gamma))?)?.detach())
-    }
 }
 
 /// Why an algorithm cannot start or be saved.

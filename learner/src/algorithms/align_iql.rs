@@ -8,14 +8,15 @@
 mod golden;
 
 use super::algorithm::{
-    AgentError, Algorithm, AlgorithmError, Context, Definition, Hyperparameters, Metric, Minibatch, check_layers,
-    numbers, read, smaller,
+    AgentError, Algorithm, AlgorithmError, Definition, Hyperparameters, Metric, check_layers, numbers, read, smaller,
 };
+use super::context::{Context, Minibatch};
 use super::diffusion::{Denoising, noise_predictor};
 use super::hyperparameters::{Candidates, Count, NotNegative, Positive, Quantile, Rate, Share};
 use super::iql::expectile_loss;
-use super::parts::{Parts, Trained, ensemble};
+use super::parts::Parts;
 use super::random::{Purpose, stream};
+use super::trained::{Trained, ensemble};
 use candle_core::Result;
 use quad_policy::{
     AdamStep, Choice, DiffusionPolicy, DiffusionShape, Ensemble, EnsembleShape, Gradients, MlpConfig, NoisePredictor,

@@ -1,8 +1,8 @@
 //! What the algorithms that train a diffusion policy share: a noise predictor with its EMA, the random numbers of a reverse
 //! chain, and noisy actions to learn to denoise.
 
-use super::algorithm::Context;
-use super::parts::{Trained, initial};
+use super::context::Context;
+use super::trained::{Trained, initial};
 use candle_core::{Device, Result, Shape, Tensor};
 use quad_policy::{NoisePredictor, NoiseShape, Schedule};
 use rand::Rng;

@@ -7,13 +7,15 @@
 mod golden;
 
 use super::algorithm::{
-    AgentError, Algorithm, AlgorithmError, Context, Definition, Hyperparameters, Metric, Minibatch, check_layers,
-    largest, numbers, read, smaller,
+    AgentError, Algorithm, AlgorithmError, Definition, Hyperparameters, Metric, check_layers, largest, numbers, read,
+    smaller,
 };
+use super::context::{Context, Minibatch};
 use super::diffusion::{Denoising, chain_noise, noise_predictor};
 use super::hyperparameters::{Candidates, Count, NotNegative, Positive, Rate, Share, Steps};
-use super::parts::{Parts, Trained, ensemble};
+use super::parts::Parts;
 use super::random::{Purpose, stream};
+use super::trained::{Trained, ensemble};
 use candle_core::{Result, Tensor};
 use candle_nn::loss::mse;
 use quad_policy::{

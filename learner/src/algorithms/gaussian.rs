@@ -7,8 +7,9 @@ use quad_policy::{
     Tensors, Weights, gaussian_mean,
 };
 
-use super::algorithm::Context;
-use super::parts::{Parts, Trained, ensemble};
+use super::context::Context;
+use super::parts::Parts;
+use super::trained::{Trained, ensemble};
 
 /// Bounds of log σ.
 const LOG_STD: (f32, f32) = (-5.0, 2.0);

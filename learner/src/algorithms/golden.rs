@@ -5,7 +5,8 @@ mod reader;
 
 use std::sync::Arc;
 
-use super::algorithm::{Algorithm, Context, Definition, Metric, Minibatch, smaller};
+use super::algorithm::{Algorithm, Definition, Metric, smaller};
+use super::context::{Context, Minibatch};
 use super::diffusion::Denoising;
 use super::parts::Parts;
 use candle_core::{Device, Tensor};

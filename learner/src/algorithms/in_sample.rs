@@ -2,12 +2,12 @@
 //! critics' smaller value, a Gaussian policy is cloned from the data with weights, and twin critics move towards r + γ·V(s').
 //! An algorithm of this kind is its [`Losses`].
 
-use super::algorithm::{
-    AgentError, Algorithm, Context, Hyperparameters, Metric, Minibatch, check_layers, numbers, smaller,
-};
+use super::algorithm::{AgentError, Algorithm, Hyperparameters, Metric, check_layers, numbers, smaller};
+use super::context::{Context, Minibatch};
 use super::gaussian::Gaussian;
 use super::hyperparameters::{Positive, Rate, Share};
-use super::parts::{Parts, Trained, ensemble};
+use super::parts::Parts;
+use super::trained::{Trained, ensemble};
 use candle_core::{DType, Result, Tensor};
 use quad_policy::{AdamStep, Ensemble, EnsembleShape, Gradients, MlpConfig, PolicyConfig, Tensors, cosine_decay};
 use serde::Deserialize;

@@ -5,6 +5,7 @@
 
 mod algorithm;
 mod align_iql;
+mod context;
 mod diffusion;
 mod dql;
 mod gaussian;
@@ -16,9 +17,11 @@ mod onestep;
 mod parts;
 mod quad;
 mod random;
+mod trained;
 mod xql;
 
-pub use algorithm::{AgentError, Algorithm, AlgorithmError, Context, Definition, Metric, Minibatch};
+pub use algorithm::{AgentError, Algorithm, AlgorithmError, Definition, Metric};
+pub use context::{Context, Minibatch};
 pub use parts::Parts;
 
 /// All algorithms, the one that learns unless another is asked for first.

@@ -7,13 +7,14 @@
 mod golden;
 
 use super::algorithm::{
-    AgentError, Algorithm, AlgorithmError, Context, Definition, Hyperparameters, Metric, Minibatch, check,
-    check_layers, numbers, read,
+    AgentError, Algorithm, AlgorithmError, Definition, Hyperparameters, Metric, check, check_layers, numbers, read,
 };
+use super::context::{Context, Minibatch};
 use super::gaussian::log_density;
 use super::hyperparameters::{Count, Positive, Rate, Share, Steps};
-use super::parts::{Parts, Trained, ensemble};
+use super::parts::Parts;
 use super::random::{Purpose, stream};
+use super::trained::{Trained, ensemble};
 use candle_core::{DType, Result, Tensor};
 use quad_dataset::Batch;
 use quad_policy::{

@@ -7,10 +7,12 @@ mod config;
 mod golden;
 mod metrics;
 
-use super::algorithm::{Algorithm, AlgorithmError, Context, Definition, Minibatch, largest, numbers, read};
+use super::algorithm::{Algorithm, AlgorithmError, Definition, largest, numbers, read};
+use super::context::{Context, Minibatch};
 use super::diffusion::{Denoising, chain_noise, noise_predictor};
-use super::parts::{Parts, Trained, ensemble};
+use super::parts::Parts;
 use super::random::{Purpose, stream};
+use super::trained::{Trained, ensemble};
 use candle_core::{DType, Result, Tensor};
 use candle_nn::loss::mse;
 use config::{Eta, Guidance, Quad as Config, TargetReduce};

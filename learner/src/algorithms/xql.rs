@@ -6,7 +6,8 @@
 #[allow(clippy::unwrap_used)]
 mod golden;
 
-use super::algorithm::{AgentError, Context, Definition, Hyperparameters, Metric, Minibatch, read};
+use super::algorithm::{AgentError, Definition, Hyperparameters, Metric, read};
+use super::context::{Context, Minibatch};
 use super::hyperparameters::{Count, NotNegative, Positive};
 use super::in_sample::{Common, Helps, InSample, Losses, metrics, scale_down};
 use super::random::{Purpose, stream};

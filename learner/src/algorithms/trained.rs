@@ -1,0 +1,73 @@
+//! A network with its optimiser, and how both begin.
+
+use candle_core::{Result, Tensor};
+use quad_policy::{Adam, AdamStep, Ensemble, EnsembleShape, Gradients, Layout, NoisePredictor, Weights};
+
+use super::context::Context;
+use super::random::{Purpose, stream};
+
+/// What has weights.
+pub(super) trait Network {
+    fn weights(&self) -> &Weights;
+    fn weights_mut(&mut self) -> &mut Weights;
+}
+
+macro_rules! network {
+    ($type:ty) => {
+        impl Network for $type {
+            fn weights(&self) -> &Weights {
+                <$type>::weights(self)
+            }
+
+            fn weights_mut(&mut self) -> &mut Weights {
+                <$type>::weights_mut(self)
+            }
+        }
+    };
+}
+network!(Ensemble);
+network!(NoisePredictor);
+
+impl Network for Weights {
+    fn weights(&self) -> &Weights {
+        self
+    }
+
+    fn weights_mut(&mut self) -> &mut Weights {
+        self
+    }
+}
+
+/// A network with its optimiser.
+pub(super) struct Trained<N> {
+    pub network: N,
+    pub adam: Adam,
+}
+
+impl<N: Network> Trained<N> {
+    pub fn new(network: N) -> Result<Self> {
+        Self::decaying(network, 0.0)
+    }
+
+    /// A network whose weights decay: AdamW.
+    pub fn decaying(network: N, decay: f32) -> Result<Self> {
+        Ok(Self { adam: Adam::decaying(network.weights(), decay)?, network })
+    }
+
+    /// Moves the network down the loss that `gradients` are of. Gives the gradient's norm before clipping, `[]`.
+    pub fn descend(&mut self, gradients: &Gradients, step: AdamStep) -> Result<Tensor> {
+        self.adam.step(self.network.weights_mut(), gradients, step)
+    }
+}
+
+/// The trainable weights that network number `network` of a run begins with.
+pub(super) fn initial(layout: &Layout, context: &Context, network: u64) -> Result<Weights> {
+    let mut generator = stream(context.seed, Purpose::Weights, network);
+    Weights::trainable(layout.clone(), &Weights::initial(layout, &mut generator, &context.device)?)
+}
+
+/// An ensemble to be trained, at its beginning.
+pub(super) fn ensemble(shape: EnsembleShape, context: &Context, network: u64) -> Result<Trained<Ensemble>> {
+    let weights = initial(&shape.layout(), context, network)?;
+    Trained::new(Ensemble::new(shape, weights, context.precision))
+}
