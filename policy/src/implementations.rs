@@ -140,7 +140,7 @@ fn gradients_are_what_finite_differences_say() {
         // Many steps: clipping leaves the first ones no gradient.
         let predictor = noise_predictor(&mut generator, layers, 8);
         let NoiseShape { observation_dim, action_dim, diffusion_steps: steps, .. } = *predictor.shape();
-        let (s, z) = (tensor(&mut generator, &[6, observation_dim]), tensor(&mut generator, &[steps, 6, action_dim]));
+        let (s, z) = (tensor(&mut generator, &[60, observation_dim]), tensor(&mut generator, &[steps, 60, action_dim]));
         let at = |weights: &Tensor| {
             let weights = Weights::constant(predictor.shape().layout(), weights.clone());
             let predictor = NoisePredictor::new(predictor.shape().clone(), weights, Precision::F32);
