@@ -24,8 +24,11 @@ pub struct Definition {
     /// Checks its hyper-parameters, the `[agent]` table of a preset.
     pub check: fn(&toml::Table) -> std::result::Result<(), AgentError>,
     /// The algorithm at step 0, of such a table.
-    pub start: fn(&toml::Table, Context) -> std::result::Result<Box<dyn Algorithm>, AlgorithmError>,
+    pub start: Start,
 }
+
+/// Makes an algorithm of its hyper-parameters.
+pub type Start = fn(&toml::Table, Context) -> std::result::Result<Box<dyn Algorithm>, AlgorithmError>;
 
 /// A number that an update measures. Gauges, `metrics.jsonl`, the progress display and docs/metrics.md derive from it.
 #[derive(Clone, Copy, Debug)]
