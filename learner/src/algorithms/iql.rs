@@ -1,6 +1,6 @@
 //! IQL (Kostrikov, Nair and Levine 2021, "Offline Reinforcement Learning with Implicit Q-Learning"): a value function
 //! learnt by expectile regression, and a Gaussian policy cloned from the data with advantages as weights. Equations are
-//! that paper's; the networks are QUAD's (docs/deviations.md).
+//! that paper's.
 
 #[cfg(test)]
 #[allow(clippy::unwrap_used)]

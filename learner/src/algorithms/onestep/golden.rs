@@ -67,26 +67,55 @@ fn it_learns_from_transitions_with_a_next_action_and_from_terminals() {
     assert_eq!(next, [[0.1], [0.0], [0.3], [0.5]]);
 }
 
+/// Two steps for β, one for Q, and what remains of five for π.
+fn short(golden: &Golden) -> Onestep {
+    let mut config: Config = read(&table(golden)).unwrap();
+    (config.behavior_steps, config.critic_steps) = (Steps(2), Steps(1));
+    Onestep::new(config, Context { total_steps: 5, ..small_context(golden) }).unwrap()
+}
+
+/// A copy of its state, because weights are saved as views.
+fn state(onestep: &mut Onestep) -> Tensors {
+    let tensors = onestep.parts().save().unwrap().into_iter();
+    tensors.map(|(name, tensor)| (name, tensor.copy().unwrap())).collect()
+}
+
+fn numbers(x: &Tensor) -> Vec<f32> {
+    x.flatten_all().unwrap().to_vec1().unwrap()
+}
+
+#[test]
+fn a_run_that_is_cut_in_any_phase_ends_as_one_that_is_not() {
+    let golden = goldens("onestep").remove(0);
+    let train = |onestep: &mut Onestep, steps: std::ops::Range<u64>| {
+        steps.for_each(|step| drop(onestep.update(step, &[0, 1]).unwrap()));
+    };
+    let mut straight = short(&golden);
+    train(&mut straight, 0..5);
+    let expected = state(&mut straight);
+    for cut in 0..5 {
+        let (mut first, mut second) = (short(&golden), short(&golden));
+        train(&mut first, 0..cut);
+        second.parts().load(&mut state(&mut first)).unwrap();
+        train(&mut second, cut..5);
+        for (name, tensor) in state(&mut second) {
+            assert_eq!(numbers(&tensor), numbers(&expected[&name]), "cut at {cut}: {name}");
+        }
+    }
+}
+
 #[test]
 fn each_phase_has_its_steps_and_the_policy_is_left_some() {
     let golden = goldens("onestep").remove(0);
-    let mut config: Config = read(&table(&golden)).unwrap();
-    (config.behavior_steps, config.critic_steps) = (Steps(2), Steps(1));
-    let with = |config, total_steps| Onestep::new(config, Context { total_steps, ..small_context(&golden) });
-    let refused = with(read(&table(&golden)).unwrap(), 1500).err().unwrap().to_string();
+    let context = Context { total_steps: 1500, ..small_context(&golden) };
+    let refused = Onestep::new(read(&table(&golden)).unwrap(), context).err().unwrap().to_string();
     assert!(refused.contains("behavior_steps is 500") && refused.contains("critic_steps"), "{refused}");
 
-    let mut onestep = with(config, 5).unwrap();
-    // Copies, because weights are saved as views.
-    let state = |onestep: &mut Onestep| -> Tensors {
-        let tensors = onestep.parts().save().unwrap().into_iter();
-        tensors.map(|(name, tensor)| (name, tensor.copy().unwrap())).collect()
-    };
+    let mut onestep = short(&golden);
     let mut before = state(&mut onestep);
     for (step, moved) in ["behavior", "behavior", "critic", "actor", "actor"].into_iter().enumerate() {
         onestep.update(step as u64, &[0, 1]).unwrap();
         let after = state(&mut onestep);
-        let numbers = |x: &Tensor| x.flatten_all().unwrap().to_vec1::<f32>().unwrap();
         for (name, tensor) in &after {
             // The moments tell which network was trained: π moves with β.
             if let Some(of) = name.strip_prefix("adam_v.") {
