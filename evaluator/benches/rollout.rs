@@ -9,7 +9,7 @@ use quad_dataset::environment::find;
 use quad_evaluator::sim::Rollout;
 use quad_evaluator::sim::{make, simulated};
 use quad_policy::{
-    Choice, DiffusionPolicy, DiffusionShape, Ensemble, EpisodeState, Header, Layout, NoisePredictor, Policy,
+    Choice, DiffusionPolicy, DiffusionShape, Ensemble, EpisodeState, Header, Layout, MlpConfig, NoisePredictor, Policy,
     PolicyConfig, Precision, Weights, load_policy,
 };
 use rand::{Rng, SeedableRng};
@@ -20,20 +20,18 @@ const EPISODES: usize = 10;
 const CANDIDATES: u32 = 10;
 /// Steps from the episodes' beginning, few enough that none falls over.
 const STEPS: usize = 4;
-const PAPER: DiffusionShape =
-    DiffusionShape { observation_dim: 11, action_dim: 3, hidden: 256, critics: 10, diffusion_steps: 5 };
-
-/// A policy with random weights, as an evaluator gets it.
+/// A policy of the paper's shape with random weights, as an evaluator gets it.
 fn policy(precision: Precision) -> Box<dyn Policy> {
+    let shape = DiffusionShape::quad((11, 3), &MlpConfig::mish(&[256; 3]), 10, 5);
     let mut generator = ChaCha8Rng::seed_from_u64(0);
     let mut weights = |layout: Layout| {
         let values = Weights::initial(&layout, &mut generator, &Device::Cpu).expect("weights");
         Weights::constant(layout, values)
     };
-    let actor = NoisePredictor::new(PAPER.actor(), weights(PAPER.actor().layout()), Precision::F32);
-    let critics = Ensemble::new(PAPER.critics(), weights(PAPER.critics().layout()), Precision::F32);
+    let actor = NoisePredictor::new(shape.actor(), weights(shape.actor().layout()), Precision::F32);
+    let critics = Ensemble::new(shape.critics(), weights(shape.critics().layout()), Precision::F32);
     let tensors = DiffusionPolicy::tensors(&actor, &critics, None).expect("tensors");
-    let policy = PolicyConfig::Diffusion { shape: PAPER, choice: Choice::best_of(CANDIDATES) };
+    let policy = PolicyConfig::Diffusion { shape, choice: Choice::best_of(CANDIDATES) };
     let file = Header { policy, origin: () }.to_safetensors(&tensors).expect("finite weights");
     load_policy(&file, precision).expect("what was just written")
 }
@@ -73,8 +71,8 @@ fn steps(criterion: &mut Criterion) {
 fn select(criterion: &mut Criterion) {
     let mut random = ChaCha8Rng::seed_from_u64(1);
     let observations: Vec<f32> =
-        (0..EPISODES * PAPER.observation_dim).map(|_| random.random_range(-1.0..1.0)).collect();
-    let mut actions = vec![0.0; EPISODES * PAPER.action_dim];
+        (0..EPISODES * policy.observation_dim()).map(|_| random.random_range(-1.0..1.0)).collect();
+    let mut actions = vec![0.0; EPISODES * policy.action_dim()];
     let mut group = criterion.benchmark_group("select");
     for (name, precision) in [("f32", Precision::F32), ("bf16", Precision::Bf16)] {
         let policy = policy(precision);

@@ -6,8 +6,8 @@ use std::sync::atomic::{AtomicUsize, Ordering::Relaxed};
 
 use candle_core::{Device, Tensor};
 use quad_policy::{
-    Choice, DiffusionPolicy, DiffusionShape, Ensemble, GaussianPolicy, GaussianShape, Header, Layout, NoisePredictor,
-    Policy, PolicyConfig, Precision, Rule, Tensors, Weights, load_policy,
+    Choice, DiffusionPolicy, DiffusionShape, Ensemble, GaussianPolicy, GaussianShape, Header, Layout, MlpConfig,
+    NoisePredictor, Policy, PolicyConfig, Precision, Rule, Tensors, Weights, load_policy,
 };
 
 /// What is not counted, such as the embedding of each denoising step: little of what an evaluator gives, bytes.
@@ -45,7 +45,7 @@ fn loaded(policy: PolicyConfig, tensors: &Tensors) -> Box<dyn Policy> {
 }
 
 fn diffusion(hidden: usize, critics: usize, diffusion_steps: usize, choice: Choice) -> Box<dyn Policy> {
-    let shape = DiffusionShape { observation_dim: 11, action_dim: 3, hidden, critics, diffusion_steps };
+    let shape = DiffusionShape::quad((11, 3), &MlpConfig::mish(&[hidden; 3]), critics, diffusion_steps);
     let actor = NoisePredictor::new(shape.actor(), zeros(shape.actor().layout()), Precision::F32);
     let critics = Ensemble::new(shape.critics(), zeros(shape.critics().layout()), Precision::F32);
     let value = Ensemble::new(shape.value(), zeros(shape.value().layout()), Precision::F32);
@@ -55,7 +55,7 @@ fn diffusion(hidden: usize, critics: usize, diffusion_steps: usize, choice: Choi
 }
 
 fn gaussian(hidden: usize) -> Box<dyn Policy> {
-    let shape = GaussianShape { observation_dim: 11, action_dim: 3, hidden };
+    let shape = GaussianShape { observation_dim: 11, action_dim: 3, actor: MlpConfig::mish(&[hidden; 3]) };
     let actor = Ensemble::new(shape.actor(), zeros(shape.actor().layout()), Precision::F32);
     loaded(PolicyConfig::Gaussian { shape }, &GaussianPolicy::tensors(&actor).unwrap())
 }

@@ -48,6 +48,20 @@ pub struct DiffusionShape {
 }
 
 impl DiffusionShape {
+    /// QUAD's: noise predictor and critics with the same hidden layers.
+    pub fn quad(dims: (usize, usize), layers: &MlpConfig, critics: usize, diffusion_steps: usize) -> Self {
+        Self {
+            observation_dim: dims.0,
+            action_dim: dims.1,
+            actor: layers.clone(),
+            critic: layers.clone(),
+            value: None,
+            critics,
+            diffusion_steps,
+            reverse: Reverse::ClipClean,
+        }
+    }
+
     /// Of the noise predictor.
     pub fn actor(&self) -> NoiseShape {
         let Self { observation_dim, action_dim, diffusion_steps, reverse, .. } = *self;

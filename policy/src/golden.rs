@@ -87,17 +87,7 @@ fn golden_choices() {
 }
 
 fn small(critics: usize) -> DiffusionShape {
-    let layers = MlpConfig { hidden: vec![8; 3], ..MlpConfig::default() };
-    DiffusionShape {
-        observation_dim: 4,
-        action_dim: 2,
-        actor: layers.clone(),
-        critic: layers,
-        value: None,
-        critics,
-        diffusion_steps: 2,
-        reverse: Reverse::ClipClean,
-    }
+    DiffusionShape::quad((4, 2), &MlpConfig::mish(&[8; 3]), critics, 2)
 }
 
 /// Finite weights so large that values overflow: the error says what is not a number, and nothing is chosen.

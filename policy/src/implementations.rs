@@ -249,7 +249,7 @@ fn noise_predictors_give_the_plain_values_and_samples() {
 #[test]
 fn rounding_changes_little_and_follows_the_weights() {
     let mut generator = ChaCha8Rng::seed_from_u64(3);
-    let layers = MlpConfig { hidden: vec![64, 64, 64], ..MlpConfig::default() };
+    let layers = MlpConfig::mish(&[64, 64, 64]);
     let shape = EnsembleShape { members: 3, observation_dim: 11, action_dim: 3, layers, outputs: 1 };
     let weights = weights(shape.layout(), &mut generator);
     let exact = Ensemble::new(shape.clone(), weights.copy().unwrap(), Precision::F32);
@@ -268,7 +268,7 @@ fn rounding_changes_little_and_follows_the_weights() {
 #[test]
 fn shapes_that_do_not_fit_are_errors() {
     let mut generator = ChaCha8Rng::seed_from_u64(0);
-    let layers = MlpConfig { hidden: vec![8], ..MlpConfig::default() };
+    let layers = MlpConfig::mish(&[8]);
     let shape = EnsembleShape { members: 2, observation_dim: 4, action_dim: 2, layers, outputs: 1 };
     let ensemble = ensemble(&mut generator, shape);
     for (observations, actions) in [([5, 4], [5, 3]), ([5, 3], [5, 2]), ([5, 4], [7, 2]), ([5, 4], [0, 2])] {

@@ -154,7 +154,7 @@ mod tests {
     }
     /// The file of a Gaussian policy that is from `origin`.
     fn gaussian(origin: &str) -> Vec<u8> {
-        let actor = MlpConfig { hidden: vec![4], ..MlpConfig::default() };
+        let actor = MlpConfig::mish(&[4]);
         let shape = GaussianShape { observation_dim: 3, action_dim: 1, actor };
         let layout = shape.actor().layout();
         let values = Tensor::zeros(layout.count(), DType::F32, &Device::Cpu).unwrap();

@@ -52,6 +52,11 @@ impl Initial {
 }
 
 impl MlpConfig {
+    /// Hidden layers of these widths, with Mish and nothing else.
+    pub fn mish(hidden: &[usize]) -> Self {
+        Self { hidden: hidden.to_vec(), ..Self::default() }
+    }
+
     /// That there are hidden layers, and of reasonable widths.
     ///
     /// # Errors

@@ -136,7 +136,7 @@ mod tests {
             members: 3,
             observation_dim: 5,
             action_dim: 2,
-            layers: MlpConfig { hidden: vec![77, 78], ..MlpConfig::default() },
+            layers: MlpConfig::mish(&[77, 78]),
             outputs: 1,
         };
         let layout = shape.layout();

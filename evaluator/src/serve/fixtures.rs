@@ -2,7 +2,8 @@
 
 use candle_core::{DType, Device, Tensor};
 use quad_policy::{
-    Choice, DiffusionPolicy, DiffusionShape, Ensemble, Header, Layout, NoisePredictor, PolicyConfig, Precision, Weights,
+    Choice, DiffusionPolicy, DiffusionShape, Ensemble, Header, Layout, MlpConfig, NoisePredictor, PolicyConfig,
+    Precision, Weights,
 };
 use quad_protocol::{Hash, Job, Name, Origin, Snapshot};
 
@@ -27,8 +28,9 @@ pub fn snapshot(file: Vec<u8>) -> Snapshot {
 }
 
 /// A diffusion policy for Hopper of the smallest size.
-pub const SMALLEST: DiffusionShape =
-    DiffusionShape { observation_dim: 11, action_dim: 3, hidden: 1, critics: 1, diffusion_steps: 1 };
+pub fn smallest() -> DiffusionShape {
+    DiffusionShape::quad((11, 3), &MlpConfig::mish(&[1]), 1, 1)
+}
 
 /// The file of a diffusion policy for an environment, all zero, that takes the best of so many candidates.
 pub fn file(environment: &str, shape: DiffusionShape, candidates: u32) -> Vec<u8> {

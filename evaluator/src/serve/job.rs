@@ -178,9 +178,9 @@ fn episode_score(outcome: &EpisodeOutcome) -> EpisodeScore {
 
 #[cfg(test)]
 mod tests {
-    use quad_policy::{DiffusionShape, Precision, load_policy};
+    use quad_policy::{DiffusionShape, MlpConfig, Precision, load_policy};
 
-    use super::super::fixtures::{self, SMALLEST, file};
+    use super::super::fixtures::{self, file};
     use super::*;
     use crate::sim;
 
@@ -189,7 +189,7 @@ mod tests {
     }
 
     fn policy(hidden: usize, critics: usize, candidates: u32) -> Box<dyn Policy> {
-        let shape = DiffusionShape { hidden, critics, ..SMALLEST };
+        let shape = DiffusionShape::quad((11, 3), &MlpConfig::mish(&[hidden; 3]), critics, 1);
         load_policy(&file("hopper", shape, candidates), Precision::F32).unwrap()
     }
 

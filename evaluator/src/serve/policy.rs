@@ -56,7 +56,7 @@ mod tests {
     use quad_dataset::environment::find;
     use quad_policy::DiffusionShape;
 
-    use super::super::fixtures::{SMALLEST, file, snapshot};
+    use super::super::fixtures::{file, smallest, snapshot};
     use super::*;
 
     #[test]
@@ -64,12 +64,12 @@ mod tests {
         let label =
             |file| load(&snapshot(file), find("hopper").unwrap(), Precision::F32).err().map(|error| error.label());
         let (observes_more, acts_more) =
-            (DiffusionShape { observation_dim: 17, ..SMALLEST }, DiffusionShape { action_dim: 6, ..SMALLEST });
-        let hopper = file("hopper", SMALLEST, 1);
+            (DiffusionShape { observation_dim: 17, ..smallest() }, DiffusionShape { action_dim: 6, ..smallest() });
+        let hopper = file("hopper", smallest(), 1);
         assert_eq!(label(hopper.clone()), None);
         for other in [
-            file("walker2d", SMALLEST, 1),
-            file(&"h".repeat(500_000), SMALLEST, 1),
+            file("walker2d", smallest(), 1),
+            file(&"h".repeat(500_000), smallest(), 1),
             file("hopper", observes_more, 1),
             file("hopper", acts_more, 1),
         ] {

@@ -6,7 +6,8 @@ use std::time::{Duration, Instant};
 
 use candle_core::Device;
 use quad_policy::{
-    Choice, DiffusionPolicy, DiffusionShape, Ensemble, Header, Layout, NoisePredictor, PolicyConfig, Precision, Weights,
+    Choice, DiffusionPolicy, DiffusionShape, Ensemble, Header, Layout, MlpConfig, NoisePredictor, PolicyConfig,
+    Precision, Weights,
 };
 use quad_protocol::{
     Hash, Job, JobReply, JobRequest, Message, Name, Origin, ScoreReply, ScoreReport, Snapshot, decode, encode, keys,
@@ -57,7 +58,7 @@ pub struct Learner {
 
 /// The file of a small diffusion policy for Hopper with random weights, which takes the best of so many candidates.
 pub fn file(candidates: u32) -> Vec<u8> {
-    let shape = DiffusionShape { observation_dim: 11, action_dim: 3, hidden: 8, critics: 2, diffusion_steps: 5 };
+    let shape = DiffusionShape::quad((11, 3), &MlpConfig::mish(&[8; 3]), 2, 5);
     let mut generator = ChaCha8Rng::seed_from_u64(0);
     let mut weights = |layout: Layout| {
         let values = Weights::initial(&layout, &mut generator, &Device::Cpu).unwrap();

@@ -8,8 +8,8 @@ use std::path::Path;
 use candle_core::{DType, Device, Tensor};
 use libfuzzer_sys::fuzz_target;
 use quad_policy::{
-    Choice, DiffusionPolicy, DiffusionShape, Ensemble, GaussianPolicy, GaussianShape, Header, Layout, NoisePredictor,
-    PolicyConfig, Precision, Rule, Weights, load_policy,
+    Choice, DiffusionPolicy, DiffusionShape, Ensemble, GaussianPolicy, GaussianShape, Header, Layout, MlpConfig,
+    NoisePredictor, PolicyConfig, Precision, Rule, Weights, load_policy,
 };
 
 const STATES: usize = 2;
@@ -24,7 +24,7 @@ fn write_seeds() {
         let values = Tensor::full(0.5f32, layout.count(), &Device::Cpu).unwrap().to_dtype(DType::F32).unwrap();
         Weights::constant(layout, values)
     };
-    let shape = DiffusionShape { observation_dim: 2, action_dim: 1, hidden: 2, critics: 2, diffusion_steps: 2 };
+    let shape = DiffusionShape::quad((2, 1), &MlpConfig::mish(&[2; 3]), 2, 2);
     let actor = NoisePredictor::new(shape.actor(), halves(shape.actor().layout()), Precision::F32);
     let critics = Ensemble::new(shape.critics(), halves(shape.critics().layout()), Precision::F32);
     let value = Ensemble::new(shape.value(), halves(shape.value().layout()), Precision::F32);
@@ -36,7 +36,7 @@ fn write_seeds() {
     };
     let (best, nearest) = (diffusion(Rule::Best), diffusion(Rule::Nearest));
     let softmax = diffusion(Rule::Softmax { temperature: 0.5 });
-    let shape = GaussianShape { observation_dim: 2, action_dim: 1, hidden: 2 };
+    let shape = GaussianShape { observation_dim: 2, action_dim: 1, actor: MlpConfig::mish(&[2; 3]) };
     let actor = Ensemble::new(shape.actor(), halves(shape.actor().layout()), Precision::F32);
     let tensors = GaussianPolicy::tensors(&actor).unwrap();
     let gaussian = Header { policy: PolicyConfig::Gaussian { shape }, origin: () }.to_safetensors(&tensors).unwrap();
