@@ -70,9 +70,8 @@ fn steps(criterion: &mut Criterion) {
 /// The policy alone, for ten states.
 fn select(criterion: &mut Criterion) {
     let mut random = ChaCha8Rng::seed_from_u64(1);
-    let observations: Vec<f32> =
-        (0..EPISODES * policy.observation_dim()).map(|_| random.random_range(-1.0..1.0)).collect();
-    let mut actions = vec![0.0; EPISODES * policy.action_dim()];
+    let observations: Vec<f32> = (0..EPISODES * 11).map(|_| random.random_range(-1.0..1.0)).collect();
+    let mut actions = vec![0.0; EPISODES * 3];
     let mut group = criterion.benchmark_group("select");
     for (name, precision) in [("f32", Precision::F32), ("bf16", Precision::Bf16)] {
         let policy = policy(precision);
