@@ -7,7 +7,7 @@
 //! - `logging`: which log lines are written, and where to.
 //! - `endpoints`: where learner and evaluators meet; `certificates`: how they show what they are; `access`: what each role may
 //!   do; `session`: the connection between them, over Zenoh.
-//! - `zenoh_threads`, `background`: how little of the processor the network takes.
+//! - `threads`, `background`: how little of the processor the network takes.
 //! - `health`: whether the parts of a process still do their work.
 //! - `metrics_server`: `/metrics` and `/healthz`.
 //! - `shutdown`: the signals that end a process.
@@ -25,7 +25,7 @@ mod logging;
 mod metrics_server;
 mod session;
 mod shutdown;
-mod zenoh_threads;
+mod threads;
 
 pub use background::stay_in_background;
 pub use certificates::{Certificates, CertificatesError, Role};
@@ -36,4 +36,4 @@ pub use logging::{Logging, init_logging};
 pub use metrics_server::{BindError, MetricsServer, serve_metrics};
 pub use session::{open_session, reachable_at};
 pub use shutdown::shutdown_signal;
-pub use zenoh_threads::choose_zenoh_threads;
+pub use threads::choose_threads;
