@@ -47,7 +47,7 @@ fn an_algorithm_that_lacks_a_hyper_parameter_says_what_it_has() {
     for (algorithm, value, words) in [
         ("quad", "guidance=sac", ["sac", "`dac`"]),
         ("iql", "guidance=dac", ["guidance", "`learner presets TASK`"]),
-        ("iql", "candidates=10", ["candidates", "`expectile`"]),
+        ("iql", "candidates=10", ["candidates", "`learner presets TASK`"]),
     ] {
         let flags = ["--task", "hopper-demo", "--dataset", "x", "--algorithm", algorithm, "--agent", value];
         refused(&flags, 1, &words);
