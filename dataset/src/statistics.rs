@@ -22,7 +22,7 @@ pub struct Statistics {
 
 impl Statistics {
     pub(crate) fn new(environment: Option<&EnvironmentSpec>, transitions: usize, episodes: &[Episode]) -> Self {
-        let returns = Spread::of(episodes.iter().map(|episode| episode.sum));
+        let returns = Extent::of(episodes.iter().map(|episode| episode.sum));
         Self {
             transitions,
             episodes: episodes.len(),
@@ -37,13 +37,13 @@ impl Statistics {
 
 /// The smallest, mean and largest of some numbers; NaN where there are none.
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub(crate) struct Spread {
+pub(crate) struct Extent {
     pub(crate) min: f64,
     pub(crate) mean: f64,
     pub(crate) max: f64,
 }
 
-impl Spread {
+impl Extent {
     pub(crate) fn of(values: impl Iterator<Item = f64>) -> Self {
         let (mut count, mut sum, mut min, mut max) = (0.0, 0.0, f64::NAN, f64::NAN);
         for value in values {
@@ -105,9 +105,9 @@ mod tests {
 
     #[test]
     fn a_spread_of_nothing_is_not_a_number() {
-        let Spread { min, mean, max } = Spread::of([3.0, -1.0, 4.0].into_iter());
+        let Extent { min, mean, max } = Extent::of([3.0, -1.0, 4.0].into_iter());
         assert_eq!((min, mean, max), (-1.0, 2.0, 4.0));
-        let nothing = Spread::of(std::iter::empty());
+        let nothing = Extent::of(std::iter::empty());
         assert!(nothing.min.is_nan() && nothing.mean.is_nan() && nothing.max.is_nan());
     }
 

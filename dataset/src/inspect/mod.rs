@@ -15,7 +15,7 @@ use crate::environment::{self, EnvironmentSpec};
 use crate::error::{DatasetError, Problem};
 use crate::formats::Source;
 use crate::recording::RowKind;
-use crate::statistics::Spread;
+use crate::statistics::Extent;
 
 pub use histogram::Histogram;
 
@@ -98,7 +98,7 @@ pub struct Range {
 
 impl Range {
     fn of(values: impl Iterator<Item = f32>) -> Self {
-        let Spread { min, max, .. } = Spread::of(values.map(f64::from).filter(|value| value.is_finite()));
+        let Extent { min, max, .. } = Extent::of(values.map(f64::from).filter(|value| value.is_finite()));
         Self { min, max }
     }
 
@@ -139,7 +139,7 @@ pub fn inspect(
     let episodes = recording.episodes();
     let lengths: Vec<f64> = episodes.iter().map(|episode| episode.length as f64).collect();
     let returns: Vec<f64> = episodes.iter().map(|episode| episode.sum).filter(|sum| sum.is_finite()).collect();
-    let (length, sum) = (Spread::of(lengths.iter().copied()), Spread::of(returns.iter().copied()));
+    let (length, sum) = (Extent::of(lengths.iter().copied()), Extent::of(returns.iter().copied()));
     let steps: f64 = lengths.iter().sum();
     let share = |flags: &[bool]| flags.iter().filter(|&&flag| flag).count() as f64 / steps;
     let is_step = |row: usize| recording.kinds[row] != RowKind::LastState;
