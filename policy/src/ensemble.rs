@@ -1,7 +1,7 @@
 //! K networks of one shape side by side: critics Q_1..Q_K over [s, a], a value function or a policy's mean over s.
 
-use crate::ensemble_ops::{ActionGradients, Networks, Values};
-use crate::mlp::Mlp;
+use crate::action_gradients::ActionGradients;
+use crate::mlp::{Mlp, RoundedKernels};
 use crate::operation::OnCpu;
 use crate::plain;
 use crate::precision::Precision;
@@ -11,7 +11,6 @@ use crate::weights::Weights;
 use candle_core::{Result, Tensor, Var, bail};
 use quad_kernels::product::Rounded;
 use rayon::prelude::*;
-use std::sync::Arc;
 
 /// An ensemble and its weights.
 pub struct Ensemble {
@@ -62,17 +61,10 @@ impl Ensemble {
     /// Differentiable in weights, observations and actions.
     pub fn outputs(&self, observations: &Tensor, actions: &Tensor) -> Result<Tensor> {
         self.check(observations, actions)?;
-        let weights = self.weights.values();
-        let constant = !(weights.track_op() || observations.track_op() || actions.track_op());
-        if !constant || !self.networks.is_fast(&self.weights) {
-            return self.networks.forward(&self.weights, &self.inputs(observations, actions)?);
-        }
-        let rounded = match self.precision {
-            Precision::F32 => None,
-            Precision::Bf16 => Some(self.rounded()?),
-        };
-        let operation = OnCpu(Values { networks: self.networks(), rounded });
-        weights.apply_op3_no_bwd(&observations.contiguous()?, &actions.contiguous()?, &operation)
+        let constant = !(self.weights.values().track_op() || observations.track_op() || actions.track_op());
+        let rounds = self.precision == Precision::Bf16 && constant && self.networks.is_fast(&self.weights);
+        let rounded = if rounds { Some(self.rounded()?) } else { None };
+        self.networks.forward_by(rounded, &self.weights, &self.inputs(observations, actions)?)
     }
 
     /// Q_k(s, a), `[K, rows]`, of networks with one output; the arguments are those of [`Self::outputs`].
@@ -103,13 +95,8 @@ impl Ensemble {
         if !self.networks.is_fast(&self.weights) || self.shape.outputs != 1 {
             return self.plain_action_gradients(observations, actions);
         }
-        let operation = OnCpu(ActionGradients { networks: self.networks() });
+        let operation = OnCpu(ActionGradients { networks: self.networks.clone() });
         weights.apply_op3_no_bwd(&observations.contiguous()?, &actions.contiguous()?, &operation)
-    }
-
-    fn networks(&self) -> Networks {
-        let EnsembleShape { observation_dim, action_dim, .. } = self.shape;
-        Networks { mlp: self.networks.clone(), observation_dim, action_dim }
     }
 
     /// `[s, a]` row by row.
@@ -129,7 +116,7 @@ impl Ensemble {
         Ok(())
     }
 
-    fn rounded(&self) -> Result<Arc<Vec<Vec<Rounded>>>> {
+    fn rounded(&self) -> Result<RoundedKernels> {
         self.rounded.get(&self.weights, |weights| {
             let round = |k| self.networks.network(weights, k).round();
             (0..self.shape.members).into_par_iter().filter_map(round).collect()

@@ -6,8 +6,8 @@
 //! - `mlp`: K networks of layers act(x·W + b) as one operation of candle's, with gradients to x, W and b. It has a fast
 //!   implementation for the CPU, and a plain one (`plain`) that runs on any device and has layer norm.
 //! - [`Ensemble`] (`ensemble`): such networks as critics, value functions or means; [`NoisePredictor`] (`noise_predictor`):
-//!   ε_θ; [`Schedule`] (`schedule`): the noise schedule and one reverse step. What they compute without a gradient is fused
-//!   over whole networks: `sampler`, `ensemble_ops`.
+//!   ε_θ; [`Schedule`] (`schedule`): the noise schedule and one reverse step. `sampler` and `action_gradients` go through
+//!   whole networks tile by tile.
 //! - [`Weights`] (`weights`): a network's weights as one vector with named tensors in it; [`Gradients`] (`gradient`) of a loss
 //!   with respect to them; [`Adam`] (`optimiser`).
 //! - [`Policy`] (`policy`): what any policy can do; [`EpisodeState`] (`episode`): what it carries through an episode. `kind`
@@ -23,10 +23,10 @@
 
 #![deny(unsafe_code)]
 
+mod action_gradients;
 mod choice;
 mod diffusion;
 mod ensemble;
-mod ensemble_ops;
 mod episode;
 mod error;
 mod gaussian;

@@ -12,8 +12,12 @@ use crate::slices::{has_fast_implementation, on_cpu, slice};
 use crate::weights::Weights;
 use candle_core::{CpuStorage, CustomOp2, Layout, Result, Shape, Tensor, bail};
 use quad_kernels::activation::Activation;
+use quad_kernels::product::Rounded;
 use rayon::prelude::*;
 use std::sync::Arc;
+
+/// Of each member the kernels between hidden layers, rounded; empty where the CPU is as fast without.
+pub(crate) type RoundedKernels = Arc<Vec<Vec<Rounded>>>;
 
 /// Networks over some part of a vector of weights.
 #[derive(Clone)]
@@ -32,6 +36,11 @@ impl Mlp {
 
     /// `x [rows, in]`, or `[K, rows, in]` for inputs of each member's own → `[K, rows, out]`.
     pub fn forward(&self, weights: &Weights, x: &Tensor) -> Result<Tensor> {
+        self.forward_by(None, weights, x)
+    }
+
+    /// The same; where no gradient is taken, by these kernels of the members, rounded.
+    pub fn forward_by(&self, rounded: Option<RoundedKernels>, weights: &Weights, x: &Tensor) -> Result<Tensor> {
         let (values, layers) = (weights.values(), &self.layers);
         let fits = match *x.dims() {
             [rows, inputs] => rows > 0 && inputs == layers.inputs(),
@@ -46,7 +55,8 @@ impl Mlp {
         }
         let kept = if values.track_op() { weights.kept_gradient().cloned() } else { None };
         let saved = (values.track_op() || x.track_op()).then(|| self.saved.lend());
-        values.apply_op2(&x.contiguous()?, Operation { mlp: self.clone(), kept, saved, to_input: x.track_op() })
+        values
+            .apply_op2(&x.contiguous()?, Operation { mlp: self.clone(), kept, saved, rounded, to_input: x.track_op() })
     }
 
     /// Whether the fast implementation serves them.
@@ -66,11 +76,12 @@ impl Mlp {
     }
 
     /// Forward of plain rows, nothing kept: `K × rows × out`.
-    pub fn run(&self, weights: &[f32], x: &[f32], shared: bool, out: &mut [f32]) {
+    pub fn run(&self, weights: &[f32], rounded: Option<&[Vec<Rounded>]>, x: &[f32], shared: bool, out: &mut [f32]) {
         let (inputs, outputs) = (self.layers.inputs(), self.layers.outputs());
         let rows = out.len() / (self.layers.members() * outputs);
         out.par_chunks_mut(rows * outputs).enumerate().for_each(|(member, out)| {
-            let network = self.network(weights, member);
+            let rounded = rounded.and_then(|rounded| rounded.get(member)).map(Vec::as_slice);
+            let network = Network { rounded, ..self.network(weights, member) };
             let x = of_member(x, shared, rows * inputs, member);
             out.par_chunks_mut(TILE * outputs).enumerate().for_each(|(i, out)| {
                 let x = rows_of(x, i * TILE, TILE, inputs);
@@ -98,6 +109,8 @@ struct Operation {
     kept: Option<Arc<KeptGradient>>,
     /// What the forward pass keeps for the backward pass, if there is to be one.
     saved: Option<Lent<SavedActivations>>,
+    /// What the products between hidden layers use, if nothing is kept.
+    rounded: Option<RoundedKernels>,
     /// Whether the inputs are to get a gradient.
     to_input: bool,
 }
@@ -178,7 +191,7 @@ impl CustomOp2 for Operation {
         let mut out = vec![0.0; members * rows * outputs];
         match &self.saved {
             Some(saved) => self.forward_saving(weights, (x, shared), saved, &mut out),
-            None => self.mlp.run(weights, x, shared, &mut out),
+            None => self.mlp.run(weights, self.rounded.as_ref().map(|rounded| &***rounded), x, shared, &mut out),
         }
         Ok((CpuStorage::F32(out), (members, rows, outputs).into()))
     }
