@@ -12,6 +12,8 @@ use std::cell::RefCell;
 
 /// Rows of a tile that are worked on together in a task whose products are rounded: these are so fast that activations must be in the nearest cache.
 const BLOCK: usize = 32;
+/// Most inputs whose gradients are sums of products, one by one.
+const NARROW: usize = 16;
 
 /// One member of the networks in a vector of weights.
 #[derive(Clone, Copy)]
@@ -218,7 +220,11 @@ impl<'a> Network<'a> {
 
     /// After `backward`: the gradient of the inputs `from .. from + count`, `rows × count`.
     pub fn input_gradient(&self, first: &[f32], (from, count): (usize, usize), out: &mut [f32]) {
-        product_transposed(first, self.first_kernel(from, count), out, count, self.width());
+        match count {
+            // A library's product is slow at few columns.
+            0..=NARROW => dots(first, self.first_kernel(from, count), &[0.0; NARROW][..count], out, self.width()),
+            _ => product_transposed(first, self.first_kernel(from, count), out, count, self.width()),
+        }
     }
 }
 
