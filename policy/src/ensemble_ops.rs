@@ -5,8 +5,8 @@ use crate::layers::TILE;
 use crate::mlp::Mlp;
 use crate::network::{Input, Network, rows_of, with_workspace};
 use crate::operation::{Arguments, Operation};
+use crate::rounded::Kernels;
 use candle_core::{Result, Shape};
-use quad_kernels::product::Rounded;
 use rayon::prelude::*;
 use std::sync::Arc;
 
@@ -19,7 +19,7 @@ pub(crate) struct Networks {
 
 impl Networks {
     fn members(&self) -> usize {
-        self.mlp.layers.members()
+        self.mlp.layers.members
     }
 
     /// Cuts `out`, `K × rows × width`, into tiles of rows that do not part the actions of a state, and has `work` fill
@@ -46,7 +46,7 @@ impl Networks {
 /// What comes out of the networks: `K × rows × outputs`.
 pub(crate) struct Values {
     pub networks: Networks,
-    pub rounded: Option<Arc<Vec<Vec<Rounded>>>>,
+    pub rounded: Option<Arc<Kernels>>,
 }
 
 impl Operation for Values {

@@ -64,10 +64,10 @@ pub enum PolicyError {
     Candle(#[from] candle_core::Error),
 }
 
-/// Widest hidden layer, most critics and most denoising steps that are believed.
-const MOST: usize = u16::MAX as usize;
+/// Widest layer and most critics that are believed.
+pub(crate) const MOST: usize = u16::MAX as usize;
 
-/// That a number of a shape is within 1..=65535.
-pub(crate) fn check_range(field: &'static str, value: usize) -> Result<(), PolicyError> {
-    if (1..=MOST).contains(&value) { Ok(()) } else { Err(PolicyError::Range { field, value }) }
+/// That a number of a shape is from 1 to `most`.
+pub(crate) fn check_range(field: &'static str, value: usize, most: usize) -> Result<(), PolicyError> {
+    if (1..=most).contains(&value) { Ok(()) } else { Err(PolicyError::Range { field, value }) }
 }

@@ -22,7 +22,7 @@ pub(crate) struct Mlp {
     pub activation: Activation,
     /// Before the names of their tensors.
     prefix: &'static str,
-    saved: Pool<SavedActivations>,
+    saved: Pool,
 }
 
 impl Mlp {
@@ -35,11 +35,11 @@ impl Mlp {
         let (values, layers) = (weights.values(), &self.layers);
         let fits = match *x.dims() {
             [rows, inputs] => rows > 0 && inputs == layers.inputs(),
-            [members, rows, inputs] => members == layers.members() && rows > 0 && inputs == layers.inputs(),
+            [members, rows, inputs] => members == layers.members && rows > 0 && inputs == layers.inputs(),
             _ => false,
         };
         if !fits {
-            bail!("{} networks of {} numbers got inputs of shape {:?}", layers.members(), layers.inputs(), x.dims());
+            bail!("{} networks of {} numbers got inputs of shape {:?}", layers.members, layers.inputs(), x.dims());
         }
         if !self.is_fast(weights) {
             return self.plain_forward(weights, x);
@@ -51,7 +51,7 @@ impl Mlp {
 
     /// Whether the fast implementation serves them.
     pub fn is_fast(&self, weights: &Weights) -> bool {
-        has_fast_implementation(weights.values().device()) && !self.layers.norm()
+        has_fast_implementation(weights.values().device()) && !self.layers.norm
     }
 
     /// [`Self::forward`] in plain candle operations.
@@ -68,7 +68,7 @@ impl Mlp {
     /// Forward of plain rows, nothing kept: `K × rows × out`.
     pub fn run(&self, weights: &[f32], x: &[f32], shared: bool, out: &mut [f32]) {
         let (inputs, outputs) = (self.layers.inputs(), self.layers.outputs());
-        let rows = out.len() / (self.layers.members() * outputs);
+        let rows = out.len() / (self.layers.members * outputs);
         out.par_chunks_mut(rows * outputs).enumerate().for_each(|(member, out)| {
             let network = self.network(weights, member);
             let x = of_member(x, shared, rows * inputs, member);
@@ -97,21 +97,15 @@ struct Operation {
     /// Where the weights' gradient is left, if there is to be one.
     kept: Option<Arc<KeptGradient>>,
     /// What the forward pass keeps for the backward pass, if there is to be one.
-    saved: Option<Lent<SavedActivations>>,
+    saved: Option<Lent>,
     /// Whether the inputs are to get a gradient.
     to_input: bool,
 }
 
 impl Operation {
-    fn forward_saving(
-        &self,
-        weights: &[f32],
-        (x, shared): (&[f32], bool),
-        lent: &Lent<SavedActivations>,
-        out: &mut [f32],
-    ) {
+    fn forward_saving(&self, weights: &[f32], (x, shared): (&[f32], bool), lent: &Lent, out: &mut [f32]) {
         let layers = &self.mlp.layers;
-        let rows = out.len() / (layers.members() * layers.outputs());
+        let rows = out.len() / (layers.members * layers.outputs());
         let mut saved = lent.lock();
         saved.resize(layers, rows);
         saved.tiles(out).into_par_iter().for_each(|mut tile| {
@@ -131,7 +125,7 @@ impl Operation {
         saved: &mut SavedActivations,
     ) -> Result<Option<Vec<f32>>> {
         let layers = &self.mlp.layers;
-        let (members, inputs) = (layers.members(), layers.inputs());
+        let (members, inputs) = (layers.members, layers.inputs());
         let rows = gradient.len() / (members * layers.outputs());
         // The copy is cut up; the other is read as a whole.
         saved.tiles(&mut gradient.to_vec()).into_par_iter().for_each(|mut tile| {
@@ -173,7 +167,7 @@ impl CustomOp2 for Operation {
         x_layout: &Layout,
     ) -> Result<(CpuStorage, Shape)> {
         let (weights, x) = (slice(weights, weights_layout)?, slice(x, x_layout)?);
-        let (members, outputs) = (self.mlp.layers.members(), self.mlp.layers.outputs());
+        let (members, outputs) = (self.mlp.layers.members, self.mlp.layers.outputs());
         let (shared, rows) = (x_layout.dims().len() == 2, x_layout.dims()[x_layout.dims().len() - 2]);
         let mut out = vec![0.0; members * rows * outputs];
         match &self.saved {

@@ -43,13 +43,13 @@ pub(crate) fn mlp(weights: &Tensors, prefix: &str, layers: &Layers, f: Activatio
         let path = format!("{prefix}{layer}.{kind}");
         let tensor = weights.get(&path).ok_or_else(|| candle_core::Error::CannotFindTensor { path }.bt())?;
         let rows = if kind == "kernel" { layers.shape(layer).0 } else { 1 };
-        tensor.reshape((layers.members(), rows, layers.shape(layer).1))
+        tensor.reshape((layers.members, rows, layers.shape(layer).1))
     };
     let mut x = x.clone();
     for layer in 0..layers.count() {
         x = x.contiguous()?.broadcast_matmul(&get(layer, "kernel")?)?.broadcast_add(&get(layer, "bias")?)?;
         if layer + 1 < layers.count() {
-            if layers.norm() {
+            if layers.norm {
                 x = layer_norm(&x, &get(layer, "scale")?, &get(layer, "shift")?)?;
             }
             x = activate(f, &x)?;

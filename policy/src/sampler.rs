@@ -5,10 +5,11 @@ use crate::layers::TILE;
 use crate::mlp::Mlp;
 use crate::network::{Input, Network, rows_of, with_workspace};
 use crate::operation::{Arguments, Operation};
+use crate::rounded::Kernels;
 use crate::schedule::Schedule;
 use crate::shape::{NoiseShape, TIME_EMBEDDING};
 use candle_core::{Result, Shape};
-use quad_kernels::product::{Rounded, product};
+use quad_kernels::product::product;
 use rayon::prelude::*;
 use std::sync::Arc;
 
@@ -27,7 +28,7 @@ pub(crate) struct Parts {
 /// The custom operation of (weights, observations, noise) that draws actions.
 pub(crate) struct Sample {
     pub parts: Arc<Parts>,
-    pub rounded: Option<Arc<Option<Vec<Rounded>>>>,
+    pub rounded: Option<Arc<Kernels>>,
 }
 
 impl Parts {
@@ -81,7 +82,7 @@ impl Operation for Sample {
     fn forward(&self, given: Arguments<'_>) -> Result<(Vec<f32>, Shape)> {
         let action_dim = self.parts.shape.action_dim;
         let mut actions = vec![0.0; given.rows * action_dim];
-        let rounded = self.rounded.as_deref().and_then(Option::as_deref);
+        let rounded = self.rounded.as_ref().and_then(|rounded| rounded.first()).map(Vec::as_slice);
         let network = Network { rounded, ..self.parts.trunk.network(given.weights, 0) };
         self.parts.sample(network, given, &mut actions);
         Ok((actions, (given.rows, action_dim).into()))

@@ -32,7 +32,7 @@ pub(crate) struct Tile<'a> {
 impl SavedActivations {
     /// Makes room.
     pub fn resize(&mut self, layers: &Layers, rows: usize) {
-        (self.widths, self.members, self.rows) = (layers.hidden().to_vec(), layers.members(), rows);
+        (self.widths, self.members, self.rows) = (layers.hidden().to_vec(), layers.members, rows);
         self.x.resize_with(self.widths.len(), Buffer::default);
         self.slope.resize_with(self.widths.len(), Buffer::default);
     }
@@ -95,42 +95,31 @@ impl SavedActivations {
 }
 
 /// Memory that is used again: fresh memory of such sizes would cost as much as the arithmetic.
-pub(crate) struct Pool<T>(Arc<Mutex<Vec<T>>>);
+#[derive(Clone, Default)]
+pub(crate) struct Pool(Arc<Mutex<Vec<SavedActivations>>>);
 
-impl<T> Clone for Pool<T> {
-    fn clone(&self) -> Self {
-        Self(self.0.clone())
-    }
-}
-
-impl<T> Default for Pool<T> {
-    fn default() -> Self {
-        Self(Arc::default())
-    }
-}
-
-impl<T: Default> Pool<T> {
+impl Pool {
     /// One that is lent until it is dropped.
-    pub fn lend(&self) -> Lent<T> {
+    pub fn lend(&self) -> Lent {
         let lent = self.0.lock().unwrap_or_else(PoisonError::into_inner).pop().unwrap_or_default();
         Lent { lent: Mutex::new(lent), home: self.clone() }
     }
 }
 
 /// What a pool has lent.
-pub(crate) struct Lent<T: Default> {
-    lent: Mutex<T>,
-    home: Pool<T>,
+pub(crate) struct Lent {
+    lent: Mutex<SavedActivations>,
+    home: Pool,
 }
 
-impl<T: Default> Lent<T> {
+impl Lent {
     /// Access to it, of one at a time.
-    pub fn lock(&self) -> MutexGuard<'_, T> {
+    pub fn lock(&self) -> MutexGuard<'_, SavedActivations> {
         self.lent.lock().unwrap_or_else(PoisonError::into_inner)
     }
 }
 
-impl<T: Default> Drop for Lent<T> {
+impl Drop for Lent {
     fn drop(&mut self) {
         let lent = std::mem::take(self.lent.get_mut().unwrap_or_else(PoisonError::into_inner));
         self.home.0.lock().unwrap_or_else(PoisonError::into_inner).push(lent);
