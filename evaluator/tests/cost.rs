@@ -45,12 +45,13 @@ fn loaded(policy: PolicyConfig, tensors: &Tensors) -> Box<dyn Policy> {
 }
 
 fn diffusion(hidden: usize, critics: usize, diffusion_steps: usize, choice: Choice) -> Box<dyn Policy> {
-    let shape = DiffusionShape::quad((11, 3), &MlpConfig::mish(&[hidden; 3]), critics, diffusion_steps);
+    let layers = MlpConfig::mish(&[hidden; 3]);
+    let value = (choice.rule == Rule::Nearest).then(|| layers.clone());
+    let shape = DiffusionShape { value, ..DiffusionShape::quad((11, 3), &layers, critics, diffusion_steps) };
     let actor = NoisePredictor::new(shape.actor(), zeros(shape.actor().layout()), Precision::F32);
     let critics = Ensemble::new(shape.critics(), zeros(shape.critics().layout()), Precision::F32);
-    let value = Ensemble::new(shape.value(), zeros(shape.value().layout()), Precision::F32);
-    let value = Some(&value).filter(|_| choice.needs_value());
-    let tensors = DiffusionPolicy::tensors(&actor, &critics, value).unwrap();
+    let value = shape.value().map(|of| Ensemble::new(of.clone(), zeros(of.layout()), Precision::F32));
+    let tensors = DiffusionPolicy::tensors(&actor, &critics, value.as_ref()).unwrap();
     loaded(PolicyConfig::Diffusion { shape, choice }, &tensors)
 }
 

@@ -55,11 +55,6 @@ impl Choice {
         Self { candidates, value: Reduce::Mean, rule: Rule::Best }
     }
 
-    /// Whether it takes a value function beside the critics.
-    pub fn needs_value(&self) -> bool {
-        self.rule == Rule::Nearest
-    }
-
     /// That it can be acted with.
     ///
     /// # Errors

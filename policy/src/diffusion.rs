@@ -184,7 +184,7 @@ impl Policy for DiffusionPolicy {
 
     fn choose(&mut self, choice: Choice) -> Result<(), PolicyError> {
         choice.check()?;
-        if choice.needs_value() && self.value.is_none() {
+        if choice.rule == Rule::Nearest && self.value.is_none() {
             return Err(PolicyError::NoValue);
         }
         self.choice = choice;

@@ -21,13 +21,8 @@ pub struct Ensemble {
 impl Ensemble {
     /// `weights` are of the shape's layout; `precision` is for what no gradient is taken of.
     pub fn new(shape: EnsembleShape, weights: Weights, precision: Precision) -> Self {
-        let networks = Mlp::new(shape.layers(), shape.layers.activation, "");
+        let networks = Mlp::new(shape.layers(), "");
         Self { shape, networks, weights, rounding: Rounding::new(precision) }
-    }
-
-    /// Its shape.
-    pub fn shape(&self) -> &EnsembleShape {
-        &self.shape
     }
 
     /// Its weights.

@@ -93,16 +93,13 @@ fn check_gradient(
     let size = gradient.sqr().unwrap().sum_all().unwrap().to_scalar::<f32>().unwrap().sqrt();
     assert!(size > 1e-3, "{what}: no gradient");
     let random = tensor(generator, at.dims());
-    let mut steps = Vec::new();
     for direction in [gradient.detach(), random] {
         let length = direction.sqr().unwrap().sum_all().unwrap().to_scalar::<f32>().unwrap().sqrt();
         let moved = (direction * (step / f64::from(length))).unwrap();
         let expected = (gradient * &moved).unwrap().sum_all().unwrap().to_scalar::<f32>().unwrap();
         let found = (value((at + &moved).unwrap()) - value((at - &moved).unwrap())) / 2.0;
-        steps.push((found, f64::from(expected)));
-    }
-    for (found, expected) in &steps {
-        assert!((found - expected).abs() < room * f64::from(size) * step, "{what}: {steps:?}");
+        let difference = (found - f64::from(expected)).abs();
+        assert!(difference < room * f64::from(size) * step, "{what}: {found} for {expected}");
     }
 }
 
@@ -183,9 +180,9 @@ fn ensembles_give_the_plain_values_and_gradients() {
         let [once, again] = [0; 2].map(|_| loss(&networks.outputs(&observations, &actions).unwrap()));
         close("twice", &gradients((once + again).unwrap()).0, &(fast.0 * 2.0).unwrap());
 
-        let critics = ensemble(&mut generator, EnsembleShape { outputs: 1, ..shape });
+        let critics = ensemble(&mut generator, EnsembleShape { outputs: 1, ..shape.clone() });
         let gradients = || critics.action_gradients(&observations, &actions).unwrap();
-        if critics.shape().action_dim > 0 {
+        if shape.action_dim > 0 {
             close(&format!("action gradients of {what}"), &gradients(), &plainly(gradients));
         }
     }
@@ -243,7 +240,7 @@ fn adam_the_ema_and_statistics_do_what_plain_operations_do() {
     let mut generator = ChaCha8Rng::seed_from_u64(1);
     for (clip, decay) in [(None, 0.0), (Some(0.3), 0.0), (Some(1e6), 0.0), (None, 0.5)] {
         // Enough numbers for several chunks, and no whole number of registers.
-        let shape = EnsembleShape { layers: MlpConfig::mish(&[77, 78]), ..shape(&mut generator) };
+        let shape = EnsembleShape { members: 3, layers: MlpConfig::mish(&[77, 78]), ..shape(&mut generator) };
         let mut fast = weights(shape.layout(), &mut generator);
         let mut plain = Weights::trainable(shape.layout(), fast.values()).unwrap();
         let [mut fast_adam, mut plain_adam] = [&fast, &plain].map(|weights| Adam::new(weights, decay).unwrap());
@@ -262,10 +259,8 @@ fn adam_the_ema_and_statistics_do_what_plain_operations_do() {
     }
     for dims in [vec![1, 4], vec![3, 7], vec![10, 5, 3]] {
         let x = tensor(&mut generator, &dims);
-        let statistics = || mean_and_variance(&x).unwrap();
-        let ((a, b), (c, d)) = (statistics(), plainly(statistics));
-        close("mean", &a, &c);
-        close("variance", &b, &d);
+        let statistics = || <[Tensor; 2]>::from(mean_and_variance(&x).unwrap());
+        statistics().iter().zip(plainly(statistics)).for_each(|(fast, plain)| close("statistics", fast, &plain));
     }
 }
 

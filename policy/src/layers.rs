@@ -5,6 +5,7 @@
 
 use crate::mlp_config::{Initial, MlpConfig};
 use crate::weights::{Part, Start};
+use quad_kernels::activation::Activation;
 use std::ops::Range;
 
 /// Rows that one task works on: weights and activations of a tile stay in a core's own cache.
@@ -18,6 +19,7 @@ pub(crate) struct Layers {
     widths: Vec<usize>,
     /// Whether a norm stands between the hidden layers' linear maps and their activations.
     pub norm: bool,
+    pub activation: Activation,
     initial: Initial,
     /// Of each layer's first kernel; behind the last layer, of the end.
     offsets: Vec<usize>,
@@ -35,7 +37,8 @@ impl Layers {
     /// The first kernel lies at `start`.
     pub fn new(members: usize, inputs: usize, config: &MlpConfig, outputs: usize, start: usize) -> Self {
         let widths: Vec<usize> = [inputs].iter().chain(&config.hidden).chain(&[outputs]).copied().collect();
-        let mut layers = Self { members, widths, norm: config.norm, initial: config.initial, offsets: vec![start] };
+        let MlpConfig { norm, activation, initial, .. } = *config;
+        let mut layers = Self { members, widths, norm, activation, initial, offsets: vec![start] };
         for layer in 0..layers.count() {
             let ((inputs, outputs), normed) = (layers.shape(layer), layers.is_normed(layer));
             let numbers = (inputs + if normed { 3 } else { 1 }) * outputs;

@@ -10,7 +10,6 @@ use crate::schedule::Schedule;
 use crate::shape::{NoiseShape, TIME_FEATURES};
 use crate::weights::Weights;
 use candle_core::{D, DType, Result, Tensor, bail};
-use quad_kernels::activation::Activation;
 use std::sync::Arc;
 
 /// A noise predictor and its weights.
@@ -32,8 +31,8 @@ impl NoisePredictor {
     /// `weights` are of the shape's layout; `precision` is for what no gradient is taken of.
     pub fn new(shape: NoiseShape, weights: Weights, precision: Precision) -> Self {
         let parts = Parts {
-            time: Mlp::new(shape.time_layers(), Activation::Mish, "time."),
-            trunk: Mlp::new(shape.trunk_layers(), shape.layers.activation, "trunk."),
+            time: Mlp::new(shape.time_layers(), "time."),
+            trunk: Mlp::new(shape.trunk_layers(), "trunk."),
             schedule: Schedule::variance_preserving(shape.diffusion_steps, shape.reverse),
             features: time_features(shape.diffusion_steps),
             shape,

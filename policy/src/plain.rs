@@ -37,7 +37,7 @@ fn layer_norm(x: &Tensor, scale: &Tensor, shift: &Tensor) -> Result<Tensor> {
 }
 
 /// Layers `{prefix}0 …`: `x [1 or K, rows, in]` → `[K, rows, out]`.
-pub(crate) fn mlp(weights: &Tensors, prefix: &str, layers: &Layers, f: Activation, x: &Tensor) -> Result<Tensor> {
+pub(crate) fn mlp(weights: &Tensors, prefix: &str, layers: &Layers, x: &Tensor) -> Result<Tensor> {
     // `[K, in, out]` or `[K, 1, out]`, whether the tensors are named as members' or as one network's.
     let get = |layer: usize, kind: &str| {
         let path = format!("{prefix}{layer}.{kind}");
@@ -52,7 +52,7 @@ pub(crate) fn mlp(weights: &Tensors, prefix: &str, layers: &Layers, f: Activatio
             if layers.norm {
                 x = layer_norm(&x, &get(layer, "scale")?, &get(layer, "shift")?)?;
             }
-            x = activate(f, &x)?;
+            x = activate(layers.activation, &x)?;
         }
     }
     Ok(x)

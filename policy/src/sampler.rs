@@ -36,7 +36,7 @@ impl Parts {
     fn shifts(&self, weights: &[f32]) -> Vec<f32> {
         let NoiseShape { observation_dim, action_dim, diffusion_steps, .. } = self.shape;
         let mut embedding = vec![0.0; diffusion_steps * TIME_EMBEDDING];
-        self.time.run(weights, &self.features, true, &mut embedding);
+        self.time.run(weights, &self.features, &mut embedding);
         let network = self.trunk.network(weights, 0);
         let mut shifts = vec![0.0; diffusion_steps * network.width()];
         let kernel = network.first_kernel(observation_dim + action_dim, TIME_EMBEDDING);

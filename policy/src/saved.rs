@@ -70,17 +70,12 @@ impl SavedActivations {
         self.of_member(&self.slope[0], 0, member)
     }
 
-    /// After the backward pass: the gradients of these layers. `input` gives a member's rows, `output_gradient` is
+    /// After the backward pass: the gradients of these layers. `input` is `rows × inputs`, `output_gradient`
     /// `members × rows × outputs`.
-    pub fn weight_gradients<'a>(
-        &self,
-        layers: Vec<LayerMut<'_>>,
-        input: impl Fn(usize) -> &'a [f32] + Sync,
-        output_gradient: &[f32],
-    ) {
+    pub fn weight_gradients(&self, layers: Vec<LayerMut<'_>>, input: &[f32], output_gradient: &[f32]) {
         layers.into_par_iter().for_each(|LayerMut { layer, member, kernel, bias }| {
             let x = match layer {
-                0 => input(member),
+                0 => input,
                 _ => self.of_member(&self.x[layer - 1], layer - 1, member),
             };
             let columns = bias.len();

@@ -123,18 +123,16 @@ impl Layout {
 /// It is missing, or has another type or shape, or a number that is not finite.
 pub fn take(tensors: &mut Tensors, name: String, shape: &[usize]) -> std::result::Result<Tensor, PolicyError> {
     let Some(tensor) = tensors.remove(&name) else { return Err(PolicyError::Missing(name)) };
-    if tensor.dtype() != DType::F32 {
-        return Err(PolicyError::Type { name, found: format!("{:?}", tensor.dtype()) });
-    }
-    if tensor.dims() != shape {
-        return Err(PolicyError::Shape { name, found: tensor.dims().to_vec(), expected: shape.to_vec() });
+    let [found, expected] = [(tensor.dtype(), tensor.dims()), (DType::F32, shape)].map(|form| format!("{form:?}"));
+    if found != expected {
+        return Err(PolicyError::Shape { name, found, expected });
     }
     check_finite(&name, &tensor)?;
     Ok(tensor)
 }
 
 /// That a tensor holds neither a NaN nor an infinity.
-pub fn check_finite(name: &str, tensor: &Tensor) -> std::result::Result<(), PolicyError> {
+pub(crate) fn check_finite(name: &str, tensor: &Tensor) -> std::result::Result<(), PolicyError> {
     let numbers = tensor.flatten_all()?.to_vec1::<f32>()?;
     if numbers.iter().all(|x| x.is_finite()) { Ok(()) } else { Err(PolicyError::NotFinite(name.to_owned())) }
 }

@@ -132,7 +132,7 @@ fn a_state_that_does_not_fit_is_refused() {
         assert!(!refused(quad.0, &quad.1, bytes).is_empty());
     }
     let policy = agent(quad.0, &quad.1, &context).policy(&origin()).unwrap();
-    assert!(refused(quad.0, &quad.1, &policy).contains("counters"));
+    assert!(refused(quad.0, &quad.1, &policy).contains("`state`"));
 }
 
 #[test]
