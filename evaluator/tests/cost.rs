@@ -46,7 +46,7 @@ fn loaded(policy: PolicyConfig, tensors: &Tensors) -> Box<dyn Policy> {
 
 fn diffusion(hidden: usize, critics: usize, diffusion_steps: usize, choice: Choice) -> Box<dyn Policy> {
     let layers = MlpConfig::mish(&[hidden; 3]);
-    let value = choice.needs_value().then(|| layers.clone());
+    let value = (choice.rule == Rule::Nearest).then(|| layers.clone());
     let shape = DiffusionShape { value, ..DiffusionShape::quad((11, 3), &layers, critics, diffusion_steps) };
     let actor = NoisePredictor::new(shape.actor(), zeros(shape.actor().layout()), Precision::F32);
     let critics = Ensemble::new(shape.critics(), zeros(shape.critics().layout()), Precision::F32);

@@ -15,22 +15,9 @@ use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 use std::time::Duration;
 
-/// Right-hand sides that take turns: the hidden layers of ten critics, which come from a cache that cores share.
+/// Right-hand sides that take turns: the hidden layers of ten critics, which come from a cache that cores share. So do the
+/// results of outer products, the gradients of as many layers.
 const IN_TURN: usize = 20;
-
-/// Rows, inner size and columns of a product.
-#[derive(Clone, Copy)]
-struct Shape {
-    m: usize,
-    k: usize,
-    n: usize,
-}
-
-impl Shape {
-    fn operations(self) -> u64 {
-        2 * (self.m * self.k * self.n) as u64
-    }
-}
 
 /// A matrix and its transpose have the same elements at other distances.
 #[derive(Clone, Copy)]
@@ -54,7 +41,7 @@ fn zeros(len: usize) -> Buffer {
 }
 
 /// `out[m × n] = a[m × k] · b[k × n]`, where either may be stored as its transpose.
-fn by_gemm(Shape { m, k, n }: Shape, a: (&[f32], Order), b: (&[f32], Order), out: &mut [f32]) {
+fn by_gemm([m, k, n]: [usize; 3], a: (&[f32], Order), b: (&[f32], Order), out: &mut [f32]) {
     assert!(a.0.len() == m * k && b.0.len() == k * n && out.len() == m * n, "the product's shape");
     /// Distances between columns and between rows.
     fn strides(order: Order, rows: usize, columns: usize) -> (isize, isize) {
@@ -73,101 +60,63 @@ fn by_gemm(Shape { m, k, n }: Shape, a: (&[f32], Order), b: (&[f32], Order), out
     }
 }
 
-fn group<'a>(criterion: &'a mut Criterion, name: String, elements: u64) -> BenchmarkGroup<'a, WallTime> {
+fn group<'a>(criterion: &'a mut Criterion, name: &str, elements: usize) -> BenchmarkGroup<'a, WallTime> {
     let mut group = criterion.benchmark_group(name);
     group.sample_size(20).warm_up_time(Duration::from_millis(200)).measurement_time(Duration::from_millis(800));
-    group.throughput(Throughput::Elements(elements));
+    group.throughput(Throughput::Elements(elements as u64));
     group
 }
 
-/// Benchmarks `work` with one right-hand side and with [`IN_TURN`]; it is given the number of the one to take.
-fn bench(group: &mut BenchmarkGroup<'_, WallTime>, name: &str, sides: usize, mut work: impl FnMut(usize)) {
-    let mut turn = 0;
-    group.bench_function(BenchmarkId::new(name, format!("{sides} in turn")), |bencher| {
-        bencher.iter(|| {
-            turn = (turn + 1) % sides;
-            work(turn);
+/// One of our products beside gemm's. `ours` is given the number of the right-hand side, the two sides, and the result.
+fn compare(
+    criterion: &mut Criterion,
+    (name, [m, k, n]): (&str, [usize; 3]),
+    (a_order, b_order, outs): (Order, Order, usize),
+    ours: impl Fn(usize, &[f32], &[f32], &mut [f32]),
+) {
+    let mut group = group(criterion, name, 2 * m * k * n);
+    let left = numbers(m * k, 0);
+    let a = left.first(m * k);
+    let right: Vec<_> = (1..=IN_TURN).map(|seed| numbers(k * n, seed)).collect();
+    let mut outs: Vec<_> = (0..outs).map(|_| zeros(m * n)).collect();
+    let count = outs.len();
+    let by_gemm = |_, a: &[f32], b: &[f32], out: &mut [f32]| by_gemm([m, k, n], (a, a_order), (b, b_order), out);
+    let both: [(&str, &dyn Fn(usize, &[f32], &[f32], &mut [f32])); 2] = [("ours", &ours), ("gemm", &by_gemm)];
+    for (sides, (name, work)) in [1, IN_TURN].into_iter().flat_map(|sides| both.map(|one| (sides, one))) {
+        let mut turn = 0;
+        group.bench_function(BenchmarkId::new(name, format!("{sides} in turn")), |bencher| {
+            bencher.iter(|| {
+                turn = (turn + 1) % sides;
+                work(turn, a, right[turn].first(k * n), outs[turn % count].sized(m * n));
+            });
         });
-    });
+    }
+    group.finish();
 }
 
-/// The two layers of the paper's networks, of the demonstration's, and the first.
+/// A layer's forward pass, the gradient that it passes on, and that of its weights: the hidden layers of the paper's networks
+/// and of the demonstration's, and the first layer.
 fn products(criterion: &mut Criterion) {
-    for (m, k, n) in [(128, 256, 256), (128, 128, 128), (128, 11, 256)] {
-        let shape = Shape { m, k, n };
-        let mut group = group(criterion, format!("product, {m} × {k} × {n}"), shape.operations());
-        let (x, mut out) = (numbers(m * k, 0), zeros(m * n));
-        let (x, out) = (x.first(m * k), out.sized(m * n));
-        let weights: Vec<_> = (1..=IN_TURN).map(|seed| numbers(k * n, seed)).collect();
-        for sides in [1, IN_TURN] {
-            bench(&mut group, "ours", sides, |i| product(x, weights[i].first(k * n), out, k, n));
-            bench(&mut group, "gemm", sides, |i| {
-                by_gemm(shape, (x, Order::RowMajor), (weights[i].first(k * n), Order::RowMajor), out);
-            });
-        }
-        group.finish();
+    for [m, k, n] in [[128, 256, 256], [128, 128, 128], [128, 11, 256]] {
+        let (name, orders) = (format!("product, {m} × {k} × {n}"), (Order::RowMajor, Order::RowMajor, 1));
+        compare(criterion, (&name, [m, k, n]), orders, |_, x, weights, out| product(x, weights, out, k, n));
     }
-}
-
-/// The backward pass through a layer.
-fn transposed(criterion: &mut Criterion) {
-    for (m, k, n) in [(128, 256, 256), (128, 128, 128)] {
-        let shape = Shape { m, k: n, n: k };
-        let mut group = group(criterion, format!("product with the transpose, {m} × {n} × {k}"), shape.operations());
-        let (g, mut out) = (numbers(m * n, 0), zeros(m * k));
-        let (g, out) = (g.first(m * n), out.sized(m * k));
-        let weights: Vec<_> = (1..=IN_TURN).map(|seed| numbers(k * n, seed)).collect();
-        for sides in [1, IN_TURN] {
-            bench(&mut group, "ours", sides, |i| product_transposed(g, weights[i].first(k * n), out, k, n));
-            bench(&mut group, "gemm", sides, |i| {
-                by_gemm(shape, (g, Order::RowMajor), (weights[i].first(k * n), Order::Transposed), out);
-            });
-        }
-        group.finish();
+    for [m, k, n] in [[128, 256, 256], [128, 128, 128]] {
+        let name = format!("product with the transpose, {m} × {n} × {k}");
+        let orders = (Order::RowMajor, Order::Transposed, 1);
+        compare(criterion, (&name, [m, n, k]), orders, |_, g, weights, out| product_transposed(g, weights, out, k, n));
     }
-}
-
-/// The gradient of a layer's weights: there, each result has a place of its own, too.
-fn outers(criterion: &mut Criterion) {
-    for (m, k, n) in [(128, 256, 256), (256, 256, 256), (128, 128, 128)] {
-        let shape = Shape { m: k, k: m, n };
-        let mut group = group(criterion, format!("outer product of {m} rows, {k} × {n}"), shape.operations());
-        let x = numbers(m * k, 0);
-        let x = x.first(m * k);
-        let gradients: Vec<_> = (1..=IN_TURN).map(|seed| numbers(m * n, seed)).collect();
-        let mut outs: Vec<_> = (0..IN_TURN).map(|_| zeros(k * n)).collect();
-        for sides in [1, IN_TURN] {
-            bench(&mut group, "ours", sides, |i| {
-                outer(x, gradients[i].first(m * n), outs[i].sized(k * n), k, n);
-            });
-            bench(&mut group, "gemm", sides, |i| {
-                let (x, g) = ((x, Order::Transposed), (gradients[i].first(m * n), Order::RowMajor));
-                by_gemm(shape, x, g, outs[i].sized(k * n));
-            });
-        }
-        group.finish();
+    for [m, k, n] in [[128, 256, 256], [256, 256, 256], [128, 128, 128]] {
+        let name = format!("outer product of {m} rows, {k} × {n}");
+        let orders = (Order::Transposed, Order::RowMajor, IN_TURN);
+        compare(criterion, (&name, [k, m, n]), orders, |_, x, g, out| outer(x, g, out, k, n));
     }
-}
-
-/// The product of rounded operands, the right one rounded before; the library has none and multiplies in f32. Nothing
-/// is measured on a CPU that gains nothing by it.
-fn rounded(criterion: &mut Criterion) {
-    for (m, k, n) in [(32, 256, 256), (32, 128, 128)] {
-        let shape = Shape { m, k, n };
-        let (x, mut out) = (numbers(m * k, 0), zeros(m * n));
-        let (x, out) = (x.first(m * k), out.sized(m * n));
-        let weights: Vec<_> = (1..=IN_TURN).map(|seed| numbers(k * n, seed)).collect();
-        let rounded: Option<Vec<_>> = weights.iter().map(|w| Rounded::new(w.first(k * n), k, n)).collect();
-        let Some(rounded) = rounded else { return };
-        let mut group = group(criterion, format!("bf16 product, {m} × {k} × {n}"), shape.operations());
-        for sides in [1, IN_TURN] {
-            bench(&mut group, "ours", sides, |i| rounded[i].product(x, out));
-            bench(&mut group, "ours in f32", sides, |i| product(x, weights[i].first(k * n), out, k, n));
-            bench(&mut group, "gemm in f32", sides, |i| {
-                by_gemm(shape, (x, Order::RowMajor), (weights[i].first(k * n), Order::RowMajor), out);
-            });
-        }
-        group.finish();
+    // The library has no product of rounded operands and multiplies in f32; nor has a CPU that gains nothing by it.
+    for [m, k, n] in [[32, 256, 256], [32, 128, 128]] {
+        let round = |seed| Rounded::new(numbers(k * n, seed).first(k * n), k, n);
+        let Some(rounded) = (1..=IN_TURN).map(round).collect::<Option<Vec<_>>>() else { return };
+        let (name, orders) = (format!("bf16 product, {m} × {k} × {n}"), (Order::RowMajor, Order::RowMajor, 1));
+        compare(criterion, (&name, [m, k, n]), orders, |i, x, _, out| rounded[i].product(x, out));
     }
 }
 
@@ -185,7 +134,7 @@ fn mish_by_std(x: &mut [f32]) {
 fn activations(criterion: &mut Criterion) {
     let (rows, width) = (128, 256);
     let len = rows * width;
-    let mut group = group(criterion, format!("activation, {rows} × {width}"), len as u64);
+    let mut group = group(criterion, &format!("activation, {rows} × {width}"), len);
     let (x, bias, mut y, mut slope) = (numbers(len, 0), numbers(width, 1), zeros(len), zeros(len));
     let (x, bias, y, slope) = (x.first(len), bias.first(width), y.sized(len), slope.sized(len));
     let mut bench = |name: &str, work: &mut dyn FnMut(&mut [f32])| {
@@ -203,5 +152,5 @@ fn activations(criterion: &mut Criterion) {
     group.finish();
 }
 
-criterion_group!(benches, products, transposed, outers, rounded, activations);
+criterion_group!(benches, products, activations);
 criterion_main!(benches);

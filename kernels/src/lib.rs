@@ -5,7 +5,7 @@
 //! - [`product`]: dense products on one thread, in f32 and with operands rounded to bfloat16.
 //! - `avx512`: the products that the libraries at hand do more slowly (docs/results.md says by how much).
 //! - [`activation`]: Mish and its derivative; [`narrow`]: the first and last layer of a network, fused with it.
-//! - [`optimiser`]: Adam, EMA and sums over whole parameter vectors.
+//! - [`optimiser`]: Adam and EMA over whole parameter vectors.
 //! - [`Buffer`] (`buffer`): memory that is used again and again, aligned to cache lines.
 //! - `vectorised`: the macro that the loops of the two above are written with.
 //!

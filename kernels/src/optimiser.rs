@@ -60,24 +60,6 @@ fn ema_chunk(target: &mut [f32], online: &[f32], rate: f32) {
     }
 }
 
-#[multiversion(targets("x86_64+avx512f+avx512dq+avx512vl+avx512bw+avx2+fma", "x86_64+avx2+fma"))]
-fn add_scaled(sum: &mut [f32], x: &[f32], factor: f32) {
-    for (sum, x) in sum.iter_mut().zip(x) {
-        *sum += factor * x;
-    }
-}
-
-/// `sum = factor · Σ x`, where `x` is several vectors of `sum`'s length, one after the other.
-pub fn weighted_sum(x: &[f32], factor: f32, sum: &mut [f32]) {
-    let len = sum.len();
-    sum.par_chunks_mut(CHUNK).enumerate().for_each(|(i, sum)| {
-        sum.fill(0.0);
-        for x in x.chunks_exact(len) {
-            add_scaled(sum, &x[i * CHUNK..][..sum.len()], factor);
-        }
-    });
-}
-
 /// The Euclidean norm. The order of the sum does not depend on the number of threads.
 pub fn norm(x: &[f32]) -> f32 {
     let squares: Vec<f32> = x.par_chunks(CHUNK).map(sum_of_squares).collect();

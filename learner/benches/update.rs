@@ -172,7 +172,7 @@ fn parts_of(group: &mut BenchmarkGroup<'_, WallTime>, experiment: &Experiment, s
         Weights::trainable(layout, &values)
     };
     let (actor, critics) = (weights(shape.actor().layout())?, weights(shape.critics().layout())?);
-    let (mut actor_adam, mut critic_adam) = (Adam::new(&actor)?, Adam::new(&critics)?);
+    let (mut actor_adam, mut critic_adam) = (Adam::new(&actor, 0.0)?, Adam::new(&critics, 0.0)?);
     let mut target_actor = NoisePredictor::new(shape.actor(), actor.copy()?, Precision::F32);
     let mut target_critics = Ensemble::new(shape.critics(), critics.copy()?, Precision::F32);
     let mut actor = NoisePredictor::new(shape.actor(), actor, Precision::F32);

@@ -19,7 +19,7 @@ impl Operation for ActionGradients {
     fn forward(&self, given: Arguments<'_>) -> Result<(Vec<f32>, Shape)> {
         let Arguments { weights, observations, actions, states, rows } = given;
         let (o, a, repeat) = (observations.len() / states, actions.len() / rows, rows / states);
-        let (layers, members) = (&self.networks.layers, self.networks.layers.members());
+        let (layers, members) = (&self.networks.layers, self.networks.layers.members);
         let mut out = vec![0.0; members * rows * a];
         out.par_chunks_mut(rows * a).enumerate().for_each(|(member, out)| {
             let network = self.networks.network(weights, member);

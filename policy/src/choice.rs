@@ -1,7 +1,8 @@
 //! How a policy that samples chooses among the actions that it has drawn in a state.
 
 use crate::episode::EpisodeState;
-use crate::error::PolicyError;
+use crate::error::{PolicyError, check_range};
+use serde::de::{self, IntoDeserializer};
 use serde::{Deserialize, Serialize};
 use std::fmt;
 use std::str::FromStr;
@@ -54,19 +55,12 @@ impl Choice {
         Self { candidates, value: Reduce::Mean, rule: Rule::Best }
     }
 
-    /// Whether it takes a value function beside the critics.
-    pub fn needs_value(&self) -> bool {
-        self.rule == Rule::Nearest
-    }
-
     /// That it can be acted with.
     ///
     /// # Errors
     /// A number of candidates or a temperature out of range.
     pub fn check(&self) -> Result<(), PolicyError> {
-        if !(1..=Self::MOST_CANDIDATES).contains(&self.candidates) {
-            return Err(PolicyError::Range { field: "candidates", value: self.candidates as usize });
-        }
+        check_range("candidates", self.candidates as usize, Self::MOST_CANDIDATES as usize)?;
         match self.rule {
             Rule::Softmax { temperature } if !(temperature > 0.0 && temperature.is_finite()) => {
                 Err(PolicyError::Temperature(temperature))
@@ -91,19 +85,14 @@ impl Reduce {
     /// The value of each of `rows` actions, of `values`, `critics × rows`. A NaN of one critic is kept.
     pub(crate) fn reduce(self, values: &[f32], rows: usize) -> Vec<f32> {
         let critics = (values.len() / rows) as f32;
-        let (first, of_each): (f32, fn(&mut f32, f32, f32)) = match self {
-            Self::Mean => (0.0, |mean, q, critics| *mean += q / critics),
-            Self::Min => (f32::INFINITY, |min, q, _| {
-                if q < *min || q.is_nan() {
-                    *min = q;
-                }
-            }),
+        let of_action = |row| {
+            let values = values.iter().skip(row).step_by(rows).copied();
+            match self {
+                Self::Mean => values.map(|q| q / critics).sum(),
+                Self::Min => values.fold(f32::INFINITY, |min, q| if q < min || q.is_nan() { q } else { min }),
+            }
         };
-        let mut reduced = vec![first; rows];
-        for critic in values.chunks_exact(rows) {
-            reduced.iter_mut().zip(critic).for_each(|(value, q)| of_each(value, *q, critics));
-        }
-        reduced
+        (0..rows).map(of_action).collect()
     }
 }
 
@@ -131,14 +120,10 @@ fn draw(worth: &[f32], temperature: f32, uniform: f64) -> usize {
 }
 
 impl FromStr for Reduce {
-    type Err = &'static str;
+    type Err = de::value::Error;
 
     fn from_str(name: &str) -> Result<Self, Self::Err> {
-        match name {
-            "mean" => Ok(Self::Mean),
-            "min" => Ok(Self::Min),
-            _ => Err("one of mean and min"),
-        }
+        Self::deserialize(name.into_deserializer())
     }
 }
 

@@ -4,7 +4,7 @@
 use crate::choice::{Choice, Rule};
 use crate::ensemble::Ensemble;
 use crate::episode::EpisodeState;
-use crate::error::{PolicyError, check_range};
+use crate::error::{MOST, PolicyError, check_range};
 use crate::mlp_config::MlpConfig;
 use crate::noise_predictor::NoisePredictor;
 use crate::policy::Policy;
@@ -12,7 +12,7 @@ use crate::precision::Precision;
 use crate::schedule::Reverse;
 use crate::shape::{EnsembleShape, NoiseShape, tile_numbers};
 use crate::slices::read;
-use crate::weights::{Layout, Tensors, Weights};
+use crate::weights::{Tensors, Weights};
 use candle_core::{Device, Tensor};
 use serde::{Deserialize, Serialize};
 
@@ -81,16 +81,10 @@ impl DiffusionShape {
     }
 
     fn check(&self) -> Result<(), PolicyError> {
-        check_range("observation_dim", self.observation_dim)?;
-        check_range("action_dim", self.action_dim)?;
-        self.actor.check("actor.hidden")?;
-        self.critic.check("critic.hidden")?;
-        self.value.as_ref().map_or(Ok(()), |value| value.check("value.hidden"))?;
-        check_range("critics", self.critics)?;
-        if self.diffusion_steps > MOST_STEPS {
-            return Err(PolicyError::Range { field: "diffusion_steps", value: self.diffusion_steps });
-        }
-        check_range("diffusion_steps", self.diffusion_steps)
+        check_range("observation_dim", self.observation_dim, MOST)?;
+        check_range("action_dim", self.action_dim, MOST)?;
+        check_range("critics", self.critics, MOST)?;
+        check_range("diffusion_steps", self.diffusion_steps, MOST_STEPS)
     }
 }
 
@@ -127,19 +121,17 @@ impl DiffusionPolicy {
         precision: Precision,
     ) -> Result<Self, PolicyError> {
         shape.check()?;
-        choice.check()?;
-        let mut weights = |layout: Layout, prefix: &str| -> Result<Weights, PolicyError> {
-            let values = layout.join(tensors, prefix)?;
-            Ok(Weights::constant(layout, values))
+        let weights = Weights::take(shape.actor().layout(), tensors, ACTOR)?;
+        let actor = NoisePredictor::new(shape.actor(), weights, precision);
+        let mut ensemble = |of: EnsembleShape, prefix| -> Result<Ensemble, PolicyError> {
+            let weights = Weights::take(of.layout(), tensors, prefix)?;
+            Ok(Ensemble::new(of, weights, precision))
         };
-        let actor = NoisePredictor::new(shape.actor(), weights(shape.actor().layout(), ACTOR)?, precision);
-        let critics = Ensemble::new(shape.critics(), weights(shape.critics().layout(), CRITIC)?, precision);
-        let value = match shape.value() {
-            Some(of) => Some(Ensemble::new(of.clone(), weights(of.layout(), VALUE)?, precision)),
-            None if choice.needs_value() => return Err(PolicyError::NoValue),
-            None => None,
-        };
-        Ok(Self { shape, choice, actor, critics, value, precision })
+        let critics = ensemble(shape.critics(), CRITIC)?;
+        let value = shape.value().map(|of| ensemble(of, VALUE)).transpose()?;
+        let mut policy = Self { shape, choice, actor, critics, value, precision };
+        policy.choose(choice)?;
+        Ok(policy)
     }
 
     /// Draws candidates with noise `T × states × candidates × action_dim`. Gives these, `states × candidates × action_dim`,
@@ -192,7 +184,7 @@ impl Policy for DiffusionPolicy {
 
     fn choose(&mut self, choice: Choice) -> Result<(), PolicyError> {
         choice.check()?;
-        if choice.needs_value() && self.value.is_none() {
+        if choice.rule == Rule::Nearest && self.value.is_none() {
             return Err(PolicyError::NoValue);
         }
         self.choice = choice;

@@ -1,36 +1,28 @@
 //! K networks of one shape side by side: critics Q_1..Q_K over [s, a], a value function or a policy's mean over s.
 
 use crate::action_gradients::ActionGradients;
-use crate::mlp::{Mlp, RoundedKernels};
+use crate::mlp::Mlp;
 use crate::operation::OnCpu;
 use crate::plain;
 use crate::precision::Precision;
-use crate::rounded::RoundedOnce;
+use crate::rounded::Rounding;
 use crate::shape::EnsembleShape;
 use crate::weights::Weights;
 use candle_core::{Result, Tensor, Var, bail};
-use quad_kernels::product::Rounded;
-use rayon::prelude::*;
 
 /// An ensemble and its weights.
 pub struct Ensemble {
     shape: EnsembleShape,
     networks: Mlp,
     weights: Weights,
-    precision: Precision,
-    rounded: RoundedOnce<Vec<Vec<Rounded>>>,
+    rounding: Rounding,
 }
 
 impl Ensemble {
     /// `weights` are of the shape's layout; `precision` is for what no gradient is taken of.
     pub fn new(shape: EnsembleShape, weights: Weights, precision: Precision) -> Self {
-        let networks = Mlp::new(shape.layers(), shape.layers.activation, "");
-        Self { shape, networks, weights, precision, rounded: RoundedOnce::default() }
-    }
-
-    /// Its shape.
-    pub fn shape(&self) -> &EnsembleShape {
-        &self.shape
+        let networks = Mlp::new(shape.layers(), "");
+        Self { shape, networks, weights, rounding: Rounding::new(precision) }
     }
 
     /// Its weights.
@@ -45,14 +37,13 @@ impl Ensemble {
 
     /// The same networks with a copy of the weights as constants: a target network at its beginning.
     pub fn copy(&self) -> Result<Self> {
-        Ok(Self::new(self.shape.clone(), self.weights.copy()?, self.precision))
+        Ok(Self::new(self.shape.clone(), self.weights.copy()?, self.rounding.precision))
     }
 
     /// The same networks with their weights as constants, which share their memory with these.
     pub fn detach(&self) -> Self {
         let (shape, networks) = (self.shape.clone(), self.networks.clone());
-        let (weights, precision) = (self.weights.detach(), Precision::F32);
-        Self { shape, networks, weights, precision, rounded: RoundedOnce::default() }
+        Self { shape, networks, weights: self.weights.detach(), rounding: Rounding::new(Precision::F32) }
     }
 
     /// What comes out, `[K, rows, outputs]`, a row for each action.
@@ -62,8 +53,8 @@ impl Ensemble {
     pub fn outputs(&self, observations: &Tensor, actions: &Tensor) -> Result<Tensor> {
         self.check(observations, actions)?;
         let constant = !(self.weights.values().track_op() || observations.track_op() || actions.track_op());
-        let rounds = self.precision == Precision::Bf16 && constant && self.networks.is_fast(&self.weights);
-        let rounded = if rounds { Some(self.rounded()?) } else { None };
+        let fast = constant && self.networks.is_fast(&self.weights);
+        let rounded = if fast { self.rounding.kernels(&self.networks, &self.weights)? } else { None };
         self.networks.forward_by(rounded, &self.weights, &self.inputs(observations, actions)?)
     }
 
@@ -116,22 +107,9 @@ impl Ensemble {
         Ok(())
     }
 
-    fn rounded(&self) -> Result<RoundedKernels> {
-        self.rounded.get(&self.weights, |weights| {
-            let round = |k| self.networks.network(weights, k).round();
-            (0..self.shape.members).into_par_iter().filter_map(round).collect()
-        })
-    }
-
-    /// [`Self::outputs`] in plain candle operations.
-    #[cfg(test)]
-    pub(crate) fn plain_outputs(&self, observations: &Tensor, actions: &Tensor) -> Result<Tensor> {
-        self.networks.plain_forward(&self.weights, &self.inputs(observations, actions)?)
-    }
-
     /// [`Self::action_gradients`] in plain candle operations. One backward pass gives the gradients of all members at actions
     /// of their own: none has a part in another's.
-    pub(crate) fn plain_action_gradients(&self, observations: &Tensor, actions: &Tensor) -> Result<Tensor> {
+    fn plain_action_gradients(&self, observations: &Tensor, actions: &Tensor) -> Result<Tensor> {
         let repeat = actions.dim(0)? / observations.dim(0)?;
         let observations = plain::repeat_rows(observations, repeat)?.broadcast_left(self.shape.members)?;
         let actions = Var::from_tensor(&actions.broadcast_left(self.shape.members)?)?;

@@ -6,9 +6,9 @@ pub enum PolicyError {
     /// The bytes are no safetensors file.
     #[error("the weights are not a readable safetensors file")]
     Unreadable(#[from] safetensors::SafeTensorError),
-    /// The file does not say what policy it holds.
-    #[error("the weights do not say what policy they are (metadata `quad`)")]
-    NoHeader,
+    /// The file does not say what it holds.
+    #[error("the file does not say what it holds (metadata `{0}`)")]
+    NoHeader(&'static str),
     /// What it says is not understood.
     #[error("what the weights say about themselves is not understood: {0}")]
     Header(#[from] serde_json::Error),
@@ -35,23 +35,15 @@ pub enum PolicyError {
     /// A tensor that no network has.
     #[error("the weights hold a tensor {0:?} that this policy does not have")]
     Unexpected(String),
-    /// A tensor of the wrong element type.
-    #[error("tensor {name:?} holds {found}, expected F32")]
-    Type {
-        /// Its name.
-        name: String,
-        /// Its element type.
-        found: String,
-    },
-    /// A tensor of the wrong shape.
-    #[error("tensor {name:?} has shape {found:?}, expected {expected:?}")]
+    /// A tensor of the wrong element type or shape.
+    #[error("tensor {name:?} has type and shape {found}, expected {expected}")]
     Shape {
         /// Its name.
         name: String,
-        /// Its shape.
-        found: Vec<usize>,
-        /// The one that the policy has.
-        expected: Vec<usize>,
+        /// What it is.
+        found: String,
+        /// What the policy has.
+        expected: String,
     },
     /// A NaN or an infinity among the weights.
     #[error("tensor {0:?} holds a number that is not finite")]
@@ -64,10 +56,10 @@ pub enum PolicyError {
     Candle(#[from] candle_core::Error),
 }
 
-/// Widest hidden layer, most critics and most denoising steps that are believed.
-const MOST: usize = u16::MAX as usize;
+/// Widest layer and most critics that are believed.
+pub(crate) const MOST: usize = u16::MAX as usize;
 
-/// That a number of a shape is within 1..=65535.
-pub(crate) fn check_range(field: &'static str, value: usize) -> Result<(), PolicyError> {
-    if (1..=MOST).contains(&value) { Ok(()) } else { Err(PolicyError::Range { field, value }) }
+/// That a number of a shape is from 1 to `most`.
+pub(crate) fn check_range(field: &'static str, value: usize, most: usize) -> Result<(), PolicyError> {
+    if (1..=most).contains(&value) { Ok(()) } else { Err(PolicyError::Range { field, value }) }
 }

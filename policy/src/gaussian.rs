@@ -2,7 +2,7 @@
 
 use crate::ensemble::Ensemble;
 use crate::episode::EpisodeState;
-use crate::error::{PolicyError, check_range};
+use crate::error::{MOST, PolicyError, check_range};
 use crate::mlp_config::MlpConfig;
 use crate::policy::Policy;
 use crate::precision::Precision;
@@ -54,12 +54,10 @@ impl GaussianPolicy {
     }
 
     pub(crate) fn load(shape: GaussianShape, tensors: &mut Tensors) -> std::result::Result<Self, PolicyError> {
-        check_range("observation_dim", shape.observation_dim)?;
-        check_range("action_dim", shape.action_dim)?;
-        shape.actor.check("actor.hidden")?;
-        let layout = shape.actor().layout();
-        let values = layout.join(tensors, ACTOR)?;
-        let actor = Ensemble::new(shape.actor(), Weights::constant(layout, values), Precision::F32);
+        check_range("observation_dim", shape.observation_dim, MOST)?;
+        check_range("action_dim", shape.action_dim, MOST)?;
+        let weights = Weights::take(shape.actor().layout(), tensors, ACTOR)?;
+        let actor = Ensemble::new(shape.actor(), weights, Precision::F32);
         Ok(Self { shape, actor })
     }
 }

@@ -43,8 +43,7 @@ fn file(shape: DiffusionShape, choice: Choice, tensors: &Tensors) -> Vec<u8> {
 fn golden_reverse_steps() {
     for golden in goldens("quad") {
         let shape = shape(&golden).actor();
-        let values = shape.layout().join(&mut golden.state.clone(), "target_actor.").unwrap();
-        let weights = Weights::constant(shape.layout(), values);
+        let weights = Weights::take(shape.layout(), &mut golden.state.clone(), "target_actor.").unwrap();
         let actor = NoisePredictor::new(shape.clone(), weights, Precision::F32);
         let observations = golden.input("observations", &Device::Cpu);
         let rows = observations.dim(0).unwrap();
@@ -86,43 +85,55 @@ fn golden_choices() {
     }
 }
 
-fn small(critics: usize) -> DiffusionShape {
-    DiffusionShape::quad((4, 2), &MlpConfig::mish(&[8; 3]), critics, 2)
+fn small() -> DiffusionShape {
+    DiffusionShape::quad((4, 2), &MlpConfig::mish(&[8; 3]), 2, 2)
+}
+
+/// A policy, read from its file, whose critics' weights are so large, of both signs, and whose value function says `v` in every
+/// state, if it has one.
+fn policy(choice: Choice, critic: f32, v: Option<f32>) -> Result<Box<dyn Policy>, PolicyError> {
+    let shape = DiffusionShape { value: v.map(|_| small().critic), ..small() };
+    let weights = |layout: Layout, size: f32, last: f32| {
+        let values = (1..=layout.count()).map(|i| match i / 3 % 2 {
+            _ if i == layout.count() => last,
+            0 => size,
+            _ => -size,
+        });
+        Weights::constant(layout.clone(), Tensor::from_iter(values, &Device::Cpu).unwrap())
+    };
+    let actor = NoisePredictor::new(shape.actor(), weights(shape.actor().layout(), 0.1, 0.1), Precision::F32);
+    let critics = Ensemble::new(shape.critics(), weights(shape.critics().layout(), critic, critic), Precision::F32);
+    let value = shape.value().zip(v);
+    let value = value.map(|(of, v)| Ensemble::new(of.clone(), weights(of.layout(), 0.0, v), Precision::F32));
+    let tensors = DiffusionPolicy::tensors(&actor, &critics, value.as_ref()).unwrap();
+    load_policy(&file(shape, choice, &tensors), Precision::F32)
+}
+
+/// What it does at the first step of an episode.
+fn first_action(policy: &dyn Policy, observation: [f32; 4]) -> Result<Vec<f32>, PolicyError> {
+    let mut actions = vec![0.0; 2];
+    policy.act(&observation, &mut [policy.begin(3)], &mut actions).map(|()| actions)
 }
 
 /// Finite weights so large that values overflow: the error says what is not a number, and nothing is chosen.
 #[test]
 fn a_candidate_without_a_value_is_an_error() {
-    let shape = small(3);
+    let [good, mut broken] = [0.1, 1e38].map(|critic| policy(Choice::best_of(5), critic, None).unwrap());
     // Of both signs, so that infinities meet.
-    let constant = |layout: Layout, size: f32| {
-        let values = (0..layout.count()).map(|i| if i / 3 % 2 == 0 { size } else { -size });
-        Weights::constant(layout.clone(), Tensor::from_iter(values, &Device::Cpu).unwrap())
-    };
-    let policy = |actor: f32, critics: f32| {
-        let actor = NoisePredictor::new(shape.actor(), constant(shape.actor().layout(), actor), Precision::F32);
-        let critics = Ensemble::new(shape.critics(), constant(shape.critics().layout(), critics), Precision::F32);
-        let tensors = DiffusionPolicy::tensors(&actor, &critics, None).unwrap();
-        load_policy(&file(shape.clone(), Choice::best_of(5), &tensors), Precision::F32).unwrap()
-    };
-    let act = |policy: &dyn Policy, observations: &[f32]| {
-        let mut actions = vec![0.0; 2];
-        policy.act(observations, &mut [policy.begin(0)], &mut actions).map(|()| actions)
-    };
-    assert!(act(&*policy(0.1, 0.1), &[1.0; 4]).is_ok());
-    let value = act(&*policy(0.1, 1e38), &[1.0, -1.0, 1.0, 1.0]).unwrap_err().to_string();
+    let observation = [1.0, -1.0, 1.0, 1.0];
+    assert!(first_action(&*good, observation).is_ok());
+    let value = first_action(&*broken, observation).unwrap_err().to_string();
     assert!(value.contains("value of a candidate is not a number"), "{value}");
-    let mut one = policy(0.1, 1e38);
-    one.choose(Choice::best_of(1)).unwrap();
-    assert!(act(&*one, &[1.0, -1.0, 1.0, 1.0]).is_ok(), "of one candidate the critics are not asked");
-    let action = act(&*policy(0.1, 0.1), &[f32::NAN, 0.0, 0.0, 0.0]).unwrap_err().to_string();
+    broken.choose(Choice::best_of(1)).unwrap();
+    assert!(first_action(&*broken, observation).is_ok(), "of one candidate the critics are not asked");
+    let action = first_action(&*good, [f32::NAN, 0.0, 0.0, 0.0]).unwrap_err().to_string();
     assert!(action.contains("not a number"), "{action}");
 }
 
 /// Shapes come from strangers: none may ask for unbounded memory, whatever it wraps around to.
 #[test]
 fn a_shape_out_of_range_is_refused() {
-    let good = small(3);
+    let good = small();
     let refused = |shape: DiffusionShape| {
         let file = file(shape, Choice::best_of(1), &Tensors::new());
         matches!(load_policy(&file, Precision::F32), Err(PolicyError::Range { .. }))
@@ -134,49 +145,20 @@ fn a_shape_out_of_range_is_refused() {
     assert!(!refused(good), "it lacks its tensors, but its shape is one");
 }
 
-/// A diffusion policy of constants: its value function says `v` in every state, its critics say so of every action, plus what
-/// the kernels make of it.
-fn constant(choice: Choice, critic: f32, v: f32) -> Result<Box<dyn Policy>, PolicyError> {
-    let shape = DiffusionShape { value: (v != 0.0).then(|| small(2).critic), ..small(2) };
-    let weights = |layout: Layout, each: f32, last: f32| {
-        let count = layout.count();
-        let values = (0..count).map(|i| if i + 1 == count { last } else { each });
-        Weights::constant(layout, Tensor::from_iter(values, &Device::Cpu).unwrap())
-    };
-    let actor = NoisePredictor::new(shape.actor(), weights(shape.actor().layout(), 0.05, 0.05), Precision::F32);
-    let critics = Ensemble::new(shape.critics(), weights(shape.critics().layout(), critic, critic), Precision::F32);
-    let value = shape.value().map(|of| Ensemble::new(of.clone(), weights(of.layout(), 0.0, v), Precision::F32));
-    let tensors = DiffusionPolicy::tensors(&actor, &critics, value.as_ref()).unwrap();
-    load_policy(&file(shape, choice, &tensors), Precision::F32)
-}
-
-/// What it does at the first step of an episode.
-fn first_action(policy: &dyn Policy) -> Vec<f32> {
-    let mut actions = vec![0.0; 2];
-    policy.act(&[0.5; 4], &mut [policy.begin(3)], &mut actions).unwrap();
-    actions
-}
-
 #[test]
 fn the_file_s_rule_chooses_unless_another_is_asked_for() {
     let best = Choice { value: Reduce::Min, ..Choice::best_of(8) };
     let nearest = Choice { rule: Rule::Nearest, ..best };
+    let act = |policy: &dyn Policy| first_action(policy, [0.5; 4]).unwrap();
     // A value above that of all actions: the nearest is the best. Below: the worst.
-    let (high, low) = (constant(nearest, 0.1, 1e3).unwrap(), constant(nearest, 0.1, -1e3).unwrap());
-    let mut policy = constant(best, 0.1, 0.0).unwrap();
-    assert_eq!(policy.choice(), Some(best));
-    assert_eq!(first_action(&*policy), first_action(&*high));
-    assert_ne!(first_action(&*policy), first_action(&*low));
+    let [high, low] = [1e3, -1e3].map(|v| act(&*policy(nearest, 1.0, Some(v)).unwrap()));
+    let mut policy_of_best = policy(best, 1.0, None).unwrap();
+    assert_eq!((policy_of_best.choice(), act(&*policy_of_best)), (Some(best), high.clone()));
+    assert_ne!(high, low);
     let cold = Choice { rule: Rule::Softmax { temperature: 1e-6 }, ..best };
-    policy.choose(cold).unwrap();
-    assert_eq!((policy.choice(), first_action(&*policy)), (Some(cold), first_action(&*high)));
-    policy.choose(Choice { rule: Rule::Softmax { temperature: 1e6 }, ..best }).unwrap();
-    assert!(matches!(policy.choose(nearest), Err(PolicyError::NoValue)));
-    assert!(matches!(policy.choose(Choice::best_of(1001)), Err(PolicyError::Range { .. })));
-}
-
-#[test]
-fn the_rule_nearest_takes_a_value_function() {
-    let nearest = Choice { rule: Rule::Nearest, ..Choice::best_of(8) };
-    assert!(matches!(constant(nearest, 0.1, 0.0), Err(PolicyError::NoValue)));
+    policy_of_best.choose(cold).unwrap();
+    assert_eq!((policy_of_best.choice(), act(&*policy_of_best)), (Some(cold), high));
+    assert!(matches!(policy_of_best.choose(nearest), Err(PolicyError::NoValue)));
+    assert!(matches!(policy(nearest, 0.1, None), Err(PolicyError::NoValue)));
+    assert!(matches!(policy_of_best.choose(Choice::best_of(1001)), Err(PolicyError::Range { .. })));
 }

@@ -7,7 +7,7 @@ use candle_core::{Result, Tensor, bail};
 
 /// The gradients of one loss, from [`Gradients::of`].
 pub struct Gradients {
-    store: GradStore,
+    pub(crate) store: GradStore,
     pass: u64,
 }
 
@@ -30,17 +30,6 @@ impl Gradients {
             (Some(gradient), None) => Ok(gradient),
             (None, Some(gradient)) => Ok(gradient.clone()),
             (None, None) => bail!("the loss does not depend on the weights that it is to train"),
-        }
-    }
-
-    /// Of a variable of candle's.
-    ///
-    /// # Errors
-    /// The loss does not depend on it.
-    pub fn of_variable(&self, variable: &Tensor) -> Result<Tensor> {
-        match self.store.get(variable) {
-            Some(gradient) => Ok(gradient.clone()),
-            None => bail!("the loss does not depend on the variable"),
         }
     }
 }

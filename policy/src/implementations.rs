@@ -3,13 +3,14 @@
 
 use crate::ensemble::Ensemble;
 use crate::gradient::Gradients;
-use crate::mlp::Mlp;
 use crate::mlp_config::{Initial, MlpConfig};
 use crate::noise_predictor::NoisePredictor;
+use crate::optimiser::{Adam, AdamStep};
 use crate::precision::Precision;
 use crate::schedule::Reverse;
 use crate::shape::{EnsembleShape, NoiseShape};
-use crate::slices::{has_fast_implementation, modify};
+use crate::slices::{has_fast_implementation, modify, plainly};
+use crate::statistics::mean_and_variance;
 use crate::weights::{Layout, Weights};
 use candle_core::{Device, Tensor, Var};
 use quad_kernels::activation::Activation;
@@ -92,16 +93,13 @@ fn check_gradient(
     let size = gradient.sqr().unwrap().sum_all().unwrap().to_scalar::<f32>().unwrap().sqrt();
     assert!(size > 1e-3, "{what}: no gradient");
     let random = tensor(generator, at.dims());
-    let mut steps = Vec::new();
     for direction in [gradient.detach(), random] {
         let length = direction.sqr().unwrap().sum_all().unwrap().to_scalar::<f32>().unwrap().sqrt();
         let moved = (direction * (step / f64::from(length))).unwrap();
         let expected = (gradient * &moved).unwrap().sum_all().unwrap().to_scalar::<f32>().unwrap();
         let found = (value((at + &moved).unwrap()) - value((at - &moved).unwrap())) / 2.0;
-        steps.push((found, f64::from(expected)));
-    }
-    for (found, expected) in &steps {
-        assert!((found - expected).abs() < room * f64::from(size) * step, "{what}: {steps:?}");
+        let difference = (found - f64::from(expected)).abs();
+        assert!(difference < room * f64::from(size) * step, "{what}: {found} for {expected}");
     }
 }
 
@@ -132,10 +130,10 @@ fn gradients_are_what_finite_differences_say() {
         let of_weights = gradients.with_respect_to(networks.weights()).unwrap();
         let (w, s, a) = (networks.weights().values().detach(), observations.detach(), actions.detach());
         check_gradient((&format!("{what}: weights"), 1e-3, 0.02), &mut generator, (&w, &of_weights), |w| at(w, &s, &a));
-        let of_s = gradients.of_variable(&observations).unwrap();
-        check_gradient((&format!("{what}: observations"), 1e-3, 0.02), &mut generator, (&s, &of_s), |s| at(&w, s, &a));
-        let of_a = gradients.of_variable(&actions).unwrap();
-        check_gradient((&format!("{what}: actions"), 1e-3, 0.02), &mut generator, (&a, &of_a), |a| at(&w, &s, a));
+        let of_s = gradients.store.get(&observations).unwrap();
+        check_gradient((&format!("{what}: observations"), 1e-3, 0.02), &mut generator, (&s, of_s), |s| at(&w, s, &a));
+        let of_a = gradients.store.get(&actions).unwrap();
+        check_gradient((&format!("{what}: actions"), 1e-3, 0.02), &mut generator, (&a, of_a), |a| at(&w, &s, a));
 
         // Many steps: clipping leaves the first ones no gradient.
         let predictor = noise_predictor(&mut generator, layers, 8);
@@ -165,14 +163,14 @@ fn ensembles_give_the_plain_values_and_gradients() {
         let observations = tensor(&mut generator, &[states, shape.observation_dim]);
         let actions = Var::from_tensor(&tensor(&mut generator, &[states * repeat, shape.action_dim])).unwrap();
         let what = format!("{shape:?}, {states} × {repeat}");
-        let plain = networks.plain_outputs(&observations, &actions).unwrap();
+        let plain = plainly(|| networks.outputs(&observations, &actions)).unwrap();
         let constant = networks.detach().outputs(&observations, &actions.detach()).unwrap();
         close(&what, &constant, &plain);
         let fast = networks.outputs(&observations, &actions).unwrap();
         close(&what, &fast, &plain);
         let gradients = |loss: Tensor| {
             let gradients = Gradients::of(&loss).unwrap();
-            let of_actions = if shape.action_dim > 0 { gradients.of_variable(&actions).unwrap() } else { loss };
+            let of_actions = if shape.action_dim > 0 { gradients.store.get(&actions).unwrap().clone() } else { loss };
             (gradients.with_respect_to(networks.weights()).unwrap().copy().unwrap(), of_actions)
         };
         let (fast, plain) = (gradients(loss(&fast)), gradients(loss(&plain)));
@@ -181,6 +179,12 @@ fn ensembles_give_the_plain_values_and_gradients() {
         // A loss that has the network in it twice.
         let [once, again] = [0; 2].map(|_| loss(&networks.outputs(&observations, &actions).unwrap()));
         close("twice", &gradients((once + again).unwrap()).0, &(fast.0 * 2.0).unwrap());
+
+        let critics = ensemble(&mut generator, EnsembleShape { outputs: 1, ..shape.clone() });
+        let gradients = || critics.action_gradients(&observations, &actions).unwrap();
+        if shape.action_dim > 0 {
+            close(&format!("action gradients of {what}"), &gradients(), &plainly(gradients));
+        }
     }
 }
 
@@ -202,21 +206,6 @@ fn a_gradient_that_is_not_taken_is_not_added_to_the_next() {
 }
 
 #[test]
-fn action_gradients_are_the_plain_ones() {
-    for seed in 0..20 {
-        let mut generator = ChaCha8Rng::seed_from_u64(seed);
-        let shape = EnsembleShape { action_dim: generator.random_range(1..8), outputs: 1, ..shape(&mut generator) };
-        let networks = ensemble(&mut generator, shape.clone());
-        let (states, repeat) = (generator.random_range(1..200), generator.random_range(1..4));
-        let observations = tensor(&mut generator, &[states, shape.observation_dim]);
-        let actions = tensor(&mut generator, &[states * repeat, shape.action_dim]);
-        let fast = networks.action_gradients(&observations, &actions).unwrap();
-        let plain = networks.plain_action_gradients(&observations, &actions).unwrap();
-        close(&format!("{shape:?}, {states} × {repeat}"), &fast, &plain);
-    }
-}
-
-#[test]
 fn noise_predictors_give_the_plain_values_and_samples() {
     for seed in 0..20 {
         let mut generator = ChaCha8Rng::seed_from_u64(seed);
@@ -230,7 +219,7 @@ fn noise_predictors_give_the_plain_values_and_samples() {
         let t: Vec<u32> = (0..rows).map(|_| generator.random_range(1..=diffusion_steps as u32)).collect();
         let t = Tensor::from_vec(t, rows, &Device::Cpu).unwrap();
         let fast = actor.predict(&observations, &actions, &t).unwrap();
-        let plain = actor.predict_by(Mlp::plain_forward, &observations, &actions, &t).unwrap();
+        let plain = plainly(|| actor.predict(&observations, &actions, &t)).unwrap();
         close("prediction", &fast, &plain);
         close("of constants", &actor.detach().predict(&observations, &actions, &t).unwrap(), &plain);
         let gradient = |predicted: &Tensor| {
@@ -241,8 +230,37 @@ fn noise_predictors_give_the_plain_values_and_samples() {
         let repeat = generator.random_range(1..12);
         let noise = tensor(&mut generator, &[diffusion_steps, rows * repeat, action_dim]);
         let fast = actor.sample(&observations, &noise).unwrap();
-        close("samples", &fast, &actor.sample_by(Mlp::plain_forward, &observations, &noise).unwrap());
+        close("samples", &fast, &plainly(|| actor.sample(&observations, &noise)).unwrap());
         close("samples", &fast, &actor.sample_with_gradient(&observations, &noise).unwrap());
+    }
+}
+
+#[test]
+fn adam_the_ema_and_statistics_do_what_plain_operations_do() {
+    let mut generator = ChaCha8Rng::seed_from_u64(1);
+    for (clip, decay) in [(None, 0.0), (Some(0.3), 0.0), (Some(1e6), 0.0), (None, 0.5)] {
+        // Enough numbers for several chunks, and no whole number of registers.
+        let shape = EnsembleShape { members: 3, layers: MlpConfig::mish(&[77, 78]), ..shape(&mut generator) };
+        let mut fast = weights(shape.layout(), &mut generator);
+        let mut plain = Weights::trainable(shape.layout(), fast.values()).unwrap();
+        let [mut fast_adam, mut plain_adam] = [&fast, &plain].map(|weights| Adam::new(weights, decay).unwrap());
+        let [mut target, mut plain_target] = [(); 2].map(|()| fast.copy().unwrap());
+        for count in 1..4 {
+            let gradient = tensor(&mut generator, &[fast.values().elem_count()]);
+            let step = AdamStep { rate: 0.01, clip, count };
+            let size = fast_adam.descend(&mut fast, &gradient, step).unwrap();
+            close("norm", &size, &plainly(|| plain_adam.descend(&mut plain, &gradient, step)).unwrap());
+            close("moments", &fast_adam.moments, &plain_adam.moments);
+            close("weights", fast.values(), plain.values());
+        }
+        target.ema_update(&fast, 0.25).unwrap();
+        plainly(|| plain_target.ema_update(&fast, 0.25)).unwrap();
+        close("EMA", target.values(), plain_target.values());
+    }
+    for dims in [vec![1, 4], vec![3, 7], vec![10, 5, 3]] {
+        let x = tensor(&mut generator, &dims);
+        let statistics = || <[Tensor; 2]>::from(mean_and_variance(&x).unwrap());
+        statistics().iter().zip(plainly(statistics)).for_each(|(fast, plain)| close("statistics", fast, &plain));
     }
 }
 

@@ -50,18 +50,12 @@ pub struct Header<O> {
 }
 
 impl<O: Serialize> Header<O> {
-    /// The safetensors file of a policy with this header: always the same bytes for the same header and numbers.
+    /// The safetensors file of a policy with this header.
     ///
     /// # Errors
     /// A number that is not finite.
     pub fn to_safetensors(&self, tensors: &Tensors) -> Result<Vec<u8>, PolicyError> {
-        let mut here = BTreeMap::new();
-        for (name, tensor) in tensors {
-            check_finite(name, tensor)?;
-            here.insert(name, tensor.to_device(&Device::Cpu)?);
-        }
-        let metadata = HashMap::from([(HEADER.to_owned(), serde_json::to_string(self)?)]);
-        Ok(safetensors::serialize(here, Some(metadata))?)
+        write_tensors(tensors, HEADER, self)
     }
 }
 
@@ -69,12 +63,9 @@ impl<O: DeserializeOwned> Header<O> {
     /// What a policy's file says of itself.
     ///
     /// # Errors
-    /// No safetensors file, or one without such a header.
+    /// As [`read_header`].
     pub fn read(file: &[u8]) -> Result<Self, PolicyError> {
-        check_header(file)?;
-        let (_, metadata) = SafeTensors::read_metadata(file)?;
-        let header = metadata.metadata().as_ref().and_then(|metadata| metadata.get(HEADER));
-        Ok(serde_json::from_str(header.ok_or(PolicyError::NoHeader)?)?)
+        read_header(file, HEADER)
     }
 }
 
@@ -95,6 +86,32 @@ pub fn load_policy(file: &[u8], precision: Precision) -> Result<Box<dyn Policy>,
         Some(name) => Err(PolicyError::Unexpected(name)),
         None => Ok(policy),
     }
+}
+
+/// The safetensors file of some tensors, with `header` as JSON under that key of its metadata: always the same bytes for the same
+/// header and numbers.
+///
+/// # Errors
+/// A number that is not finite.
+pub fn write_tensors(tensors: &Tensors, key: &str, header: &impl Serialize) -> Result<Vec<u8>, PolicyError> {
+    let mut here = BTreeMap::new();
+    for (name, tensor) in tensors {
+        check_finite(name, tensor)?;
+        here.insert(name, tensor.to_device(&Device::Cpu)?);
+    }
+    let metadata = HashMap::from([(key.to_owned(), serde_json::to_string(header)?)]);
+    Ok(safetensors::serialize(here, Some(metadata))?)
+}
+
+/// What [`write_tensors`] has written beside the tensors.
+///
+/// # Errors
+/// No safetensors file, or one without such a header.
+pub fn read_header<T: DeserializeOwned>(file: &[u8], key: &'static str) -> Result<T, PolicyError> {
+    check_header(file)?;
+    let (_, metadata) = SafeTensors::read_metadata(file)?;
+    let header = metadata.metadata().as_ref().and_then(|metadata| metadata.get(key));
+    Ok(serde_json::from_str(header.ok_or(PolicyError::NoHeader(key))?)?)
 }
 
 /// All tensors of a safetensors file, on the CPU.
@@ -152,6 +169,7 @@ mod tests {
             assert_eq!(refused(file), [false; 2]);
         }
     }
+
     /// The file of a Gaussian policy that is from `origin`.
     fn gaussian(origin: &str) -> Vec<u8> {
         let actor = MlpConfig::mish(&[4]);
@@ -177,7 +195,7 @@ mod tests {
         assert!(serde_json::from_str::<PolicyConfig>(&newer).is_err(), "what is not known is not ignored");
         let tensor = Tensor::zeros(1, DType::F32, &Device::Cpu).unwrap();
         let nameless = safetensors::serialize([("weights", tensor)], None).unwrap();
-        assert!(matches!(load_policy(&nameless, Precision::F32), Err(PolicyError::NoHeader)));
+        assert!(matches!(load_policy(&nameless, Precision::F32), Err(PolicyError::NoHeader(_))));
         assert!(matches!(Header::<u64>::read(&file), Err(PolicyError::Header(_))), "another origin than was wanted");
     }
 

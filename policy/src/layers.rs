@@ -5,6 +5,7 @@
 
 use crate::mlp_config::{Initial, MlpConfig};
 use crate::weights::{Part, Start};
+use quad_kernels::activation::Activation;
 use std::ops::Range;
 
 /// Rows that one task works on: weights and activations of a tile stay in a core's own cache.
@@ -13,9 +14,12 @@ pub(crate) const TILE: usize = 128;
 /// Linear layers for K members: for each K kernels `[in, out]`, then K biases `[out]`.
 #[derive(Clone, Debug)]
 pub(crate) struct Layers {
-    members: usize,
+    /// Networks side by side.
+    pub members: usize,
     widths: Vec<usize>,
-    norm: bool,
+    /// Whether a norm stands between the hidden layers' linear maps and their activations.
+    pub norm: bool,
+    pub activation: Activation,
     initial: Initial,
     /// Of each layer's first kernel; behind the last layer, of the end.
     offsets: Vec<usize>,
@@ -33,7 +37,8 @@ impl Layers {
     /// The first kernel lies at `start`.
     pub fn new(members: usize, inputs: usize, config: &MlpConfig, outputs: usize, start: usize) -> Self {
         let widths: Vec<usize> = [inputs].iter().chain(&config.hidden).chain(&[outputs]).copied().collect();
-        let mut layers = Self { members, widths, norm: config.norm, initial: config.initial, offsets: vec![start] };
+        let MlpConfig { norm, activation, initial, .. } = *config;
+        let mut layers = Self { members, widths, norm, activation, initial, offsets: vec![start] };
         for layer in 0..layers.count() {
             let ((inputs, outputs), normed) = (layers.shape(layer), layers.is_normed(layer));
             let numbers = (inputs + if normed { 3 } else { 1 }) * outputs;
@@ -44,16 +49,6 @@ impl Layers {
 
     pub fn count(&self) -> usize {
         self.widths.len() - 1
-    }
-
-    /// Networks side by side.
-    pub fn members(&self) -> usize {
-        self.members
-    }
-
-    /// Whether a norm stands between the hidden layers' linear maps and their activations.
-    pub fn norm(&self) -> bool {
-        self.norm
     }
 
     fn is_normed(&self, layer: usize) -> bool {
@@ -110,24 +105,17 @@ impl Layers {
         all
     }
 
-    /// Names, shapes, offsets and initial values of the tensors `{prefix}{layer}.kernel` and `.bias`, and with a norm
+    /// Names, shapes and initial values of the tensors `{prefix}{layer}.kernel` and `.bias`, and with a norm
     /// `.scale` and `.shift`; `leading` says whether the number of members is their first dimension.
     pub fn named(&self, prefix: &str, leading: bool) -> Vec<Part> {
         let mut parts = Vec::new();
         for layer in 0..self.count() {
             let (inputs, outputs) = self.shape(layer);
             let (kernel, bias) = self.initial.of_layer(inputs, outputs);
-            let mut offset = self.offsets[layer];
             let mut push = |kind: &str, shape: &[usize], start| {
-                let members = leading.then_some(self.members);
-                let name = format!("{prefix}{layer}.{kind}");
-                parts.push(Part {
-                    name,
-                    shape: members.into_iter().chain(shape.iter().copied()).collect(),
-                    offset,
-                    start,
-                });
-                offset += self.members * shape.iter().product::<usize>();
+                let members = leading.then_some(&self.members);
+                let shape = members.into_iter().chain(shape).copied().collect();
+                parts.push(Part { name: format!("{prefix}{layer}.{kind}"), shape, start });
             };
             push("kernel", &[inputs, outputs], kernel);
             push("bias", &[outputs], bias);

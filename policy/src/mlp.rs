@@ -11,44 +11,37 @@ use crate::saved::{Lent, Pool, SavedActivations};
 use crate::slices::{has_fast_implementation, on_cpu, slice};
 use crate::weights::Weights;
 use candle_core::{CpuStorage, CustomOp2, Layout, Result, Shape, Tensor, bail};
-use quad_kernels::activation::Activation;
 use quad_kernels::product::Rounded;
 use rayon::prelude::*;
 use std::sync::Arc;
 
-/// Of each member the kernels between hidden layers, rounded; empty where the CPU is as fast without.
-pub(crate) type RoundedKernels = Arc<Vec<Vec<Rounded>>>;
+/// For each network the kernels between its hidden layers, rounded; none where it is as fast without.
+pub(crate) type Kernels = Vec<Vec<Rounded>>;
 
 /// Networks over some part of a vector of weights.
 #[derive(Clone)]
 pub(crate) struct Mlp {
     pub layers: Arc<Layers>,
-    pub activation: Activation,
     /// Before the names of their tensors.
     prefix: &'static str,
-    saved: Pool<SavedActivations>,
+    saved: Pool,
 }
 
 impl Mlp {
-    pub fn new(layers: Layers, activation: Activation, prefix: &'static str) -> Self {
-        Self { layers: Arc::new(layers), activation, prefix, saved: Pool::default() }
+    pub fn new(layers: Layers, prefix: &'static str) -> Self {
+        Self { layers: Arc::new(layers), prefix, saved: Pool::default() }
     }
 
-    /// `x [rows, in]`, or `[K, rows, in]` for inputs of each member's own → `[K, rows, out]`.
+    /// `x [rows, in]` → `[K, rows, out]`.
     pub fn forward(&self, weights: &Weights, x: &Tensor) -> Result<Tensor> {
         self.forward_by(None, weights, x)
     }
 
     /// The same; where no gradient is taken, by these kernels of the members, rounded.
-    pub fn forward_by(&self, rounded: Option<RoundedKernels>, weights: &Weights, x: &Tensor) -> Result<Tensor> {
+    pub fn forward_by(&self, rounded: Option<Arc<Kernels>>, weights: &Weights, x: &Tensor) -> Result<Tensor> {
         let (values, layers) = (weights.values(), &self.layers);
-        let fits = match *x.dims() {
-            [rows, inputs] => rows > 0 && inputs == layers.inputs(),
-            [members, rows, inputs] => members == layers.members() && rows > 0 && inputs == layers.inputs(),
-            _ => false,
-        };
-        if !fits {
-            bail!("{} networks of {} numbers got inputs of shape {:?}", layers.members(), layers.inputs(), x.dims());
+        if !matches!(*x.dims(), [rows, inputs] if rows > 0 && inputs == layers.inputs()) {
+            bail!("{} networks of {} numbers got inputs of shape {:?}", layers.members, layers.inputs(), x.dims());
         }
         if !self.is_fast(weights) {
             return self.plain_forward(weights, x);
@@ -61,28 +54,27 @@ impl Mlp {
 
     /// Whether the fast implementation serves them.
     pub fn is_fast(&self, weights: &Weights) -> bool {
-        has_fast_implementation(weights.values().device()) && !self.layers.norm()
+        has_fast_implementation(weights.values().device()) && !self.layers.norm
     }
 
-    /// [`Self::forward`] in plain candle operations.
+    /// [`Self::forward`] in plain candle operations; here each member may have inputs of its own, `[K, rows, in]`.
     pub fn plain_forward(&self, weights: &Weights, x: &Tensor) -> Result<Tensor> {
         let tensors = weights.layout().split(weights.values(), "")?;
         let x = if x.rank() == 2 { x.unsqueeze(0)? } else { x.clone() };
-        plain::mlp(&tensors, self.prefix, &self.layers, self.activation, &x)
+        plain::mlp(&tensors, self.prefix, &self.layers, &x)
     }
 
     pub fn network<'a>(&'a self, weights: &'a [f32], member: usize) -> Network<'a> {
-        Network { weights, layers: &self.layers, activation: self.activation, member, rounded: None }
+        Network { weights, layers: &self.layers, member, rounded: None }
     }
 
     /// Forward of plain rows, nothing kept: `K × rows × out`.
-    pub fn run(&self, weights: &[f32], rounded: Option<&[Vec<Rounded>]>, x: &[f32], shared: bool, out: &mut [f32]) {
+    pub fn run(&self, weights: &[f32], rounded: Option<&[Vec<Rounded>]>, x: &[f32], out: &mut [f32]) {
         let (inputs, outputs) = (self.layers.inputs(), self.layers.outputs());
-        let rows = out.len() / (self.layers.members() * outputs);
+        let rows = out.len() / (self.layers.members * outputs);
         out.par_chunks_mut(rows * outputs).enumerate().for_each(|(member, out)| {
             let rounded = rounded.and_then(|rounded| rounded.get(member)).map(Vec::as_slice);
             let network = Network { rounded, ..self.network(weights, member) };
-            let x = of_member(x, shared, rows * inputs, member);
             out.par_chunks_mut(TILE * outputs).enumerate().for_each(|(i, out)| {
                 let x = rows_of(x, i * TILE, TILE, inputs);
                 with_workspace(|work| {
@@ -97,38 +89,26 @@ impl Mlp {
     }
 }
 
-/// A member's inputs: all have the same where these are shared.
-fn of_member(x: &[f32], shared: bool, len: usize, member: usize) -> &[f32] {
-    if shared { x } else { &x[member * len..][..len] }
-}
-
 /// The custom operation of (weights, inputs).
 struct Operation {
     mlp: Mlp,
     /// Where the weights' gradient is left, if there is to be one.
     kept: Option<Arc<KeptGradient>>,
     /// What the forward pass keeps for the backward pass, if there is to be one.
-    saved: Option<Lent<SavedActivations>>,
+    saved: Option<Lent>,
     /// What the products between hidden layers use, if nothing is kept.
-    rounded: Option<RoundedKernels>,
+    rounded: Option<Arc<Kernels>>,
     /// Whether the inputs are to get a gradient.
     to_input: bool,
 }
 
 impl Operation {
-    fn forward_saving(
-        &self,
-        weights: &[f32],
-        (x, shared): (&[f32], bool),
-        lent: &Lent<SavedActivations>,
-        out: &mut [f32],
-    ) {
+    fn forward_saving(&self, weights: &[f32], x: &[f32], lent: &Lent, out: &mut [f32]) {
         let layers = &self.mlp.layers;
-        let rows = out.len() / (layers.members() * layers.outputs());
+        let rows = out.len() / (layers.members * layers.outputs());
         let mut saved = lent.lock();
         saved.resize(layers, rows);
         saved.tiles(out).into_par_iter().for_each(|mut tile| {
-            let x = of_member(x, shared, rows * layers.inputs(), tile.member);
             let x = rows_of(x, tile.index * TILE, TILE, layers.inputs());
             let network = self.mlp.network(weights, tile.member);
             with_workspace(|work| network.forward_saving(x, &mut tile.activations, work, tile.out));
@@ -139,12 +119,12 @@ impl Operation {
     fn backward(
         &self,
         weights: &[f32],
-        (x, shared): (&[f32], bool),
+        x: &[f32],
         gradient: &[f32],
         saved: &mut SavedActivations,
     ) -> Result<Option<Vec<f32>>> {
         let layers = &self.mlp.layers;
-        let (members, inputs) = (layers.members(), layers.inputs());
+        let (members, inputs) = (layers.members, layers.inputs());
         let rows = gradient.len() / (members * layers.outputs());
         // The copy is cut up; the other is read as a whole.
         saved.tiles(&mut gradient.to_vec()).into_par_iter().for_each(|mut tile| {
@@ -152,8 +132,7 @@ impl Operation {
             with_workspace(|work| network.backward(tile.out, &mut tile.activations.slope, work));
         });
         if let Some(kept) = &self.kept {
-            let input = |member| of_member(x, shared, rows * inputs, member);
-            kept.write(layers.range(), |out| saved.weight_gradients(layers.split_mut(out), input, gradient))?;
+            kept.write(layers.range(), |out| saved.weight_gradients(layers.split_mut(out), x, gradient))?;
         }
         if !self.to_input {
             return Ok(None);
@@ -162,13 +141,11 @@ impl Operation {
         of_members.par_chunks_mut(rows * inputs).enumerate().for_each(|(member, out)| {
             self.mlp.network(weights, member).input_gradient(saved.first_delta(member), (0, inputs), out);
         });
-        if shared {
-            let (sum, others) = of_members.split_at_mut(rows * inputs);
-            for other in others.chunks_exact(rows * inputs) {
-                sum.iter_mut().zip(other).for_each(|(sum, x)| *sum += x);
-            }
-            of_members.truncate(rows * inputs);
+        let (sum, others) = of_members.split_at_mut(rows * inputs);
+        for other in others.chunks_exact(rows * inputs) {
+            sum.iter_mut().zip(other).for_each(|(sum, x)| *sum += x);
         }
+        of_members.truncate(rows * inputs);
         Ok(Some(of_members))
     }
 }
@@ -186,12 +163,12 @@ impl CustomOp2 for Operation {
         x_layout: &Layout,
     ) -> Result<(CpuStorage, Shape)> {
         let (weights, x) = (slice(weights, weights_layout)?, slice(x, x_layout)?);
-        let (members, outputs) = (self.mlp.layers.members(), self.mlp.layers.outputs());
-        let (shared, rows) = (x_layout.dims().len() == 2, x_layout.dims()[x_layout.dims().len() - 2]);
+        let (members, outputs) = (self.mlp.layers.members, self.mlp.layers.outputs());
+        let rows = x_layout.dims()[0];
         let mut out = vec![0.0; members * rows * outputs];
         match &self.saved {
-            Some(saved) => self.forward_saving(weights, (x, shared), saved, &mut out),
-            None => self.mlp.run(weights, self.rounded.as_ref().map(|rounded| &***rounded), x, shared, &mut out),
+            Some(saved) => self.forward_saving(weights, x, saved, &mut out),
+            None => self.mlp.run(weights, self.rounded.as_ref().map(|rounded| &***rounded), x, &mut out),
         }
         Ok((CpuStorage::F32(out), (members, rows, outputs).into()))
     }
@@ -208,7 +185,7 @@ impl CustomOp2 for Operation {
         let of_input = {
             let held = [weights, &x, &gradient].map(Tensor::storage_and_layout);
             let [w, input, g] = held.each_ref().map(|(storage, layout)| on_cpu(storage, layout));
-            self.backward(w?, (input?, x.rank() == 2), g?, &mut saved.lock())?
+            self.backward(w?, input?, g?, &mut saved.lock())?
         };
         let of_input = of_input.map(|numbers| Tensor::from_vec(numbers, x.shape(), x.device())).transpose()?;
         Ok((None, of_input))

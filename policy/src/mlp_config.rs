@@ -1,8 +1,9 @@
 //! Hidden layers as a line of configuration.
 
-use crate::error::{PolicyError, check_range};
+use crate::error::MOST;
 use crate::weights::Start;
 use quad_kernels::activation::Activation;
+use serde::de::{Deserializer, Error};
 use serde::{Deserialize, Serialize};
 
 /// Most hidden layers that are believed.
@@ -12,7 +13,8 @@ const MOST_LAYERS: usize = 64;
 #[derive(Clone, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct MlpConfig {
-    /// Their widths.
+    /// Their widths: from 1 to 64 of them, each from 1 to 65535.
+    #[serde(deserialize_with = "widths")]
     pub hidden: Vec<usize>,
     /// What follows each of them.
     pub activation: Activation,
@@ -57,19 +59,16 @@ impl MlpConfig {
         Self { hidden: hidden.to_vec(), ..Self::default() }
     }
 
-    /// That there are hidden layers, and of reasonable widths.
-    ///
-    /// # Errors
-    /// There are none or too many, or one's width is out of range.
-    pub fn check(&self, field: &'static str) -> Result<(), PolicyError> {
-        if !(1..=MOST_LAYERS).contains(&self.hidden.len()) {
-            return Err(PolicyError::Range { field, value: self.hidden.len() });
-        }
-        self.hidden.iter().try_for_each(|width| check_range(field, *width))
-    }
-
     /// Numbers of the widest hidden layer.
     pub(crate) fn widest(&self) -> usize {
         self.hidden.iter().copied().max().unwrap_or(1)
     }
+}
+
+fn widths<'de, D: Deserializer<'de>>(deserializer: D) -> Result<Vec<usize>, D::Error> {
+    let widths = Vec::<usize>::deserialize(deserializer)?;
+    if (1..=MOST_LAYERS).contains(&widths.len()) && widths.iter().all(|width| (1..=MOST).contains(width)) {
+        return Ok(widths);
+    }
+    Err(D::Error::custom(format_args!("hidden layers are 1 to {MOST_LAYERS} widths from 1 to {MOST}, not {widths:?}")))
 }

@@ -5,7 +5,7 @@
 
 use crate::layers::{Layers, TILE};
 use quad_kernels::Buffer;
-use quad_kernels::activation::{Activation, activate, activate_with_slope, multiply};
+use quad_kernels::activation::{activate, activate_with_slope, multiply};
 use quad_kernels::narrow::{FirstLayer, dots, first_layer, scale_by_combination};
 use quad_kernels::product::{Rounded, product, product_transposed};
 use std::cell::RefCell;
@@ -20,7 +20,6 @@ const NARROW: usize = 16;
 pub(crate) struct Network<'a> {
     pub weights: &'a [f32],
     pub layers: &'a Layers,
-    pub activation: Activation,
     pub member: usize,
     /// The kernels between hidden layers with their numbers rounded, if forward passes are to use these.
     pub rounded: Option<&'a [Rounded]>,
@@ -173,7 +172,11 @@ impl<'a> Network<'a> {
             let count = out.len() / outputs;
             let actions = &input.actions[i * rows * action_dim..][..count * action_dim];
             let Input { repeat, shift, kernel, .. } = input;
-            first_layer(self.activation, &FirstLayer { base, repeat, shift, actions, kernel }, x.sized(count * width));
+            first_layer(
+                self.layers.activation,
+                &FirstLayer { base, repeat, shift, actions, kernel },
+                x.sized(count * width),
+            );
             for layer in 1..last {
                 let (inputs, width) = self.layers.shape(layer);
                 let (x, y) = if layer % 2 == 1 { (&mut *x, &mut *y) } else { (&mut *y, &mut *x) };
@@ -182,7 +185,7 @@ impl<'a> Network<'a> {
                     Some(kernels) => kernels[layer - 1].product(x, y),
                     None => product(x, self.kernel(layer), y, inputs, width),
                 }
-                activate(self.activation, y, self.bias(layer));
+                activate(self.layers.activation, y, self.bias(layer));
             }
             let width = self.layers.shape(last).0;
             let x = if last % 2 == 1 { &mut *x } else { &mut *y };
@@ -198,7 +201,7 @@ impl<'a> Network<'a> {
             let (before, here) = left.x.split_at_mut(layer);
             let x = before.last().map_or(input, |x| &**x);
             product(x, self.kernel(layer), here[0], inputs, width);
-            activate_with_slope(self.activation, here[0], self.bias(layer), left.slope[layer]);
+            activate_with_slope(self.layers.activation, here[0], self.bias(layer), left.slope[layer]);
         }
         dots(left.x[last - 1], self.output_rows(&mut work.output), self.bias(last), out, self.layers.shape(last).0);
     }

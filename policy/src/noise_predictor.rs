@@ -4,22 +4,19 @@ use crate::mlp::Mlp;
 use crate::operation::OnCpu;
 use crate::plain;
 use crate::precision::Precision;
-use crate::rounded::RoundedOnce;
+use crate::rounded::Rounding;
 use crate::sampler::{Parts, Sample};
 use crate::schedule::Schedule;
 use crate::shape::{NoiseShape, TIME_FEATURES};
 use crate::weights::Weights;
 use candle_core::{D, DType, Result, Tensor, bail};
-use quad_kernels::activation::Activation;
-use quad_kernels::product::Rounded;
 use std::sync::Arc;
 
 /// A noise predictor and its weights.
 pub struct NoisePredictor {
     parts: Arc<Parts>,
     weights: Weights,
-    precision: Precision,
-    rounded: RoundedOnce<Option<Vec<Rounded>>>,
+    rounding: Rounding,
 }
 
 /// cos(t·f_k), then sin(t·f_k), with f_k = exp(-k·ln(10000)/7) for k = 0..7, of t = 1..T.
@@ -34,13 +31,13 @@ impl NoisePredictor {
     /// `weights` are of the shape's layout; `precision` is for what no gradient is taken of.
     pub fn new(shape: NoiseShape, weights: Weights, precision: Precision) -> Self {
         let parts = Parts {
-            time: Mlp::new(shape.time_layers(), Activation::Mish, "time."),
-            trunk: Mlp::new(shape.trunk_layers(), shape.layers.activation, "trunk."),
+            time: Mlp::new(shape.time_layers(), "time."),
+            trunk: Mlp::new(shape.trunk_layers(), "trunk."),
             schedule: Schedule::variance_preserving(shape.diffusion_steps, shape.reverse),
             features: time_features(shape.diffusion_steps),
             shape,
         };
-        Self { parts: Arc::new(parts), weights, precision, rounded: RoundedOnce::default() }
+        Self { parts: Arc::new(parts), weights, rounding: Rounding::new(precision) }
     }
 
     /// Its weights.
@@ -66,28 +63,17 @@ impl NoisePredictor {
     /// ε_θ(a^t, s, t): `observations [B, o]`, `actions [B, a]`, `t [B]` (u32, in 1..=T) → `[B, a]`. Differentiable in weights,
     /// observations and actions.
     pub fn predict(&self, observations: &Tensor, actions: &Tensor, t: &Tensor) -> Result<Tensor> {
-        self.predict_by(Mlp::forward, observations, actions, t)
-    }
-
-    /// [`Self::predict`] with one implementation of the networks.
-    pub(crate) fn predict_by(
-        &self,
-        network: fn(&Mlp, &Weights, &Tensor) -> Result<Tensor>,
-        observations: &Tensor,
-        actions: &Tensor,
-        t: &Tensor,
-    ) -> Result<Tensor> {
         let Parts { time, trunk, features, shape, .. } = &*self.parts;
         let features = Tensor::from_slice(features, (shape.diffusion_steps, TIME_FEATURES), actions.device())?;
-        let embedding = network(time, &self.weights, &features)?.squeeze(0)?;
+        let embedding = time.forward(&self.weights, &features)?.squeeze(0)?;
         let embedding = embedding.index_select(&(t.to_dtype(DType::F32)? - 1.0)?.to_dtype(DType::U32)?, 0)?;
-        network(trunk, &self.weights, &Tensor::cat(&[observations, actions, &embedding], D::Minus1)?)?.squeeze(0)
+        trunk.forward(&self.weights, &Tensor::cat(&[observations, actions, &embedding], D::Minus1)?)?.squeeze(0)
     }
 
     /// The same network with its weights as constants, which share their memory with these.
     pub fn detach(&self) -> Self {
         let (parts, weights) = (self.parts.clone(), self.weights.detach());
-        Self { parts, weights, precision: Precision::F32, rounded: RoundedOnce::default() }
+        Self { parts, weights, rounding: Rounding::new(Precision::F32) }
     }
 
     /// Draws actions by the whole reverse process (DDPM).
@@ -96,40 +82,25 @@ impl NoisePredictor {
     /// observation: first a^T, then the noise of the reverse steps from t = T down to 2. Gives `[rows, a]`, through which no
     /// gradient flows.
     pub fn sample(&self, observations: &Tensor, noise: &Tensor) -> Result<Tensor> {
-        let weights = self.weights.values().detach();
-        self.check_noise(observations, noise)?;
         if !self.parts.trunk.is_fast(&self.weights) {
-            return self.detach().sample_by(Mlp::forward, observations, noise);
+            return self.detach().sample_with_gradient(observations, noise);
         }
-        let rounded = match self.precision {
-            Precision::F32 => None,
-            Precision::Bf16 => {
-                Some(self.rounded.get(&self.weights, |weights| self.parts.trunk.network(weights, 0).round())?)
-            }
-        };
+        self.check_noise(observations, noise)?;
+        let rounded = self.rounding.kernels(&self.parts.trunk, &self.weights)?;
         let operation = OnCpu(Sample { parts: self.parts.clone(), rounded });
+        let weights = self.weights.values().detach();
         weights.apply_op3_no_bwd(&observations.contiguous()?, &noise.contiguous()?, &operation)
     }
 
     /// [`Self::sample`], but differentiable in the weights, through every reverse step; slower.
     pub fn sample_with_gradient(&self, observations: &Tensor, noise: &Tensor) -> Result<Tensor> {
         self.check_noise(observations, noise)?;
-        self.sample_by(Mlp::forward, observations, noise)
-    }
-
-    /// The reverse process, step by step, with one implementation of the networks.
-    pub(crate) fn sample_by(
-        &self,
-        network: fn(&Mlp, &Weights, &Tensor) -> Result<Tensor>,
-        observations: &Tensor,
-        noise: &Tensor,
-    ) -> Result<Tensor> {
         let (steps, rows, _) = noise.dims3()?;
         let observations = plain::repeat_rows(observations, rows / observations.dim(0)?)?;
         let mut actions = noise.get(0)?;
         for t in (1..=steps).rev() {
             let all = Tensor::full(t as u32, rows, noise.device())?;
-            let epsilon = self.predict_by(network, &observations, &actions, &all)?;
+            let epsilon = self.predict(&observations, &actions, &all)?;
             let z = if t > 1 { Some(noise.get(steps - t + 1)?) } else { None };
             actions = self.schedule().reverse(t, &actions, &epsilon, z.as_ref())?;
         }

@@ -1,7 +1,6 @@
 //! Adam over the weights of a network, with an implementation for the CPU and one of plain candle operations.
 
 use crate::error::PolicyError;
-use crate::gradient::Gradients;
 use crate::slices::{has_fast_implementation, modify, read};
 use crate::weights::{Layout, Tensors, Weights};
 use candle_core::{DType, Result, Tensor};
@@ -11,7 +10,7 @@ use quad_kernels::optimiser::{BETA1, BETA2, EPSILON, adam, norm};
 /// AdamW (Loshchilov and Hutter 2019).
 pub struct Adam {
     /// Running means of the gradient and of its square, `[2, P]`.
-    moments: Tensor,
+    pub(crate) moments: Tensor,
     /// What each step takes off the weights, relative to them and to its rate.
     decay: f32,
 }
@@ -28,24 +27,13 @@ pub struct AdamStep {
 }
 
 impl Adam {
-    /// For weights that have not moved yet.
-    pub fn new(weights: &Weights) -> Result<Self> {
-        Self::decaying(weights, 0.0)
-    }
-
-    /// The same with a weight decay.
-    pub fn decaying(weights: &Weights, decay: f32) -> Result<Self> {
+    /// For weights that have not moved yet, with a weight decay, if it is not 0.
+    pub fn new(weights: &Weights, decay: f32) -> Result<Self> {
         let values = weights.values();
         Ok(Self { moments: Tensor::zeros((2, values.elem_count()), DType::F32, values.device())?, decay })
     }
 
-    /// Moves the weights down the loss that `gradients` are of. Gives the gradient's norm before clipping, `[]`.
-    pub fn step(&mut self, weights: &mut Weights, gradients: &Gradients, step: AdamStep) -> Result<Tensor> {
-        let gradient = gradients.with_respect_to(weights)?;
-        self.descend(weights, &gradient, step)
-    }
-
-    /// [`Self::step`] along a gradient.
+    /// Moves the weights down a gradient. Gives its norm before clipping, `[]`.
     pub fn descend(&mut self, weights: &mut Weights, gradient: &Tensor, step: AdamStep) -> Result<Tensor> {
         match has_fast_implementation(gradient.device()) {
             true => self.fused_step(weights, gradient, step),
@@ -117,56 +105,6 @@ pub fn cosine_decay(step: u64, total: u64) -> f32 {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::mlp_config::MlpConfig;
-    use crate::shape::EnsembleShape;
-    use candle_core::Device;
-    use rand::{Rng, SeedableRng};
-    use rand_chacha::ChaCha8Rng;
-
-    fn close(fast: &Tensor, plain: &Tensor) {
-        let [fast, plain] = [fast, plain].map(|x| x.flatten_all().unwrap().to_vec1::<f32>().unwrap());
-        for (fast, plain) in fast.iter().zip(&plain) {
-            assert!((fast - plain).abs() <= 1e-5 * plain.abs() + 1e-8, "{fast} for {plain}");
-        }
-    }
-
-    /// Enough numbers for several chunks, and no whole number of registers.
-    fn weights() -> Weights {
-        let shape = EnsembleShape {
-            members: 3,
-            observation_dim: 5,
-            action_dim: 2,
-            layers: MlpConfig::mish(&[77, 78]),
-            outputs: 1,
-        };
-        let layout = shape.layout();
-        let values = Weights::initial(&layout, &mut ChaCha8Rng::seed_from_u64(0), &Device::Cpu).unwrap();
-        Weights::trainable(layout, &values).unwrap()
-    }
-
-    #[test]
-    fn both_implementations_of_adam_and_the_ema_do_what_they_should() {
-        let mut generator = ChaCha8Rng::seed_from_u64(1);
-        for (clip, decay) in [(None, 0.0), (Some(0.3), 0.0), (Some(1e6), 0.0), (None, 0.5)] {
-            let [mut fast, mut plain] = [weights(), weights()];
-            let [mut fast_adam, mut plain_adam] =
-                [&fast, &plain].map(|weights| Adam::decaying(weights, decay).unwrap());
-            let mut target = fast.copy().unwrap();
-            let before = target.values().copy().unwrap();
-            for count in 1..4 {
-                let len = fast.values().elem_count();
-                let gradient: Vec<f32> = (0..len).map(|_| generator.random_range(-1.0..1.0)).collect();
-                let gradient = Tensor::from_vec(gradient, len, &Device::Cpu).unwrap();
-                let step = AdamStep { rate: 0.01, clip, count };
-                let size = fast_adam.fused_step(&mut fast, &gradient, step).unwrap();
-                close(&size, &plain_adam.plain_step(&mut plain, &gradient, step).unwrap());
-                close(&fast_adam.moments, &plain_adam.moments);
-                close(fast.values(), plain.values());
-            }
-            target.ema_update(&fast, 0.25).unwrap();
-            close(target.values(), &((before * 0.75).unwrap() + (fast.values() * 0.25).unwrap()).unwrap());
-        }
-    }
 
     #[test]
     fn the_learning_rate_falls_along_a_cosine() {

@@ -37,22 +37,22 @@ fn layer_norm(x: &Tensor, scale: &Tensor, shift: &Tensor) -> Result<Tensor> {
 }
 
 /// Layers `{prefix}0 …`: `x [1 or K, rows, in]` → `[K, rows, out]`.
-pub(crate) fn mlp(weights: &Tensors, prefix: &str, layers: &Layers, f: Activation, x: &Tensor) -> Result<Tensor> {
+pub(crate) fn mlp(weights: &Tensors, prefix: &str, layers: &Layers, x: &Tensor) -> Result<Tensor> {
     // `[K, in, out]` or `[K, 1, out]`, whether the tensors are named as members' or as one network's.
     let get = |layer: usize, kind: &str| {
         let path = format!("{prefix}{layer}.{kind}");
         let tensor = weights.get(&path).ok_or_else(|| candle_core::Error::CannotFindTensor { path }.bt())?;
         let rows = if kind == "kernel" { layers.shape(layer).0 } else { 1 };
-        tensor.reshape((layers.members(), rows, layers.shape(layer).1))
+        tensor.reshape((layers.members, rows, layers.shape(layer).1))
     };
     let mut x = x.clone();
     for layer in 0..layers.count() {
         x = x.contiguous()?.broadcast_matmul(&get(layer, "kernel")?)?.broadcast_add(&get(layer, "bias")?)?;
         if layer + 1 < layers.count() {
-            if layers.norm() {
+            if layers.norm {
                 x = layer_norm(&x, &get(layer, "scale")?, &get(layer, "shift")?)?;
             }
-            x = activate(f, &x)?;
+            x = activate(layers.activation, &x)?;
         }
     }
     Ok(x)

@@ -1,5 +1,6 @@
 //! How exactly networks are evaluated that no gradient is taken of.
 
+use serde::de::{self, IntoDeserializer};
 use serde::{Deserialize, Serialize};
 use std::str::FromStr;
 
@@ -30,7 +31,7 @@ impl Precision {
 
     /// What this CPU computes with where it is asked for.
     pub fn in_effect(self) -> Self {
-        if self.is_available() { self } else { Precision::F32 }
+        if quad_kernels::product::rounding_is_faster() { self } else { Precision::F32 }
     }
 
     /// How this CPU computes where it is asked for, as it is called on the wire and in `scores.jsonl`: what is in effect, and by
@@ -42,21 +43,14 @@ impl Precision {
 
     /// Whether this CPU computes with it, rather than with f32 in its place.
     pub fn is_available(self) -> bool {
-        match self {
-            Precision::F32 => true,
-            Precision::Bf16 => quad_kernels::product::rounding_is_faster(),
-        }
+        self.in_effect() == self
     }
 }
 
 impl FromStr for Precision {
-    type Err = &'static str;
+    type Err = de::value::Error;
 
     fn from_str(name: &str) -> Result<Self, Self::Err> {
-        match name {
-            "f32" => Ok(Precision::F32),
-            "bf16" => Ok(Precision::Bf16),
-            _ => Err("one of f32 and bf16"),
-        }
+        Self::deserialize(name.into_deserializer())
     }
 }

@@ -2,13 +2,14 @@
 //! one tile of rows after the other, so that activations stay in a core's cache; tiles run in parallel.
 
 use crate::layers::TILE;
-use crate::mlp::Mlp;
+use crate::mlp::{Kernels, Mlp};
 use crate::network::{Input, Network, rows_of, with_workspace};
 use crate::operation::{Arguments, Operation};
+
 use crate::schedule::Schedule;
 use crate::shape::{NoiseShape, TIME_EMBEDDING};
 use candle_core::{Result, Shape};
-use quad_kernels::product::{Rounded, product};
+use quad_kernels::product::product;
 use rayon::prelude::*;
 use std::sync::Arc;
 
@@ -27,7 +28,7 @@ pub(crate) struct Parts {
 /// The custom operation of (weights, observations, noise) that draws actions.
 pub(crate) struct Sample {
     pub parts: Arc<Parts>,
-    pub rounded: Option<Arc<Option<Vec<Rounded>>>>,
+    pub rounded: Option<Arc<Kernels>>,
 }
 
 impl Parts {
@@ -35,7 +36,7 @@ impl Parts {
     fn shifts(&self, weights: &[f32]) -> Vec<f32> {
         let NoiseShape { observation_dim, action_dim, diffusion_steps, .. } = self.shape;
         let mut embedding = vec![0.0; diffusion_steps * TIME_EMBEDDING];
-        self.time.run(weights, None, &self.features, true, &mut embedding);
+        self.time.run(weights, None, &self.features, &mut embedding);
         let network = self.trunk.network(weights, 0);
         let mut shifts = vec![0.0; diffusion_steps * network.width()];
         let kernel = network.first_kernel(observation_dim + action_dim, TIME_EMBEDDING);
@@ -81,7 +82,7 @@ impl Operation for Sample {
     fn forward(&self, given: Arguments<'_>) -> Result<(Vec<f32>, Shape)> {
         let action_dim = self.parts.shape.action_dim;
         let mut actions = vec![0.0; given.rows * action_dim];
-        let rounded = self.rounded.as_deref().and_then(Option::as_deref);
+        let rounded = self.rounded.as_ref().and_then(|rounded| rounded.first()).map(Vec::as_slice);
         let network = Network { rounded, ..self.parts.trunk.network(given.weights, 0) };
         self.parts.sample(network, given, &mut actions);
         Ok((actions, (given.rows, action_dim).into()))

@@ -32,7 +32,7 @@ pub(crate) struct Tile<'a> {
 impl SavedActivations {
     /// Makes room.
     pub fn resize(&mut self, layers: &Layers, rows: usize) {
-        (self.widths, self.members, self.rows) = (layers.hidden().to_vec(), layers.members(), rows);
+        (self.widths, self.members, self.rows) = (layers.hidden().to_vec(), layers.members, rows);
         self.x.resize_with(self.widths.len(), Buffer::default);
         self.slope.resize_with(self.widths.len(), Buffer::default);
     }
@@ -70,17 +70,12 @@ impl SavedActivations {
         self.of_member(&self.slope[0], 0, member)
     }
 
-    /// After the backward pass: the gradients of these layers. `input` gives a member's rows, `output_gradient` is
+    /// After the backward pass: the gradients of these layers. `input` is `rows × inputs`, `output_gradient`
     /// `members × rows × outputs`.
-    pub fn weight_gradients<'a>(
-        &self,
-        layers: Vec<LayerMut<'_>>,
-        input: impl Fn(usize) -> &'a [f32] + Sync,
-        output_gradient: &[f32],
-    ) {
+    pub fn weight_gradients(&self, layers: Vec<LayerMut<'_>>, input: &[f32], output_gradient: &[f32]) {
         layers.into_par_iter().for_each(|LayerMut { layer, member, kernel, bias }| {
             let x = match layer {
-                0 => input(member),
+                0 => input,
                 _ => self.of_member(&self.x[layer - 1], layer - 1, member),
             };
             let columns = bias.len();
@@ -95,42 +90,31 @@ impl SavedActivations {
 }
 
 /// Memory that is used again: fresh memory of such sizes would cost as much as the arithmetic.
-pub(crate) struct Pool<T>(Arc<Mutex<Vec<T>>>);
+#[derive(Clone, Default)]
+pub(crate) struct Pool(Arc<Mutex<Vec<SavedActivations>>>);
 
-impl<T> Clone for Pool<T> {
-    fn clone(&self) -> Self {
-        Self(self.0.clone())
-    }
-}
-
-impl<T> Default for Pool<T> {
-    fn default() -> Self {
-        Self(Arc::default())
-    }
-}
-
-impl<T: Default> Pool<T> {
+impl Pool {
     /// One that is lent until it is dropped.
-    pub fn lend(&self) -> Lent<T> {
+    pub fn lend(&self) -> Lent {
         let lent = self.0.lock().unwrap_or_else(PoisonError::into_inner).pop().unwrap_or_default();
         Lent { lent: Mutex::new(lent), home: self.clone() }
     }
 }
 
 /// What a pool has lent.
-pub(crate) struct Lent<T: Default> {
-    lent: Mutex<T>,
-    home: Pool<T>,
+pub(crate) struct Lent {
+    lent: Mutex<SavedActivations>,
+    home: Pool,
 }
 
-impl<T: Default> Lent<T> {
+impl Lent {
     /// Access to it, of one at a time.
-    pub fn lock(&self) -> MutexGuard<'_, T> {
+    pub fn lock(&self) -> MutexGuard<'_, SavedActivations> {
         self.lent.lock().unwrap_or_else(PoisonError::into_inner)
     }
 }
 
-impl<T: Default> Drop for Lent<T> {
+impl Drop for Lent {
     fn drop(&mut self) {
         let lent = std::mem::take(self.lent.get_mut().unwrap_or_else(PoisonError::into_inner));
         self.home.0.lock().unwrap_or_else(PoisonError::into_inner).push(lent);

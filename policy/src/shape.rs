@@ -4,7 +4,6 @@ use crate::layers::{Layers, TILE};
 use crate::mlp_config::MlpConfig;
 use crate::schedule::Reverse;
 use crate::weights::Layout;
-use quad_kernels::activation::Activation;
 
 /// Size of the sinusoidal features of a denoising step.
 pub(crate) const TIME_FEATURES: usize = 16;
@@ -75,12 +74,7 @@ pub struct NoiseShape {
 impl NoiseShape {
     /// The network that embeds a denoising step; always the same.
     pub(crate) fn time_layers(&self) -> Layers {
-        let config = MlpConfig {
-            hidden: vec![TIME_EMBEDDING],
-            activation: Activation::Mish,
-            norm: false,
-            initial: self.layers.initial,
-        };
+        let config = MlpConfig { initial: self.layers.initial, ..MlpConfig::mish(&[TIME_EMBEDDING]) };
         Layers::new(1, TIME_FEATURES, &config, TIME_EMBEDDING, 0)
     }
 

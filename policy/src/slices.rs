@@ -6,7 +6,25 @@ use candle_core::{CpuStorage, Device, Error, InplaceOp1, Layout, Result, Storage
 
 /// Whether operations on this device have a fast implementation: on the CPU, unless the feature `plain` says otherwise.
 pub fn has_fast_implementation(device: &Device) -> bool {
+    #[cfg(test)]
+    if PLAINLY.get() {
+        return false;
+    }
     device.is_cpu() && !cfg!(feature = "plain")
+}
+
+#[cfg(test)]
+thread_local! {
+    static PLAINLY: Cell<bool> = const { Cell::new(false) };
+}
+
+/// What `work` gives where nothing has a fast implementation.
+#[cfg(test)]
+pub(crate) fn plainly<R>(work: impl FnOnce() -> R) -> R {
+    PLAINLY.set(true);
+    let result = work();
+    PLAINLY.set(false);
+    result
 }
 
 /// The numbers behind a contiguous layout.

@@ -23,15 +23,13 @@ pub enum Start {
     Orthogonal(f32),
 }
 
-/// A named tensor's place in a flat vector.
+/// A named tensor in a flat vector.
 #[derive(Clone, Debug)]
 pub struct Part {
     /// Its name within the network, e.g. `trunk.0.kernel`.
     pub name: String,
     /// Its shape.
     pub shape: Vec<usize>,
-    /// Where in the vector it begins.
-    pub offset: usize,
     /// What it begins with.
     pub start: Start,
 }
@@ -91,13 +89,15 @@ impl Layout {
 
     /// Numbers in the vector.
     pub fn count(&self) -> usize {
-        self.0.last().map_or(0, |part| part.offset + part.count())
+        self.0.iter().map(Part::count).sum()
     }
 
     /// The tensors in a vector of this layout, as views of it, named with `prefix` before each name.
     pub fn split(&self, vector: &Tensor, prefix: &str) -> Result<Tensors> {
+        let mut offset = 0;
         let view = |part: &Part| {
-            let tensor = vector.narrow(0, part.offset, part.count())?.reshape(part.shape.as_slice())?;
+            let tensor = vector.narrow(0, offset, part.count())?.reshape(part.shape.as_slice())?;
+            offset += part.count();
             Ok((format!("{prefix}{}", part.name), tensor))
         };
         self.0.iter().map(view).collect()
@@ -123,18 +123,16 @@ impl Layout {
 /// It is missing, or has another type or shape, or a number that is not finite.
 pub fn take(tensors: &mut Tensors, name: String, shape: &[usize]) -> std::result::Result<Tensor, PolicyError> {
     let Some(tensor) = tensors.remove(&name) else { return Err(PolicyError::Missing(name)) };
-    if tensor.dtype() != DType::F32 {
-        return Err(PolicyError::Type { name, found: format!("{:?}", tensor.dtype()) });
-    }
-    if tensor.dims() != shape {
-        return Err(PolicyError::Shape { name, found: tensor.dims().to_vec(), expected: shape.to_vec() });
+    let [found, expected] = [(tensor.dtype(), tensor.dims()), (DType::F32, shape)].map(|form| format!("{form:?}"));
+    if found != expected {
+        return Err(PolicyError::Shape { name, found, expected });
     }
     check_finite(&name, &tensor)?;
     Ok(tensor)
 }
 
 /// That a tensor holds neither a NaN nor an infinity.
-pub fn check_finite(name: &str, tensor: &Tensor) -> std::result::Result<(), PolicyError> {
+pub(crate) fn check_finite(name: &str, tensor: &Tensor) -> std::result::Result<(), PolicyError> {
     let numbers = tensor.flatten_all()?.to_vec1::<f32>()?;
     if numbers.iter().all(|x| x.is_finite()) { Ok(()) } else { Err(PolicyError::NotFinite(name.to_owned())) }
 }
@@ -162,6 +160,15 @@ impl Weights {
         Self { layout, values, kept: None, changes: 0 }
     }
 
+    /// The same, of named tensors, which are taken out of `tensors`.
+    ///
+    /// # Errors
+    /// As [`Layout::join`].
+    pub fn take(layout: Layout, tensors: &mut Tensors, prefix: &str) -> std::result::Result<Self, PolicyError> {
+        let values = layout.join(tensors, prefix)?;
+        Ok(Self::constant(layout, values))
+    }
+
     /// A constant copy.
     pub fn copy(&self) -> Result<Self> {
         Ok(Self::constant(self.layout.clone(), self.values.detach().copy()?))
@@ -175,8 +182,10 @@ impl Weights {
     /// What each part begins with.
     pub fn initial(layout: &Layout, generator: &mut impl Rng, device: &Device) -> Result<Tensor> {
         let mut values = vec![0.0; layout.count()];
+        let mut rest = &mut values[..];
         for part in layout.0.iter() {
-            part.fill(&mut values[part.offset..][..part.count()], generator);
+            let mine = rest.split_off_mut(..part.count()).unwrap_or_default();
+            part.fill(mine, generator);
         }
         Tensor::from_vec(values, layout.count(), device)
     }
@@ -242,17 +251,12 @@ mod tests {
 
     #[test]
     fn each_part_begins_with_what_it_says() {
-        let part = |name: &str, shape: &[usize], offset, start| Part {
-            name: name.to_owned(),
-            shape: shape.to_vec(),
-            offset,
-            start,
-        };
+        let part = |name: &str, shape: &[usize], start| Part { name: name.to_owned(), shape: shape.to_vec(), start };
         let layout = Layout::new(vec![
-            part("wide", &[2, 3, 5], 0, Start::Orthogonal(2.0)),
-            part("tall", &[1, 5, 3], 30, Start::Orthogonal(2.0)),
-            part("scale", &[4], 45, Start::Constant(1.0)),
-            part("flat", &[100], 49, Start::Uniform(0.25)),
+            part("wide", &[2, 3, 5], Start::Orthogonal(2.0)),
+            part("tall", &[1, 5, 3], Start::Orthogonal(2.0)),
+            part("scale", &[4], Start::Constant(1.0)),
+            part("flat", &[100], Start::Uniform(0.25)),
         ]);
         let values = Weights::initial(&layout, &mut ChaCha8Rng::seed_from_u64(0), &Device::Cpu).unwrap();
         let parts = layout.split(&values, "").unwrap();
@@ -261,12 +265,10 @@ mod tests {
                 let matrix = Tensor::new(matrix, &Device::Cpu).unwrap();
                 let rows = if transposed { matrix.t().unwrap() } else { matrix };
                 let rows = rows.contiguous().unwrap();
-                let products: Vec<Vec<f32>> = rows.matmul(&rows.t().unwrap()).unwrap().to_vec2().unwrap();
-                for (i, row) in products.iter().enumerate() {
-                    for (j, x) in row.iter().enumerate() {
-                        assert!((x - if i == j { 4.0 } else { 0.0 }).abs() < 1e-5, "{name}: {products:?}");
-                    }
-                }
+                let products = rows.matmul(&rows.t().unwrap()).unwrap();
+                let expected = (Tensor::eye(3, DType::F32, &Device::Cpu).unwrap() * 4.0).unwrap();
+                let difference = (products - expected).unwrap().abs().unwrap().max_all().unwrap();
+                assert!(difference.to_scalar::<f32>().unwrap() < 1e-5, "{name}");
             }
         }
         assert_eq!(parts["scale"].to_vec1::<f32>().unwrap(), [1.0; 4]);

@@ -2,7 +2,7 @@
 //! as one list of named parts, and a table of metrics.
 
 use candle_core::{Result, Tensor};
-use quad_policy::{MlpConfig, PolicyConfig, PolicyError, Tensors};
+use quad_policy::{PolicyConfig, PolicyError, Tensors};
 use serde::de::DeserializeOwned;
 
 use super::context::Context;
@@ -93,25 +93,9 @@ pub enum AgentError {
     },
 }
 
-/// The hyper-parameters of one algorithm, which its `[agent]` table is read into.
-pub(super) trait Hyperparameters: DeserializeOwned {
-    /// That each is in its range, as far as its type does not say so.
-    fn check(&self) -> std::result::Result<(), AgentError>;
-}
-
-/// Reads a table of hyper-parameters and checks them.
-pub(super) fn read<T: Hyperparameters>(table: &toml::Table) -> std::result::Result<T, AgentError> {
-    let config = T::deserialize(table.clone())?;
-    config.check()?;
-    Ok(config)
-}
-
-/// That a network has hidden layers of reasonable widths.
-pub(super) fn check_layers(field: &'static str, layers: &MlpConfig) -> std::result::Result<(), AgentError> {
-    layers.check(field).map_err(|_| {
-        let value = format!("{:?}", layers.hidden);
-        AgentError::Range { field, value, range: "a list of the hidden layers' widths, each from 1 to 65535" }
-    })
+/// Reads a table of hyper-parameters, whose types say their ranges.
+pub(super) fn read<T: DeserializeOwned>(table: &toml::Table) -> std::result::Result<T, AgentError> {
+    Ok(T::deserialize(table.clone())?)
 }
 
 /// That a hyper-parameter is in its range.

@@ -7,9 +7,7 @@
 #[allow(clippy::unwrap_used)]
 mod golden;
 
-use super::algorithm::{
-    AgentError, Algorithm, AlgorithmError, Definition, Hyperparameters, Metric, check_layers, numbers, read, smaller,
-};
+use super::algorithm::{Algorithm, AlgorithmError, Definition, Metric, numbers, read, smaller};
 use super::context::{Context, Minibatch};
 use super::diffusion::{Denoising, noise_predictor};
 use super::hyperparameters::{Candidates, Count, NotNegative, Positive, Quantile, Rate, Share};
@@ -91,14 +89,6 @@ struct Config {
     actor_ema_rate: Rate,
     /// Actions that an evaluated policy draws in each state.
     candidates: Candidates,
-}
-
-impl Hyperparameters for Config {
-    fn check(&self) -> std::result::Result<(), AgentError> {
-        check_layers("actor", &self.actor)?;
-        check_layers("critic", &self.critic)?;
-        check_layers("value", &self.value)
-    }
 }
 
 /// AlignIQL in the middle of a run.

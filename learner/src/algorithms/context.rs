@@ -41,7 +41,16 @@ impl Context {
     pub fn batch(&self, items: &[u32]) -> Result<Minibatch> {
         let mut batch = Batch::default();
         self.transitions.gather(items, &mut batch);
-        Minibatch::new(&batch, &self.device)
+        let rows =
+            |numbers: &[f32]| Tensor::from_slice(numbers, (items.len(), numbers.len() / items.len()), &self.device);
+        let column = |numbers: &[f32]| Tensor::from_slice(numbers, items.len(), &self.device);
+        Ok(Minibatch {
+            observations: rows(&batch.observations)?,
+            actions: rows(&batch.actions)?,
+            rewards: column(&batch.rewards)?,
+            next_observations: rows(&batch.next_observations)?,
+            masks: column(&batch.masks)?,
+        })
     }
 }
 
@@ -61,23 +70,6 @@ pub struct Minibatch {
 }
 
 impl Minibatch {
-    /// Copies a batch to a device.
-    ///
-    /// # Errors
-    /// Candle fails.
-    pub fn new(batch: &Batch, device: &Device) -> Result<Self> {
-        let b = batch.size;
-        let rows = |numbers: &[f32]| Tensor::from_slice(numbers, (b, numbers.len() / b), device);
-        let column = |numbers: &[f32]| Tensor::from_slice(numbers, b, device);
-        Ok(Self {
-            observations: rows(&batch.observations)?,
-            actions: rows(&batch.actions)?,
-            rewards: column(&batch.rewards)?,
-            next_observations: rows(&batch.next_observations)?,
-            masks: column(&batch.masks)?,
-        })
-    }
-
     /// y = r + γ·mask·v for values v of s', `[B]`, as constants.
     ///
     /// # Errors

@@ -17,7 +17,7 @@ pub(super) fn noise_predictor(
 ) -> Result<(Trained<NoisePredictor>, NoisePredictor)> {
     let weights = initial(&shape.layout(), context, network)?;
     let target = NoisePredictor::new(shape.clone(), weights.copy()?, context.precision);
-    Ok((Trained::decaying(NoisePredictor::new(shape, weights, context.precision), decay)?, target))
+    Ok((Trained::new(NoisePredictor::new(shape, weights, context.precision), decay)?, target))
 }
 
 /// Standard normal numbers.

@@ -6,10 +6,7 @@
 #[allow(clippy::unwrap_used)]
 mod golden;
 
-use super::algorithm::{
-    AgentError, Algorithm, AlgorithmError, Definition, Hyperparameters, Metric, check_layers, largest, numbers, read,
-    smaller,
-};
+use super::algorithm::{Algorithm, AlgorithmError, Definition, Metric, largest, numbers, read, smaller};
 use super::context::{Context, Minibatch};
 use super::diffusion::{Denoising, chain_noise, noise_predictor};
 use super::hyperparameters::{Candidates, Count, NotNegative, Positive, Rate, Share, Steps};
@@ -94,13 +91,6 @@ struct Config {
     candidates: Candidates,
     /// Temperature of the softmax by which one of them is drawn, in units of Q.
     temperature: Positive,
-}
-
-impl Hyperparameters for Config {
-    fn check(&self) -> std::result::Result<(), AgentError> {
-        check_layers("actor", &self.actor)?;
-        check_layers("critic", &self.critic)
-    }
 }
 
 /// Diffusion-QL in the middle of a run.

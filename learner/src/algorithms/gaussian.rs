@@ -27,10 +27,10 @@ impl Gaussian {
     pub fn new(layers: &MlpConfig, context: &Context, network: u64) -> Result<Self> {
         let action_dim = context.action_dim();
         let shape = GaussianShape { observation_dim: context.observation_dim(), action_dim, actor: layers.clone() };
-        let part = Part { name: "log_std".to_owned(), shape: vec![action_dim], offset: 0, start: Start::Constant(0.0) };
+        let part = Part { name: "log_std".to_owned(), shape: vec![action_dim], start: Start::Constant(0.0) };
         let log_std = Tensor::zeros(action_dim, DType::F32, &context.device)?;
         let log_std = Weights::trainable(Layout::new(vec![part]), &log_std)?;
-        Ok(Self { mean: ensemble(shape.actor(), context, network)?, log_std: Trained::new(log_std)?, shape })
+        Ok(Self { mean: ensemble(shape.actor(), context, network)?, log_std: Trained::new(log_std, 0.0)?, shape })
     }
 
     /// log π(a|s), `[B]`.

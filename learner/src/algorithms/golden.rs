@@ -148,10 +148,7 @@ pub(super) fn check_candidates(golden: &Golden, algorithm: &dyn Algorithm) -> Dr
     load_policy(&file, Precision::F32).unwrap();
     let PolicyConfig::Diffusion { shape, choice } = policy else { panic!("{policy:?}") };
     let mut tensors = read_tensors(&file).unwrap();
-    let mut weights = |layout: Layout, prefix: &str| {
-        let values = layout.join(&mut tensors, prefix).unwrap();
-        Weights::constant(layout, values)
-    };
+    let mut weights = |layout: Layout, prefix: &str| Weights::take(layout, &mut tensors, prefix).unwrap();
     let actor = NoisePredictor::new(shape.actor(), weights(shape.actor().layout(), "actor."), Precision::F32);
     let critics = Ensemble::new(shape.critics(), weights(shape.critics().layout(), "critic."), Precision::F32);
     let value = shape.value().map(|of| Ensemble::new(of.clone(), weights(of.layout(), "value."), Precision::F32));

@@ -2,7 +2,7 @@
 //! critics' smaller value, a Gaussian policy is cloned from the data with weights, and twin critics move towards r + γ·V(s').
 //! An algorithm of this kind is its [`Losses`].
 
-use super::algorithm::{AgentError, Algorithm, Hyperparameters, Metric, check_layers, numbers, smaller};
+use super::algorithm::{Algorithm, Metric, numbers, smaller};
 use super::context::{Context, Minibatch};
 use super::gaussian::Gaussian;
 use super::hyperparameters::{Positive, Rate, Share};
@@ -64,7 +64,7 @@ pub(super) struct Common {
 }
 
 /// The equations of one algorithm; its hyper-parameters hold them.
-pub(super) trait Losses: Hyperparameters + Send {
+pub(super) trait Losses: Send {
     fn common(&self) -> &Common;
 
     /// The loss `[]` that V is moved down, of `q`, the smaller Q̂(s, a), and `v`, V(s); both `[B]`.
@@ -86,14 +86,6 @@ pub(super) trait Losses: Hyperparameters + Send {
     /// Steps that V makes in an update.
     fn value_steps(&self) -> u64 {
         1
-    }
-}
-
-impl Common {
-    pub fn check(&self) -> std::result::Result<(), AgentError> {
-        check_layers("actor", &self.actor)?;
-        check_layers("critic", &self.critic)?;
-        check_layers("value", &self.value)
     }
 }
 

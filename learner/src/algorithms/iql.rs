@@ -6,7 +6,7 @@
 #[allow(clippy::unwrap_used)]
 mod golden;
 
-use super::algorithm::{AgentError, Definition, Hyperparameters, Metric, read};
+use super::algorithm::{Definition, Metric, read};
 use super::hyperparameters::{Positive, Quantile};
 use super::in_sample::{Common, Helps, InSample, Losses, metrics};
 use candle_core::{DType, Result, Tensor};
@@ -39,12 +39,6 @@ struct Config {
     expectile: Quantile,
     /// Inverse temperature β of the advantages.
     temperature: Positive,
-}
-
-impl Hyperparameters for Config {
-    fn check(&self) -> std::result::Result<(), AgentError> {
-        self.common.check()
-    }
 }
 
 /// Mean of |expectile − 1(u < 0)|·u² (Eq. 5), `[]`: least where u is, by so much, as often above as below 0.

@@ -7,7 +7,7 @@
 #[allow(clippy::unwrap_used)]
 mod golden;
 
-use super::algorithm::{AgentError, Definition, Hyperparameters, Metric, read};
+use super::algorithm::{Definition, Metric, read};
 use super::hyperparameters::Positive;
 use super::in_sample::{Common, Helps, InSample, Losses, metrics, scale_down};
 use candle_core::{Result, Tensor};
@@ -69,12 +69,6 @@ impl Config {
             Divergence::Sparse => *self.alpha.sparse,
             Divergence::Exponential => *self.alpha.exponential,
         })
-    }
-}
-
-impl Hyperparameters for Config {
-    fn check(&self) -> std::result::Result<(), AgentError> {
-        self.common.check()
     }
 }
 

@@ -35,11 +35,6 @@ pub const ALGORITHMS: [Definition; 7] = [
     xql::DEFINITION,
 ];
 
-/// The algorithm of that name.
-pub fn named(name: &str) -> Option<Definition> {
-    ALGORITHMS.into_iter().find(|definition| definition.name == name)
-}
-
 #[cfg(test)]
 #[allow(clippy::unwrap_used)]
 mod golden;

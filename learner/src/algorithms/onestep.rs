@@ -6,9 +6,7 @@
 #[allow(clippy::unwrap_used)]
 mod golden;
 
-use super::algorithm::{
-    AgentError, Algorithm, AlgorithmError, Definition, Hyperparameters, Metric, check, check_layers, numbers, read,
-};
+use super::algorithm::{Algorithm, AlgorithmError, Definition, Metric, check, numbers, read};
 use super::context::{Context, Minibatch};
 use super::gaussian::log_density;
 use super::hyperparameters::{Count, Positive, Rate, Share, Steps};
@@ -97,13 +95,6 @@ struct Config {
     /// Lengths of the first two phases; what remains of the run is the third.
     behavior_steps: Steps,
     critic_steps: Steps,
-}
-
-impl Hyperparameters for Config {
-    fn check(&self) -> std::result::Result<(), AgentError> {
-        check_layers("behavior", &self.behavior)?;
-        check_layers("critic", &self.critic)
-    }
 }
 
 /// What an update does, and how many of its kind came before it.

@@ -64,22 +64,11 @@ impl<'a> Parts<'a> {
         Ok(tensors)
     }
 
-    /// The names of all networks.
+    /// The weights of all networks.
     #[cfg(test)]
-    pub fn networks(self) -> Vec<&'static str> {
-        let is_network = |part: &Part<'_>| matches!(part, Part::Weights(_));
-        self.0.into_iter().filter(|(_, part)| is_network(part)).map(|(name, _)| name).collect()
-    }
-
-    /// Makes the weights of a network NaN.
-    #[cfg(test)]
-    #[allow(clippy::unwrap_used)]
-    pub fn spoil(self, name: &str) {
-        for (of, part) in self.0 {
-            if let (true, Part::Weights(weights)) = (of == name, part) {
-                weights.change(|values| values.slice_set(&(values * f64::NAN)?, 0, 0)).unwrap();
-            }
-        }
+    pub fn networks(self) -> Vec<(&'static str, &'a mut Weights)> {
+        let weights = |(name, part)| if let Part::Weights(weights) = part { Some((name, weights)) } else { None };
+        self.0.into_iter().filter_map(weights).collect()
     }
 
     /// Takes each part's tensors out of `tensors`.

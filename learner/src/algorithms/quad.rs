@@ -7,7 +7,7 @@ mod config;
 mod golden;
 mod metrics;
 
-use super::algorithm::{Algorithm, AlgorithmError, Definition, largest, numbers, read};
+use super::algorithm::{Algorithm, AlgorithmError, Definition, largest, numbers};
 use super::context::{Context, Minibatch};
 use super::diffusion::{Denoising, chain_noise, noise_predictor};
 use super::parts::Parts;
@@ -28,8 +28,8 @@ pub(super) const DEFINITION: Definition = Definition {
     settings: include_str!("../../../presets/quad.toml"),
     variant: Some("guidance"),
     metrics: METRICS,
-    check: |table| read::<Config>(table).map(drop),
-    start: |table, context| Ok(Box::new(Quad::new(read(table)?, context)?)),
+    check: |table| Config::read(table).map(drop),
+    start: |table, context| Ok(Box::new(Quad::new(Config::read(table)?, context)?)),
 };
 
 /// QUAD in the middle of a run.

@@ -5,26 +5,18 @@ use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;
 
 /// What random numbers are for.
-#[derive(Clone, Copy, Debug)]
+#[derive(Clone, Copy)]
+#[repr(u64)]
 pub enum Purpose {
     /// Initial weights; counted by network.
-    Weights,
+    Weights = u64::from_be_bytes(*b"weights "),
     /// The noise of an update; counted by gradient step.
-    Noise,
-}
-
-impl Purpose {
-    fn key(self) -> u64 {
-        u64::from_be_bytes(match self {
-            Self::Weights => *b"weights ",
-            Self::Noise => *b"noise   ",
-        })
-    }
+    Noise = u64::from_be_bytes(*b"noise   "),
 }
 
 /// The stream of a run's seed for a purpose.
 pub fn stream(seed: u64, purpose: Purpose, count: u64) -> ChaCha8Rng {
-    let mut generator = ChaCha8Rng::seed_from_u64(seed ^ purpose.key());
+    let mut generator = ChaCha8Rng::seed_from_u64(seed ^ purpose as u64);
     generator.set_stream(count);
     generator
 }

@@ -45,18 +45,15 @@ pub(super) struct Trained<N> {
 }
 
 impl<N: Network> Trained<N> {
-    pub fn new(network: N) -> Result<Self> {
-        Self::decaying(network, 0.0)
-    }
-
-    /// A network whose weights decay: AdamW.
-    pub fn decaying(network: N, decay: f32) -> Result<Self> {
-        Ok(Self { adam: Adam::decaying(network.weights(), decay)?, network })
+    /// A network whose weights decay so much in each step, relative to its rate.
+    pub fn new(network: N, decay: f32) -> Result<Self> {
+        Ok(Self { adam: Adam::new(network.weights(), decay)?, network })
     }
 
     /// Moves the network down the loss that `gradients` are of. Gives the gradient's norm before clipping, `[]`.
     pub fn descend(&mut self, gradients: &Gradients, step: AdamStep) -> Result<Tensor> {
-        self.adam.step(self.network.weights_mut(), gradients, step)
+        let gradient = gradients.with_respect_to(self.network.weights())?;
+        self.adam.descend(self.network.weights_mut(), &gradient, step)
     }
 }
 
@@ -69,5 +66,5 @@ pub(super) fn initial(layout: &Layout, context: &Context, network: u64) -> Resul
 /// An ensemble to be trained, at its beginning.
 pub(super) fn ensemble(shape: EnsembleShape, context: &Context, network: u64) -> Result<Trained<Ensemble>> {
     let weights = initial(&shape.layout(), context, network)?;
-    Trained::new(Ensemble::new(shape, weights, context.precision))
+    Trained::new(Ensemble::new(shape, weights, context.precision), 0.0)
 }

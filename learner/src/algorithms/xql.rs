@@ -6,7 +6,7 @@
 #[allow(clippy::unwrap_used)]
 mod golden;
 
-use super::algorithm::{AgentError, Definition, Hyperparameters, Metric, read};
+use super::algorithm::{Definition, Metric, read};
 use super::context::{Context, Minibatch};
 use super::hyperparameters::{Count, NotNegative, Positive};
 use super::in_sample::{Common, Helps, InSample, Losses, metrics, scale_down};
@@ -56,12 +56,6 @@ struct Config {
     value_noise: NotNegative,
     /// Steps of V per update.
     value_steps: Count,
-}
-
-impl Hyperparameters for Config {
-    fn check(&self) -> std::result::Result<(), AgentError> {
-        self.common.check()
-    }
 }
 
 /// The random numbers of one update.

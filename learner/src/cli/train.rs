@@ -9,7 +9,8 @@ use quad_service::parse_endpoint;
 use toml::{Table, Value};
 
 use super::{parse_algorithm, parse_preset, parse_task};
-use crate::config::{Device, tables};
+use crate::config::Device;
+use crate::config::tables::{self, parse_assignment};
 
 pub(super) const EXAMPLES: &str = "\
 Examples:
@@ -73,10 +74,10 @@ pub struct TrainArgs {
     #[arg(long, value_name = "cpu|cuda", value_enum, hide_possible_values = true, default_value_t)]
     pub device: Device,
     /// Another value of a hyper-parameter of the algorithm, in TOML's notation: guidance=dac, tau=0.5; repeatable
-    #[arg(long, value_name = "KEY=VALUE", value_parser = tables::parse_agent_assignment)]
+    #[arg(long, value_name = "KEY=VALUE", value_parser = |text: &str| parse_assignment(&format!("agent.{text}")))]
     agent: Vec<Table>,
     /// The same of any key: batch_size=64, environment=my-robot; repeatable
-    #[arg(long, value_name = "KEY=VALUE", value_parser = tables::parse_assignment)]
+    #[arg(long, value_name = "KEY=VALUE", value_parser = parse_assignment)]
     set: Vec<Table>,
     #[command(flatten)]
     overrides: OverrideArgs,

@@ -13,7 +13,7 @@ use toml::Table;
 use super::nearest::did_you_mean;
 use super::tables::merge;
 use super::tasks::Task;
-use crate::algorithms::{self, ALGORITHMS, Definition};
+use crate::algorithms::{ALGORITHMS, Definition};
 
 /// The file of one algorithm.
 #[derive(Debug, Deserialize)]
@@ -71,14 +71,13 @@ pub fn not_given(definition: &Definition, task: &Task) -> anyhow::Result<Option<
 /// There is none; the hint has similar names.
 pub fn algorithm(name: &str) -> anyhow::Result<Definition> {
     let unknown = || hinted(anyhow!("there is no algorithm named {name}"), unknown_hint(name));
-    algorithms::named(name).ok_or_else(unknown)
+    ALGORITHMS.into_iter().find(|known| known.name == name).ok_or_else(unknown)
 }
 
 /// What to do about a name that no algorithm has.
 pub fn unknown_hint(name: &str) -> String {
     let names = ALGORITHMS.map(|known| known.name);
-    let nearest = did_you_mean(name, names).map(|nearest| nearest + " ").unwrap_or_default();
-    format!("{nearest}there are {}", names.join(", "))
+    format!("{}there are {}", did_you_mean(name, names), names.join(", "))
 }
 
 fn fits(pattern: &str, name: &str) -> bool {

@@ -24,14 +24,6 @@ pub fn parse_assignment(text: &str) -> Result<Table, String> {
     text.parse().or_else(|_| quoted().parse()).map_err(|_| format!("{key:?} is no key like agent.tau"))
 }
 
-/// Reads `tau=0.5`, an assignment in the table of an algorithm's hyper-parameters.
-///
-/// # Errors
-/// As [`parse_assignment`].
-pub fn parse_agent_assignment(text: &str) -> Result<Table, String> {
-    parse_assignment(&format!("agent.{text}"))
-}
-
 /// The values of a table and of the tables in it, with dotted keys.
 pub fn keys(table: &Table) -> Vec<(String, &Value)> {
     let mut all = Vec::new();

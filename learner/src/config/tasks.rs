@@ -57,7 +57,5 @@ pub fn named(name: &str) -> anyhow::Result<&'static Task> {
 
 /// What to do about a name that no task has.
 pub fn unknown_hint(name: &str) -> String {
-    let nearest = did_you_mean(name, all().iter().map(|task| &*task.name));
-    let nearest = nearest.map(|nearest| nearest + " ").unwrap_or_default();
-    format!("{nearest}`learner presets` lists all tasks")
+    did_you_mean(name, all().iter().map(|task| &*task.name)) + "`learner presets` lists all tasks"
 }

@@ -45,7 +45,7 @@ impl Source {
     pub fn named(name: &str) -> anyhow::Result<Self> {
         const LIST: &str = "`learner datasets list` prints all names; to train on a file, give its path";
         let known = catalogue::all().iter().map(|dataset| dataset.name.as_str());
-        let nearest = did_you_mean(name, known).map(|nearest| nearest + " ").unwrap_or_default();
+        let nearest = did_you_mean(name, known);
         let found = catalogue::find(name).map(Self::Named);
         found.ok_or_else(|| anyhow!("unknown dataset `{name}`")).hint(nearest + LIST)
     }

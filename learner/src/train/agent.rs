@@ -5,11 +5,9 @@ use super::pool::run_awake;
 use crate::algorithms::Parts;
 use crate::algorithms::{Algorithm, AlgorithmError, Context, Definition, Metric};
 use candle_core::Device;
-use quad_policy::{Header, PolicyError, check_finite, read_tensors};
+use quad_policy::{Header, PolicyError, read_header, read_tensors, write_tensors};
 use quad_protocol::Origin;
-use safetensors::SafeTensors;
 use serde::{Deserialize, Serialize};
-use std::collections::HashMap;
 
 /// Key of the counters in the metadata of a saved state.
 const COUNTERS: &str = "state";
@@ -34,9 +32,6 @@ struct Counters {
 /// A saved state that cannot be gone on from.
 #[derive(Debug, thiserror::Error)]
 pub enum StateError {
-    /// Not a state of this learner's.
-    #[error("this is not a state that a learner has saved: {0}")]
-    Content(String),
     /// Of another algorithm.
     #[error("the state is of the algorithm {found}, this run is of {expected}")]
     Algorithm {
@@ -110,15 +105,8 @@ impl Agent {
     /// # Errors
     /// A number that is not finite: a state with no future.
     pub fn save(&mut self) -> Result<Vec<u8>, AlgorithmError> {
-        let mut tensors = self.algorithm.parts().save()?;
-        for (name, tensor) in &mut tensors {
-            check_finite(name, tensor)?;
-            *tensor = tensor.to_device(&Device::Cpu)?;
-        }
         let counters = Counters { algorithm: self.definition.name.to_owned(), step: self.step };
-        let counters = serde_json::to_string(&counters).map_err(PolicyError::from)?;
-        let metadata = HashMap::from([(COUNTERS.to_owned(), counters)]);
-        Ok(safetensors::serialize(tensors, Some(metadata)).map_err(PolicyError::from)?)
+        Ok(write_tensors(&self.algorithm.parts().save()?, COUNTERS, &counters)?)
     }
 
     /// Goes on from a saved state, bit for bit, if the run's configuration is the same.
@@ -126,11 +114,7 @@ impl Agent {
     /// # Errors
     /// A file that is not the whole state of this algorithm; the agent is not to be used then.
     pub fn load(&mut self, bytes: &[u8]) -> Result<(), StateError> {
-        let (_, metadata) = SafeTensors::read_metadata(bytes).map_err(PolicyError::from)?;
-        let counters = metadata.metadata().as_ref().and_then(|metadata| metadata.get(COUNTERS));
-        let counters = counters.ok_or_else(|| StateError::Content("it has no counters".to_owned()))?;
-        let counters: Counters =
-            serde_json::from_str(counters).map_err(|error| StateError::Content(error.to_string()))?;
+        let counters: Counters = read_header(bytes, COUNTERS)?;
         if counters.algorithm != self.definition.name {
             return Err(StateError::Algorithm { found: counters.algorithm, expected: self.definition.name });
         }

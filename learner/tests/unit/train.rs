@@ -15,7 +15,8 @@ use super::outbox::{Outbox, Work};
 use super::results::{self, Outcome};
 use super::steps::{Outlets, Plan, TrainError, train};
 use super::{Registrar, Training, TrainingMetrics};
-use crate::algorithms::{Context, named};
+use crate::algorithms::Context;
+use crate::config::hyperparameters::algorithm as definition;
 use crate::config::{Schedule, resolve};
 use crate::run::Checkpoint;
 
@@ -99,7 +100,7 @@ fn run_of(
         precision: Precision::F32,
         device: Device::Cpu,
     };
-    let definition = named(algorithm).unwrap();
+    let definition = definition(algorithm).unwrap();
     let mut agent = Agent::new(definition, table, context).unwrap();
     if let Some(checkpoint) = from {
         agent.load(&checkpoint.state).unwrap();

@@ -8,7 +8,7 @@ use std::path::Path;
 use candle_core::{DType, Device, Tensor};
 use libfuzzer_sys::fuzz_target;
 use quad_policy::{
-    Choice, DiffusionPolicy, DiffusionShape, Ensemble, GaussianPolicy, GaussianShape, Header, Layout, MlpConfig,
+    Choice, DiffusionPolicy, DiffusionShape, Ensemble, EnsembleShape, GaussianPolicy, GaussianShape, Header, Layout, MlpConfig,
     NoisePredictor, PolicyConfig, Precision, Rule, Weights, load_policy,
 };
 
@@ -24,19 +24,21 @@ fn write_seeds() {
         let values = Tensor::full(0.5f32, layout.count(), &Device::Cpu).unwrap().to_dtype(DType::F32).unwrap();
         Weights::constant(layout, values)
     };
-    let shape = DiffusionShape::quad((2, 1), &MlpConfig::mish(&[2; 3]), 2, 2);
-    let actor = NoisePredictor::new(shape.actor(), halves(shape.actor().layout()), Precision::F32);
-    let critics = Ensemble::new(shape.critics(), halves(shape.critics().layout()), Precision::F32);
-    let value = Ensemble::new(shape.value(), halves(shape.value().layout()), Precision::F32);
+    let layers = MlpConfig::mish(&[2; 3]);
+    let with_value = DiffusionShape { value: Some(layers.clone()), ..DiffusionShape::quad((2, 1), &layers, 2, 2) };
     let diffusion = |rule: Rule| {
         let choice = Choice { rule, ..Choice::best_of(2) };
-        let value = Some(&value).filter(|_| choice.needs_value());
-        let tensors = DiffusionPolicy::tensors(&actor, &critics, value).unwrap();
+        let value = with_value.value.clone().filter(|_| rule == Rule::Nearest);
+        let shape = DiffusionShape { value, ..with_value.clone() };
+        let actor = NoisePredictor::new(shape.actor(), halves(shape.actor().layout()), Precision::F32);
+        let ensemble = |of: EnsembleShape| Ensemble::new(of.clone(), halves(of.layout()), Precision::F32);
+        let (critics, value) = (ensemble(shape.critics()), shape.value().map(ensemble));
+        let tensors = DiffusionPolicy::tensors(&actor, &critics, value.as_ref()).unwrap();
         Header { policy: PolicyConfig::Diffusion { shape, choice }, origin: () }.to_safetensors(&tensors).unwrap()
     };
     let (best, nearest) = (diffusion(Rule::Best), diffusion(Rule::Nearest));
     let softmax = diffusion(Rule::Softmax { temperature: 0.5 });
-    let shape = GaussianShape { observation_dim: 2, action_dim: 1, actor: MlpConfig::mish(&[2; 3]) };
+    let shape = GaussianShape { observation_dim: 2, action_dim: 1, actor: layers };
     let actor = Ensemble::new(shape.actor(), halves(shape.actor().layout()), Precision::F32);
     let tensors = GaussianPolicy::tensors(&actor).unwrap();
     let gaussian = Header { policy: PolicyConfig::Gaussian { shape }, origin: () }.to_safetensors(&tensors).unwrap();

@@ -1,6 +1,6 @@
 //! QUAD's hyper-parameters: the `[agent]` table of a preset.
 
-use crate::algorithms::algorithm::{AgentError, Hyperparameters, check, check_layers};
+use crate::algorithms::algorithm::{AgentError, check, read};
 use crate::algorithms::hyperparameters::{Candidates, Count, NotNegative, Positive, Rate, Share, Steps};
 use quad_policy::MlpConfig;
 use serde::Deserialize;
@@ -89,14 +89,15 @@ pub(super) struct Quad {
     pub actor_ema_start: u64,
 }
 
-impl Hyperparameters for Quad {
-    fn check(&self) -> Result<(), AgentError> {
-        check_layers("actor", &self.actor)?;
-        check_layers("critic", &self.critic)?;
-        check("tau", self.tau, self.tau > 0.0, "above 0 (`inf` is allowed)")?;
-        let Eta { initial, minimum, maximum, .. } = self.eta;
+impl Quad {
+    /// Reads a table of them and checks what their types do not say.
+    pub fn read(table: &toml::Table) -> Result<Self, AgentError> {
+        let config: Self = read(table)?;
+        check("tau", config.tau, config.tau > 0.0, "above 0 (`inf` is allowed)")?;
+        let Eta { initial, minimum, maximum, .. } = config.eta;
         check("eta.maximum", *maximum, *maximum >= *minimum, "at least eta.minimum")?;
         let within = (*minimum..=*maximum).contains(&*initial);
-        check("eta.initial", *initial, within, "between eta.minimum and eta.maximum")
+        check("eta.initial", *initial, within, "between eta.minimum and eta.maximum")?;
+        Ok(config)
     }
 }

@@ -9,7 +9,7 @@ use crate::algorithms::hyperparameters::{NotNegative, Positive};
 use candle_core::Device;
 
 fn start(golden: &Golden, device: &Device) -> Quad {
-    let mut quad = Quad::new(read(&table(golden)).unwrap(), context(golden, device)).unwrap();
+    let mut quad = Quad::new(Config::read(&table(golden)).unwrap(), context(golden, device)).unwrap();
     load(golden, quad.parts());
     // Below 0: not set yet.
     quad.nu_squared = quad.nu_squared.filter(|nu_squared| nu_squared.to_scalar::<f32>().unwrap() >= 0.0);

@@ -20,6 +20,7 @@ fn what_cannot_be_used_is_named_with_what_can() {
         ("hopper-demo", toml! { agent.eta.treshold = 1.0 }, "`threshold`"),
         ("hopper-demo", toml! { agent.guidance = "sac" }, "`quad`, `dac`, `none`"),
         ("hopper-demo", toml! { agent.samples = 0 }, "in `samples`"),
+        ("hopper-demo", toml! { agent.actor.hidden = [8, 0] }, "in `actor.hidden`"),
         ("hopper-demo", toml! { algorithm = "td3" }, "no algorithm named td3"),
         ("hopper-demo", toml! { episodes = 0 }, "episodes is 0, but must be from 1 to 10000"),
         ("hopper-demo", toml! { agent.candidates = 1001 }, "1001 is not a whole number from 1 to 1000"),
