@@ -67,12 +67,15 @@ fn group<'a>(criterion: &'a mut Criterion, name: &str, elements: usize) -> Bench
     group
 }
 
-/// One of our products beside gemm's. `ours` is given the number of the right-hand side, the two sides, and the result.
+/// Of the right-hand side of that number: its left and right side, and the result.
+type Product<'a> = &'a dyn Fn(usize, &[f32], &[f32], &mut [f32]);
+
+/// One of our products beside gemm's.
 fn compare(
     criterion: &mut Criterion,
     (name, [m, k, n]): (&str, [usize; 3]),
     (a_order, b_order, outs): (Order, Order, usize),
-    ours: impl Fn(usize, &[f32], &[f32], &mut [f32]),
+    ours: Product<'_>,
 ) {
     let mut group = group(criterion, name, 2 * m * k * n);
     let left = numbers(m * k, 0);
@@ -81,7 +84,7 @@ fn compare(
     let mut outs: Vec<_> = (0..outs).map(|_| zeros(m * n)).collect();
     let count = outs.len();
     let by_gemm = |_, a: &[f32], b: &[f32], out: &mut [f32]| by_gemm([m, k, n], (a, a_order), (b, b_order), out);
-    let both: [(&str, &dyn Fn(usize, &[f32], &[f32], &mut [f32])); 2] = [("ours", &ours), ("gemm", &by_gemm)];
+    let both: [(&str, Product<'_>); 2] = [("ours", ours), ("gemm", &by_gemm)];
     for (sides, (name, work)) in [1, IN_TURN].into_iter().flat_map(|sides| both.map(|one| (sides, one))) {
         let mut turn = 0;
         group.bench_function(BenchmarkId::new(name, format!("{sides} in turn")), |bencher| {
@@ -99,24 +102,24 @@ fn compare(
 fn products(criterion: &mut Criterion) {
     for [m, k, n] in [[128, 256, 256], [128, 128, 128], [128, 11, 256]] {
         let (name, orders) = (format!("product, {m} × {k} × {n}"), (Order::RowMajor, Order::RowMajor, 1));
-        compare(criterion, (&name, [m, k, n]), orders, |_, x, weights, out| product(x, weights, out, k, n));
+        compare(criterion, (&name, [m, k, n]), orders, &|_, x, weights, out| product(x, weights, out, k, n));
     }
     for [m, k, n] in [[128, 256, 256], [128, 128, 128]] {
         let name = format!("product with the transpose, {m} × {n} × {k}");
         let orders = (Order::RowMajor, Order::Transposed, 1);
-        compare(criterion, (&name, [m, n, k]), orders, |_, g, weights, out| product_transposed(g, weights, out, k, n));
+        compare(criterion, (&name, [m, n, k]), orders, &|_, g, weights, out| product_transposed(g, weights, out, k, n));
     }
     for [m, k, n] in [[128, 256, 256], [256, 256, 256], [128, 128, 128]] {
         let name = format!("outer product of {m} rows, {k} × {n}");
         let orders = (Order::Transposed, Order::RowMajor, IN_TURN);
-        compare(criterion, (&name, [k, m, n]), orders, |_, x, g, out| outer(x, g, out, k, n));
+        compare(criterion, (&name, [k, m, n]), orders, &|_, x, g, out| outer(x, g, out, k, n));
     }
     // The library has no product of rounded operands and multiplies in f32; nor has a CPU that gains nothing by it.
     for [m, k, n] in [[32, 256, 256], [32, 128, 128]] {
         let round = |seed| Rounded::new(numbers(k * n, seed).first(k * n), k, n);
         let Some(rounded) = (1..=IN_TURN).map(round).collect::<Option<Vec<_>>>() else { return };
         let (name, orders) = (format!("bf16 product, {m} × {k} × {n}"), (Order::RowMajor, Order::RowMajor, 1));
-        compare(criterion, (&name, [m, k, n]), orders, |i, x, _, out| rounded[i].product(x, out));
+        compare(criterion, (&name, [m, k, n]), orders, &|i, x, _, out| rounded[i].product(x, out));
     }
 }
 

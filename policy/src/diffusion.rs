@@ -10,7 +10,7 @@ use crate::noise_predictor::NoisePredictor;
 use crate::policy::Policy;
 use crate::precision::Precision;
 use crate::schedule::Reverse;
-use crate::shape::{EnsembleShape, NoiseShape, tile_numbers};
+use crate::shape::{EnsembleShape, NoiseShape, bytes, tile_numbers};
 use crate::slices::read;
 use crate::weights::{Tensors, Weights};
 use candle_core::{Device, Tensor};
@@ -193,15 +193,12 @@ impl Policy for DiffusionPolicy {
 
     fn memory(&self, states: usize) -> u64 {
         let DiffusionShape { observation_dim, action_dim, diffusion_steps, .. } = self.shape;
-        let (states, candidates, steps) = (states as u64, u64::from(self.choice.candidates), diffusion_steps as u64);
-        let rows = states.saturating_mul(candidates);
+        let (states, candidates) = (states as u128, u128::from(self.choice.candidates));
         // The noise of all steps, the candidates and their copies, and their values.
-        let drawn = rows.saturating_mul(action_dim as u64).saturating_mul(steps + 3).saturating_add(rows);
-        let observed = states.saturating_mul(observation_dim as u64);
-        let sampling = drawn.saturating_add(observed).saturating_add(tile_numbers(candidates, &self.shape.actor));
+        let drawn = states * candidates * (action_dim * (diffusion_steps + 3) + 1) as u128;
+        let sampling = drawn + states * observation_dim as u128 + tile_numbers(candidates, &self.shape.actor);
         let of_states = self.shape.value().map_or(0, |value| value.memory(states, 1));
-        let critics = self.shape.critics().memory(states, candidates).saturating_add(of_states);
-        sampling.saturating_mul(4).saturating_add(critics)
+        bytes(sampling + self.shape.critics().memory(states, candidates) + of_states)
     }
 
     fn act(&self, observations: &[f32], states: &mut [EpisodeState], actions: &mut [f32]) -> Result<(), PolicyError> {

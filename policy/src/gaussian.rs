@@ -6,7 +6,7 @@ use crate::error::{MOST, PolicyError, check_range};
 use crate::mlp_config::MlpConfig;
 use crate::policy::Policy;
 use crate::precision::Precision;
-use crate::shape::EnsembleShape;
+use crate::shape::{EnsembleShape, bytes};
 use crate::slices::read;
 use crate::weights::{Tensors, Weights};
 use candle_core::{Device, Result, Tensor};
@@ -77,8 +77,8 @@ impl Policy for GaussianPolicy {
 
     fn memory(&self, states: usize) -> u64 {
         let GaussianShape { observation_dim, action_dim, .. } = self.shape;
-        let numbers = states as u64 * (observation_dim + 2 * action_dim) as u64;
-        self.shape.actor().memory(states as u64, 1) + 4 * numbers
+        let states = states as u128;
+        bytes(self.shape.actor().memory(states, 1) + states * (observation_dim + 2 * action_dim) as u128)
     }
 
     fn act(

@@ -30,16 +30,15 @@ impl EnsembleShape {
         Layers::new(self.members, self.observation_dim + self.action_dim, &self.layers, self.outputs, 0)
     }
 
-    /// Bytes that it takes to run all networks forward on so many states, `repeat` rows for each.
-    pub(crate) fn memory(&self, states: u64, repeat: u64) -> u64 {
-        let (rows, members) = (states.saturating_mul(repeat), self.members as u64);
-        let outputs = rows.saturating_mul(members).saturating_mul(self.outputs as u64);
+    /// Numbers that it takes to run all networks forward on so many states, `repeat` rows for each.
+    pub(crate) fn memory(&self, states: u128, repeat: u128) -> u128 {
+        let rows = states * repeat * self.members as u128;
         let inside = match self.layers.norm {
             false => tile_numbers(repeat, &self.layers),
             // The plain implementation keeps whole layers: input and output of an operation.
-            true => rows.saturating_mul(members).saturating_mul(4 * self.layers.widest() as u64),
+            true => rows * 4 * self.layers.widest() as u128,
         };
-        outputs.saturating_add(inside).saturating_mul(4)
+        rows * self.outputs as u128 + inside
     }
 
     /// Tensors `{0..}.kernel` `[K, in, out]` and `{0..}.bias` `[K, out]`, and with a norm `.scale` and `.shift` `[K, out]`.
@@ -50,10 +49,14 @@ impl EnsembleShape {
 
 /// Numbers that the threads keep of the tiles of rows that they are at: rows of one state are not parted, and of each row
 /// there are some hidden layers.
-pub(crate) fn tile_numbers(repeat: u64, layers: &MlpConfig) -> u64 {
-    let each = (2 * layers.hidden.len()).max(4) as u64;
-    let tiles = (rayon::current_num_threads() as u64 * each).saturating_mul(repeat.max(TILE as u64));
-    tiles.saturating_mul(layers.widest() as u64)
+pub(crate) fn tile_numbers(repeat: u128, layers: &MlpConfig) -> u128 {
+    let each = (2 * layers.hidden.len()).max(4) * layers.widest();
+    (rayon::current_num_threads() * each) as u128 * repeat.max(TILE as u128)
+}
+
+/// Bytes of so many numbers, or as many as can be said.
+pub(crate) fn bytes(numbers: u128) -> u64 {
+    u64::try_from(4 * numbers).unwrap_or(u64::MAX)
 }
 
 /// The shape of a noise predictor.
