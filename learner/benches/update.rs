@@ -12,9 +12,7 @@ use quad_kernels::activation::{Activation, activate, activate_with_slope};
 use quad_learner::algorithms::Context;
 use quad_learner::config::{Device, Experiment, resolve};
 use quad_learner::train::agent::Agent;
-use quad_policy::{
-    Adam, AdamStep, DiffusionShape, Ensemble, Gradients, Layout, NoisePredictor, Precision, Reverse, Weights,
-};
+use quad_policy::{Adam, AdamStep, DiffusionShape, Ensemble, Gradients, Layout, NoisePredictor, Precision, Weights};
 use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 use rayon::prelude::*;
@@ -156,17 +154,8 @@ fn parts_of(group: &mut BenchmarkGroup<'_, WallTime>, experiment: &Experiment, s
     let count = |name: &str| experiment.agent[name].as_integer().expect("a whole number") as usize;
     let (b, k, steps) = (experiment.batch_size as usize, count("critics"), count("diffusion_steps"));
     let (observation_dim, action_dim) = DIMS;
-    let layers = |name: &str| experiment.agent[name].clone().try_into().expect("hidden layers");
-    let shape = DiffusionShape {
-        observation_dim,
-        action_dim,
-        actor: layers("actor"),
-        critic: layers("critic"),
-        value: None,
-        critics: k,
-        diffusion_steps: steps,
-        reverse: Reverse::ClipClean,
-    };
+    let layers = experiment.agent["critic"].clone().try_into().expect("hidden layers");
+    let shape = DiffusionShape::quad(DIMS, &layers, k, steps);
     let weights = |layout: Layout| {
         let values = Weights::initial(&layout, &mut ChaCha8Rng::seed_from_u64(0), &candle_core::Device::Cpu)?;
         Weights::trainable(layout, &values)

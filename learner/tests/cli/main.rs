@@ -3,6 +3,7 @@
 
 mod online;
 mod presets;
+mod published;
 mod report;
 mod run;
 mod threads;

@@ -8,18 +8,18 @@ use crate::printed;
 use crate::run::Run;
 
 /// What is reported of runs, which lie in folders a, b, …
-struct Reported {
-    json: Value,
-    text: String,
-    markdown: String,
-    picture: String,
+pub(super) struct Reported {
+    pub(super) json: Value,
+    pub(super) text: String,
+    pub(super) markdown: String,
+    pub(super) picture: String,
 }
 
-fn report(runs: &[Run]) -> Reported {
+pub(super) fn report(runs: &[Run]) -> Reported {
     report_with(runs, &[])
 }
 
-fn report_with(runs: &[Run], flags: &[&str]) -> Reported {
+pub(super) fn report_with(runs: &[Run], flags: &[&str]) -> Reported {
     let folder = tempfile::tempdir().unwrap();
     let paths: Vec<_> = ('a'..='z').take(runs.len()).map(|name| folder.path().join(name.to_string())).collect();
     runs.iter().zip(&paths).for_each(|(run, path)| run.write(path));
@@ -34,21 +34,21 @@ fn report_with(runs: &[Run], flags: &[&str]) -> Reported {
 
 impl Reported {
     /// The only group of runs.
-    fn group(&self) -> &Value {
+    pub(super) fn group(&self) -> &Value {
         let groups = self.json["groups"].as_array().unwrap();
         assert_eq!(groups.len(), 1, "{}", self.text);
         &groups[0]
     }
 
     /// That both forms of the report say this.
-    fn says(&self, words: &[&str]) {
+    pub(super) fn says(&self, words: &[&str]) {
         for text in [&self.text, &self.markdown] {
             words.iter().for_each(|words| assert!(text.contains(words), "{words} is missing in\n{text}"));
         }
     }
 
     /// That both have a line with all these words.
-    fn has_row(&self, words: &[&str]) {
+    pub(super) fn has_row(&self, words: &[&str]) {
         for text in [&self.text, &self.markdown] {
             let has_all = |line: &str| words.iter().all(|word| line.contains(word));
             assert!(text.lines().any(has_all), "a line with {words:?} is missing in\n{text}");
@@ -75,7 +75,7 @@ fn small(seed: u64, shift: f64) -> Run {
 }
 
 /// Four runs of one of the paper's tasks, with a score of each evaluation up to `last`.
-fn paper(task: &str, last: u64, score: impl Fn(u64) -> f64) -> Vec<Run> {
+pub(super) fn paper(task: &str, last: u64, score: impl Fn(u64) -> f64) -> Vec<Run> {
     let run = |seed| {
         let mut run = Run::new(task, seed);
         for step in (20_000..=last).step_by(20_000) {
@@ -86,7 +86,7 @@ fn paper(task: &str, last: u64, score: impl Fn(u64) -> f64) -> Vec<Run> {
     (0..4).map(run).collect()
 }
 
-const HOPPER: &str = "hopper-medium-replay-v2";
+pub(super) const HOPPER: &str = "hopper-medium-replay-v2";
 
 #[test]
 fn a_run_is_summarised_by_its_complete_evaluations_and_says_how_many_there_are() {
@@ -165,120 +165,6 @@ fn a_seed_counts_once_and_a_run_without_a_complete_evaluation_not_at_all() {
     reported.has_row(&["Not counted: ", "b has seed 0 like "]);
     reported.has_row(&["Not counted: ", "c has no complete evaluation"]);
     assert!(reported.text.contains("no evaluation has a score yet"), "{}", reported.text);
-}
-
-#[test]
-fn the_papers_protocol_stands_beside_the_papers_figures() {
-    // The last five: 1,920,000 to 2,000,000; the last 50,000 steps: 1,960,000 to 2,000,000. An early best one counts nowhere.
-    let score = |step| if step == 20_000 { 1000.0 } else { step as f64 / 20_000.0 };
-    let reported = report(&paper(HOPPER, 2_000_000, score));
-    let group = reported.group();
-    assert_eq!((&group["mean_last_5"]["mean"], &group["mean_last_50000_steps"]["mean"]), (&json!(99.5), &json!(100.5)));
-    assert_eq!((&group["departures"], &group["published"][0]["score"]["mean"]), (&json!([]), &json!(104.9)));
-    reported.has_row(&[HOPPER, "score", "± by n ", "± by n - 1"]);
-    reported.has_row(&[
-        "ours: quad",
-        " 99.50 ",
-        " 1.12 ",
-        " 1.29 ",
-        "last 5 evaluations; 4 seeds, 2000000 steps on cpu",
-    ]);
-    reported.has_row(&["ours: quad", " 100.50 ", "last 50000 steps", "scored in f32"]);
-    reported.has_row(&["QUAD", " 104.9 ", " 0.2 ", "Table 1"]);
-    reported.has_row(&["IQL"]);
-    reported.has_row(&["DAC's code", "divides by the number of seeds n"]);
-    assert!(!reported.text.contains("Not the paper's"), "{}", reported.text);
-    assert!(reported.markdown.contains("\n| --- |"), "{}", reported.markdown);
-}
-
-#[test]
-fn what_is_known_of_the_papers_figures_stands_below_them() {
-    let reported = report(&paper("antmaze-large-diverse-v0", 20_000, |_| 50.0));
-    let published = reported.group()["published"].as_array().unwrap();
-    let of = |method: &str| published.iter().find(|figure| figure["method"] == method).unwrap();
-    assert_eq!((&of("QUAD")["remarks"], &of("DQL")["remarks"][0]["selected"]), (&json!([]), &json!(true)));
-    reported.has_row(&["AlignIQL", " 54.0 bcd "]);
-    reported.has_row(&["DTQL", " 66.4 de "]);
-    reported.says(&["\n- a (DQL): selected by test returns: most likely the best of a run's"]);
-    reported.has_row(&["- d (AlignIQL, DTQL): AlignIQL's and DTQL's most likely changed places"]);
-    reported.has_row(&["CQL", " 14.9 h "]);
-    reported.has_row(&["- h (CQL): ", "CORL", " 20.5"]);
-}
-
-#[test]
-fn the_best_evaluation_counts_only_where_it_is_asked_for_and_the_report_says_so() {
-    // Of seed s the best evaluation has 1000 + s, at 20,000 steps.
-    let runs = paper(HOPPER, 200_000, |step| if step == 20_000 { 1000.0 } else { 50.0 });
-    let [last, best] = [&[][..], &["--select", "best"]].map(|flags| report_with(&runs, flags));
-    assert_eq!((&last.json["select"], &last.group()["best"]), (&json!("last"), &Value::Null));
-    assert_eq!((&best.json["select"], &best.group()["best"]["mean"]), (&json!("best"), &json!(1001.5)));
-    assert_eq!(best.group()["departures"][0], "the best evaluation of each run, not the mean of its last five");
-    let reasons = ["Selected: of each run its best complete evaluation counts", "it is optimistic"];
-    best.says(&reasons);
-    best.says(&["such selection stands behind those of DQL, EQL, Onestep-RL, as far as is known"]);
-    best.has_row(&["task", "best evaluation"]);
-    best.has_row(&["ours: quad", " 1001.50 ", "best evaluation of each run; 4 seeds"]);
-    assert!(best.text.contains("mean score of the best evaluation, after 20000 steps: 1003.00"), "{}", best.text);
-    for words in reasons.into_iter().chain(["1001.50", "such selection", "after 20000 steps"]) {
-        assert!(!last.text.contains(words) && !last.markdown.contains(words), "{words} in\n{}", last.text);
-    }
-}
-
-#[test]
-fn what_is_not_the_papers_protocol_is_called_so() {
-    let departures = |runs: &[Run]| {
-        let reported = report(runs);
-        let departures: Vec<String> = serde_json::from_value(reported.group()["departures"].clone()).unwrap();
-        departures.iter().for_each(|words| reported.says(&[words]));
-        departures
-    };
-    let stopped = &paper(HOPPER, 400_000, |_| 50.0)[..1];
-    let changes = [("experiment.dataset", "x.hdf5".into()), ("experiment.agent.tau", 1.0.into())];
-    let stopped = stopped[0].clone().set(&changes);
-    let expected = [
-        "dataset is x.hdf5, not hopper-medium-replay-v2",
-        "agent.tau is 1.0, not 0.1",
-        "20 of 100 evaluations are complete, the last of them after 400000 of 2000000 steps",
-        "1 of 4 seeds",
-    ];
-    assert_eq!(departures(std::slice::from_ref(&stopped)), expected);
-    // The named file in another place, known by its checksum.
-    let sha256 = "e121c5f7c9857a307baa9edc6a2c3b48e85fedb9ac316ecddd0f48ca7ef4e39b";
-    assert_eq!(departures(&[stopped.set(&[("dataset.sha256", sha256.into())])]), expected[1..]);
-
-    // What evaluators computed in does not part the seeds, but it is named.
-    let mut mixed = paper(HOPPER, 2_000_000, |_| 50.0);
-    mixed[1].scores.iter_mut().for_each(|line| line["precision"] = json!("bf16-amx"));
-    assert_eq!(departures(&mixed), ["scored in bf16 and f32, not in f32"]);
-    mixed.iter_mut().flat_map(|run| &mut run.scores).for_each(|line| line["precision"] = json!("bf16-amx"));
-    assert_eq!(departures(&mixed), ["scored in bf16, not in f32"]);
-}
-
-/// DAC and IQL have rows of their own in the paper's tables; behaviour cloning has none.
-#[test]
-fn another_algorithm_is_compared_with_its_own_authors_values() {
-    let guided = |guidance: &str| {
-        let runs = paper(HOPPER, 2_000_000, |_| 50.0);
-        Vec::from_iter(runs.into_iter().map(|run| run.set(&[("experiment.agent.guidance", guidance.into())])))
-    };
-    let reported = report(&guided("dac"));
-    assert_eq!(reported.group()["departures"], json!([]), "{}", reported.text);
-    reported.has_row(&["ours: quad, guidance dac, 10 candidates (DAC-Rep, DAC)", " 51.50 "]);
-    let reported = report(&guided("none"));
-    assert_eq!(reported.group()["departures"], json!(["agent.guidance is \"none\", not \"quad\""]));
-
-    let mut iql = Run::by("iql", HOPPER, 0).set(&[("experiment.agent.expectile", 0.8.into())]);
-    (0..10).for_each(|episode| iql.score(5_000, episode, 50.0, "00"));
-    let reported = report(&[iql, paper(HOPPER, 100_000, |_| 50.0).remove(0)]);
-    let [iql, quad] = &reported.json["groups"].as_array().unwrap()[..] else { panic!("{}", reported.text) };
-    assert_eq!((&iql["methods"], &iql["departures"][0]), (&json!(["IQL"]), &json!("agent.expectile is 0.8, not 0.7")));
-    assert_eq!(
-        (&iql["differs"], &quad["differs"]),
-        (&json!([]), &json!([])),
-        "of other algorithms nothing is expected"
-    );
-    reported.has_row(&["ours: iql "]);
-    reported.has_row(&["ours: quad, guidance quad, 10 candidates "]);
 }
 
 #[test]

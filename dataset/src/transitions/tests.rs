@@ -1,0 +1,93 @@
+//! Tests of what follows what.
+
+use super::*;
+use crate::recording::RowKind::{self, Dropped, LastState, Transition};
+
+/// Rows whose observation, action (in hundredths) and reward are their number.
+fn recording(kinds: &[RowKind]) -> Recording {
+    let n = kinds.len();
+    let numbers = || (0..n).map(|row| row as f32);
+    Recording {
+        observation_dim: 1,
+        action_dim: 1,
+        observations: numbers().collect(),
+        actions: numbers().map(|row| row / 100.0).collect(),
+        rewards: numbers().collect(),
+        kinds: kinds.to_vec(),
+        terminals: vec![false; n],
+        timeouts: vec![false; n],
+        ends: vec![false; n],
+        ..Recording::default()
+    }
+}
+
+fn transitions(recording: Recording) -> Transitions {
+    let scaling = RewardRule::AsIs.scaling(&[]).unwrap();
+    Transitions::new(recording, None, scaling)
+}
+
+/// D4RL: 0 1 2(timeout) | 3 4(terminal) | 5 6(the last row).
+fn d4rl() -> Recording {
+    let mut recording = recording(&[Transition, Transition, Dropped, Transition, Transition, Transition, Dropped]);
+    recording.timeouts[2] = true;
+    recording.terminals[4] = true;
+    recording.ends[2] = true;
+    recording.ends[4] = true;
+    recording
+}
+
+#[test]
+fn episodes_end_at_timeouts_terminals_and_the_end_of_the_file() {
+    let transitions = transitions(d4rl());
+    assert_eq!(transitions.episodes(), [0..2, 2..4, 4..5]);
+    let next: Vec<_> = (0..5).map(|index| transitions.next(index)).collect();
+    assert_eq!(next, [Some(1), None, Some(3), None, None]);
+}
+
+#[test]
+fn a_dropped_step_gives_its_action_to_the_transition_that_leads_to_it() {
+    let transitions = transitions(d4rl());
+    let actions: Vec<_> = (0..5).map(|index| transitions.next_action(index).map(|action| action[0])).collect();
+    assert_eq!(actions, [Some(0.01), Some(0.02), Some(0.04), None, Some(0.06)], "after a terminal there is none");
+}
+
+#[test]
+fn the_last_state_of_an_episode_is_no_step() {
+    let mut recording = recording(&[Transition, Transition, LastState, Transition, LastState]);
+    recording.ends[1] = true;
+    recording.ends[3] = true;
+    let transitions = transitions(recording);
+    assert_eq!(transitions.episodes(), [0..2, 2..3]);
+    assert_eq!((transitions.next_action(0), transitions.next_action(1)), (Some(&[0.01][..]), None));
+}
+
+#[test]
+fn an_episode_ends_at_the_goal_although_the_recording_goes_on() {
+    let mut recording = recording(&[Transition, Transition, Transition, Dropped]);
+    recording.goal = true;
+    recording.terminals[1] = true;
+    recording.ends[3] = true;
+    let transitions = transitions(recording);
+    assert_eq!(transitions.episodes(), [0..2, 2..3]);
+    assert!(transitions.next_action(1).is_none());
+}
+
+#[test]
+fn rows_with_next_observations_of_their_own_follow_one_another_where_these_say_so() {
+    let mut recording = recording(&[Transition; 4]);
+    recording.next_observations = Some(vec![1.0, 9.0, 3.0, 4.0]);
+    let transitions = transitions(recording);
+    assert_eq!(transitions.episodes(), [0..2, 2..4]);
+    assert_eq!((transitions.next_action(1), transitions.next_action(3)), (None, None));
+}
+
+#[test]
+fn windows_lie_within_episodes() {
+    let transitions = transitions(d4rl());
+    assert_eq!(transitions.window_starts(1), [0, 1, 2, 3, 4]);
+    assert_eq!(transitions.window_starts(2), [0, 2]);
+    assert!(transitions.window_starts(3).is_empty());
+    let mut batch = Batch::default();
+    transitions.gather(&Vec::from_iter(2..4), &mut batch);
+    assert_eq!((batch.observations, batch.next_observations), (vec![3.0, 4.0], vec![4.0, 5.0]));
+}
