@@ -1,6 +1,6 @@
 //! `learner report` beside the paper's figures.
 
-use serde_json::json;
+use serde_json::{Value, json};
 
 use super::report::{HOPPER, paper, report, report_with};
 use crate::run::Run;
