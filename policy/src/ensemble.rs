@@ -55,7 +55,10 @@ impl Ensemble {
         let constant = !(self.weights.values().track_op() || observations.track_op() || actions.track_op());
         let fast = constant && self.networks.is_fast(&self.weights);
         let rounded = if fast { self.rounding.kernels(&self.networks, &self.weights)? } else { None };
-        self.networks.forward_by(rounded, &self.weights, &self.inputs(observations, actions)?)
+        let observations = plain::repeat_rows(observations, actions.dim(0)? / observations.dim(0)?)?;
+        let inputs = [&observations, actions];
+        let inputs = if self.shape.action_dim == 0 { &inputs[..1] } else { &inputs };
+        self.networks.forward_by(rounded, &self.weights, inputs)
     }
 
     /// Q_k(s, a), `[K, rows]`, of networks with one output; the arguments are those of [`Self::outputs`].
@@ -88,14 +91,6 @@ impl Ensemble {
         }
         let operation = OnCpu(ActionGradients { networks: self.networks.clone() });
         weights.apply_op3_no_bwd(&observations.contiguous()?, &actions.contiguous()?, &operation)
-    }
-
-    /// `[s, a]` row by row.
-    fn inputs(&self, observations: &Tensor, actions: &Tensor) -> Result<Tensor> {
-        match self.shape.action_dim {
-            0 => Ok(observations.clone()),
-            _ => Tensor::cat(&[&plain::repeat_rows(observations, actions.dim(0)? / observations.dim(0)?)?, actions], 1),
-        }
     }
 
     fn check(&self, observations: &Tensor, actions: &Tensor) -> Result<()> {

@@ -32,24 +32,26 @@ impl Mlp {
         Self { layers: Arc::new(layers), prefix, saved: Pool::default() }
     }
 
-    /// `x [rows, in]` → `[K, rows, out]`.
-    pub fn forward(&self, weights: &Weights, x: &Tensor) -> Result<Tensor> {
-        self.forward_by(None, weights, x)
+    /// `inputs [rows, …]`, side by side → `[K, rows, out]`.
+    pub fn forward(&self, weights: &Weights, inputs: &[&Tensor]) -> Result<Tensor> {
+        self.forward_by(None, weights, inputs)
     }
 
     /// The same; where no gradient is taken, by these kernels of the members, rounded.
-    pub fn forward_by(&self, rounded: Option<Arc<Kernels>>, weights: &Weights, x: &Tensor) -> Result<Tensor> {
+    pub fn forward_by(&self, rounded: Option<Arc<Kernels>>, weights: &Weights, inputs: &[&Tensor]) -> Result<Tensor> {
+        let x = if let [x] = inputs { (*x).clone() } else { Tensor::cat(inputs, 1)? };
         let (values, layers) = (weights.values(), &self.layers);
-        if !matches!(*x.dims(), [rows, inputs] if rows > 0 && inputs == layers.inputs()) {
+        if !matches!(*x.dims(), [rows, width] if rows > 0 && width == layers.inputs()) {
             bail!("{} networks of {} numbers got inputs of shape {:?}", layers.members, layers.inputs(), x.dims());
         }
         if !self.is_fast(weights) {
-            return self.plain_forward(weights, x);
+            return self.plain_forward(weights, &x);
         }
         let kept = if values.track_op() { weights.kept_gradient().cloned() } else { None };
         let saved = (values.track_op() || x.track_op()).then(|| self.saved.lend());
-        values
-            .apply_op2(&x.contiguous()?, Operation { mlp: self.clone(), kept, saved, rounded, to_input: x.track_op() })
+        let constant =
+            inputs.iter().take_while(|input| !input.track_op()).map(|input| input.dim(1)).sum::<Result<_>>()?;
+        values.apply_op2(&x.contiguous()?, Operation { mlp: self.clone(), kept, saved, rounded, constant })
     }
 
     /// Whether the fast implementation serves them.
@@ -98,8 +100,8 @@ struct Operation {
     saved: Option<Lent>,
     /// What the products between hidden layers use, if nothing is kept.
     rounded: Option<Arc<Kernels>>,
-    /// Whether the inputs are to get a gradient.
-    to_input: bool,
+    /// How many of the inputs, the first ones, get no gradient.
+    constant: usize,
 }
 
 impl Operation {
@@ -134,19 +136,22 @@ impl Operation {
         if let Some(kept) = &self.kept {
             kept.write(layers.range(), |out| saved.weight_gradients(layers.split_mut(out), x, gradient))?;
         }
-        if !self.to_input {
+        let width = inputs - self.constant;
+        if width == 0 {
             return Ok(None);
         }
-        let mut of_members = vec![0.0; members * rows * inputs];
-        of_members.par_chunks_mut(rows * inputs).enumerate().for_each(|(member, out)| {
-            self.mlp.network(weights, member).input_gradient(saved.first_delta(member), (0, inputs), out);
+        let mut of_members = vec![0.0; members * rows * width];
+        of_members.par_chunks_mut(rows * width).enumerate().for_each(|(member, out)| {
+            let delta = saved.first_delta(member);
+            self.mlp.network(weights, member).input_gradient(delta, (self.constant, width), out);
         });
-        let (sum, others) = of_members.split_at_mut(rows * inputs);
-        for other in others.chunks_exact(rows * inputs) {
-            sum.iter_mut().zip(other).for_each(|(sum, x)| *sum += x);
+        let mut sum = vec![0.0; rows * inputs];
+        for member in of_members.chunks_exact(rows * width) {
+            for (sum, x) in sum.chunks_exact_mut(inputs).zip(member.chunks_exact(width)) {
+                sum[self.constant..].iter_mut().zip(x).for_each(|(sum, x)| *sum += x);
+            }
         }
-        of_members.truncate(rows * inputs);
-        Ok(Some(of_members))
+        Ok(Some(sum))
     }
 }
 

@@ -9,7 +9,7 @@ use crate::sampler::{Parts, Sample};
 use crate::schedule::Schedule;
 use crate::shape::{NoiseShape, TIME_FEATURES};
 use crate::weights::Weights;
-use candle_core::{D, DType, Result, Tensor, bail};
+use candle_core::{DType, Result, Tensor, bail};
 use std::sync::Arc;
 
 /// A noise predictor and its weights.
@@ -65,9 +65,9 @@ impl NoisePredictor {
     pub fn predict(&self, observations: &Tensor, actions: &Tensor, t: &Tensor) -> Result<Tensor> {
         let Parts { time, trunk, features, shape, .. } = &*self.parts;
         let features = Tensor::from_slice(features, (shape.diffusion_steps, TIME_FEATURES), actions.device())?;
-        let embedding = time.forward(&self.weights, &features)?.squeeze(0)?;
+        let embedding = time.forward(&self.weights, &[&features])?.squeeze(0)?;
         let embedding = embedding.index_select(&(t.to_dtype(DType::F32)? - 1.0)?.to_dtype(DType::U32)?, 0)?;
-        trunk.forward(&self.weights, &Tensor::cat(&[observations, actions, &embedding], D::Minus1)?)?.squeeze(0)
+        trunk.forward(&self.weights, &[observations, actions, &embedding])?.squeeze(0)
     }
 
     /// The same network with its weights as constants, which share their memory with these.
