@@ -38,7 +38,9 @@ impl EnsembleShape {
             // The plain implementation keeps whole layers: input and output of an operation.
             true => rows * 4 * self.layers.widest() as u128,
         };
-        rows * self.outputs as u128 + inside
+        // An observation for each action, and both side by side.
+        let fed = states * repeat * (2 * self.observation_dim + self.action_dim) as u128;
+        rows * self.outputs as u128 + fed + inside
     }
 
     /// Tensors `{0..}.kernel` `[K, in, out]` and `{0..}.bias` `[K, out]`, and with a norm `.scale` and `.shift` `[K, out]`.
