@@ -122,8 +122,12 @@ struct Onestep {
 impl Onestep {
     fn new(config: Config, context: Context) -> std::result::Result<Self, AlgorithmError> {
         let before = config.behavior_steps.saturating_add(*config.critic_steps);
-        let range = "so small that with agent.critic_steps it leaves some of the run's steps for the policy";
-        check("behavior_steps", *config.behavior_steps, before < context.total_steps, range)?;
+        let value = format!(
+            "{} (and critic_steps {}, of {} steps)",
+            *config.behavior_steps, *config.critic_steps, context.total_steps
+        );
+        let range = "so small that steps are left for the policy: give more --steps, or make both smaller";
+        check("behavior_steps", value, before < context.total_steps, range)?;
         let items = items(&context);
         if items.is_empty() {
             let what = "no transition of the dataset has a next action, which Onestep-RL learns from";
