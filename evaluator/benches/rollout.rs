@@ -5,9 +5,7 @@
 
 use candle_core::Device;
 use criterion::{BatchSize, Criterion, criterion_group, criterion_main};
-use quad_dataset::environment::find;
-use quad_evaluator::sim::Rollout;
-use quad_evaluator::sim::{make, simulated};
+use quad_evaluator::sim::{EnvironmentError, Environments, Rollout, Simulations, make, simulated};
 use quad_policy::{
     Choice, DiffusionPolicy, DiffusionShape, Ensemble, EpisodeState, Header, Layout, MlpConfig, NoisePredictor, Policy,
     PolicyConfig, Precision, Weights, load_policy,
@@ -38,7 +36,6 @@ fn policy(precision: Precision) -> Box<dyn Policy> {
 
 /// Four steps of ten episodes; a policy call and a control period each.
 fn steps(criterion: &mut Criterion) {
-    let spec = find("hopper").expect("a known environment");
     let seeds: Vec<u64> = (0..EPISODES as u64).collect();
     let mut group = criterion.benchmark_group("rollout");
     for (name, precision) in [("f32", Precision::F32), ("bf16", Precision::Bf16)] {
@@ -46,16 +43,17 @@ fn steps(criterion: &mut Criterion) {
         group.bench_function(format!("{STEPS} steps, {name}"), |bencher| {
             bencher.iter_batched_ref(
                 || {
-                    Rollout::new(spec, 0, &seeds, |seed| policy.begin(seed))
+                    Rollout::new(|| Simulations.make("hopper", 0), (11, 3), &seeds, |seed| policy.begin(seed))
                         .expect("MuJoCo compiles the embedded model")
                 },
                 |rollout| {
                     rayon::scope(|_| {
                         for _ in 0..STEPS {
                             let act = |observations: &[f32], states: &mut [EpisodeState], actions: &mut [f32]| {
-                                policy.act(observations, states, actions)
+                                policy.act(observations, states, actions).expect("the policy's numbers are finite");
+                                Ok::<_, EnvironmentError>(())
                             };
-                            rollout.step(act).expect("the policy's numbers are finite");
+                            rollout.step(act).expect("a simulation cannot break down");
                         }
                     });
                     assert_eq!(rollout.environment_steps(), (EPISODES * STEPS) as u64, "an episode has ended");

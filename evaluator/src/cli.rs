@@ -2,6 +2,7 @@
 
 use std::num::NonZeroUsize;
 use std::path::PathBuf;
+use std::sync::Arc;
 
 use clap::{Args, Parser, Subcommand};
 use quad_dataset::EnvironmentSpec;
@@ -10,6 +11,7 @@ use quad_service::Hint;
 
 use crate::doctor::{self, DoctorArgs};
 use crate::serve::{self, ServeArgs};
+use crate::sim::Simulations;
 use crate::tools::collect::{self, CollectError, Summary};
 use crate::tools::score::{self, ScoreArgs};
 use crate::tools::verify::{self, Report, VerifyError};
@@ -75,7 +77,7 @@ impl Cli {
     /// Does what was asked for.
     pub fn run(self) -> anyhow::Result<()> {
         match self.command {
-            Command::Serve(args) => serve::serve(args),
+            Command::Serve(args) => serve::serve(args, Arc::new(Simulations)),
             Command::Score(args) => {
                 print(&score::score(&args)?);
                 Ok(())

@@ -4,7 +4,6 @@ use std::path::PathBuf;
 use std::time::Duration;
 
 use clap::Args;
-use quad_dataset::environment;
 use quad_policy::Precision;
 use quad_protocol::{JobReply, JobRequest, Name, PROTOCOL_VERSION, decode_from, encode, keys};
 use quad_service::doctor::{self, Findings};
@@ -12,8 +11,10 @@ use quad_service::{Endpoints, Role, default_endpoint, parse_endpoint};
 use zenoh::Session;
 
 use crate::serve::DEFAULT_PORT;
-use crate::sim::Rollout;
+use crate::sim::{Environments, Rollout, Simulations};
 
+/// What is tried.
+const HOPPER: &str = "hopper";
 /// How long learners are waited for.
 const ANSWER: Duration = Duration::from_secs(5);
 
@@ -62,7 +63,8 @@ pub fn examine(args: &DoctorArgs) -> anyhow::Result<Findings> {
 fn simulator(findings: &mut Findings) {
     let version = mujoco_rs::mujoco_version();
     let step = || -> anyhow::Result<()> {
-        Rollout::new(environment::find("hopper")?, 0, &[0], |_| ())?.step(|_, _, _| Ok(()))
+        let sizes = Simulations.sizes(HOPPER).unwrap_or_default();
+        Rollout::new(|| Simulations.make(HOPPER, 0), sizes, &[0], |_| ())?.step(|_, _, _| Ok(()))
     };
     match step() {
         Ok(()) => findings.ok("libmujoco", format!("{version}, and Hopper moves in it")),

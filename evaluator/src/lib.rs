@@ -5,7 +5,7 @@
 //! Three rooms, of which the later two use the first and never each other:
 //!
 //! - [`sim`]: the tasks and whole batches of their episodes.
-//! - `serve`: finds runs on the network, evaluates their snapshots, delivers the scores.
+//! - [`serve`]: finds runs on the network, evaluates their snapshots, delivers the scores.
 //! - [`tools`]: records datasets, replays them, scores saved policies, on this machine alone.
 //!
 //! Beside them: [`cli`], the command line; `doctor`, which checks this machine before it evaluates anything; `metrics`, what
@@ -14,6 +14,6 @@
 pub mod cli;
 mod doctor;
 mod metrics;
-mod serve;
+pub mod serve;
 pub mod sim;
 pub mod tools;

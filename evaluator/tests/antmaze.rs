@@ -4,14 +4,14 @@
 use mujoco_rs::wrappers::mj_data::MjData;
 use mujoco_rs::wrappers::mj_model::MjModel;
 use quad_dataset::environment::find;
-use quad_evaluator::sim::{Environment, Step, make, mjcf};
+use quad_evaluator::sim::{Simulation, Step, make, mjcf};
 use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 
 const MAZES: [&str; 3] = ["antmaze-umaze", "antmaze-medium", "antmaze-large"];
 const AT_REST: [f64; 14] = [0.0; 14];
 
-fn ant(name: &str) -> Box<dyn Environment> {
+fn ant(name: &str) -> Box<dyn Simulation> {
     make(find(name).unwrap(), 0).unwrap()
 }
 

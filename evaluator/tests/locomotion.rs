@@ -2,15 +2,15 @@
 #![allow(clippy::unwrap_used)]
 
 use quad_dataset::environment::find;
-use quad_evaluator::sim::{Environment, Step, make};
+use quad_evaluator::sim::{Simulation, Step, make};
 
 const ROBOTS: [&str; 3] = ["hopper", "halfcheetah", "walker2d"];
 
-fn robot(name: &str) -> Box<dyn Environment> {
+fn robot(name: &str) -> Box<dyn Simulation> {
     make(find(name).unwrap(), 0).unwrap()
 }
 
-fn hopper() -> Box<dyn Environment> {
+fn hopper() -> Box<dyn Simulation> {
     robot("hopper")
 }
 

@@ -2,11 +2,11 @@
 #![allow(clippy::unwrap_used)]
 
 use std::collections::BTreeMap;
-use std::convert::Infallible;
 
 use quad_dataset::environment::{EnvironmentSpec, find};
-use quad_evaluator::sim::{EpisodeOutcome, Rollout};
-use quad_evaluator::sim::{make, simulated};
+use quad_evaluator::sim::{
+    Environment, EnvironmentError, Environments, EpisodeOutcome, Rollout, Simulations, Step, make, simulated,
+};
 use quad_policy::{EpisodeState, Policy, PolicyError, Precision};
 use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
@@ -18,7 +18,7 @@ fn act(observation: &[f32], noise: &mut ChaCha8Rng, action: &mut [f32]) {
     }
 }
 
-fn select(observations: &[f32], noise: &mut [ChaCha8Rng], actions: &mut [f32]) -> Result<(), Infallible> {
+fn select(observations: &[f32], noise: &mut [ChaCha8Rng], actions: &mut [f32]) -> Result<(), EnvironmentError> {
     assert_eq!(observations.len(), 11 * noise.len());
     assert_eq!(actions.len(), 3 * noise.len());
     for ((observation, noise), action) in observations.chunks(11).zip(noise).zip(actions.chunks_mut(3)) {
@@ -27,8 +27,12 @@ fn select(observations: &[f32], noise: &mut [ChaCha8Rng], actions: &mut [f32]) -
     Ok(())
 }
 
+fn hopper<S>(seeds: &[u64], begin: impl FnMut(u64) -> S) -> Rollout<S> {
+    Rollout::new(|| Simulations.make("hopper", 0), (11, 3), seeds, begin).unwrap()
+}
+
 fn run(seeds: &[u64]) -> Vec<EpisodeOutcome> {
-    let mut rollout = Rollout::new(find("hopper").unwrap(), 0, seeds, ChaCha8Rng::seed_from_u64).unwrap();
+    let mut rollout = hopper(seeds, ChaCha8Rng::seed_from_u64);
     let mut steps = 0;
     while !rollout.is_done() {
         rollout.step(select).unwrap();
@@ -82,7 +86,9 @@ fn an_outcome_is_what_stepping_by_hand_gives() {
 /// What the policy saw of each seed's episode in the first steps of a batch.
 fn trajectories(spec: &'static EnvironmentSpec, seeds: &[u64]) -> BTreeMap<u64, Vec<f32>> {
     let mut seen = BTreeMap::<u64, Vec<f32>>::new();
-    let mut rollout = Rollout::new(spec, 0, seeds, |seed| (seed, ChaCha8Rng::seed_from_u64(seed))).unwrap();
+    let make = || Simulations.make(&spec.name, 0);
+    let sizes = (spec.observation_dim, spec.action_dim);
+    let mut rollout = Rollout::new(make, sizes, seeds, |seed| (seed, ChaCha8Rng::seed_from_u64(seed))).unwrap();
     for _ in 0..40 {
         let select = |observations: &[f32], noise: &mut [(u64, ChaCha8Rng)], actions: &mut [f32]| {
             let observations = observations.chunks(spec.observation_dim);
@@ -92,7 +98,7 @@ fn trajectories(spec: &'static EnvironmentSpec, seeds: &[u64]) -> BTreeMap<u64, 
                 seen.entry(*seed).or_default().extend(observation);
                 action.fill_with(|| noise.random_range(-1.0..1.0));
             }
-            Ok::<_, Infallible>(())
+            Ok::<_, EnvironmentError>(())
         };
         rollout.step(select).unwrap();
     }
@@ -151,9 +157,14 @@ impl Policy for Counter {
 #[test]
 fn what_a_policy_remembers_is_its_episode_s_own_and_begins_anew() {
     let run = |seeds: &[u64]| {
-        let mut rollout = Rollout::new(find("hopper").unwrap(), 0, seeds, |seed| Counter.begin(seed)).unwrap();
+        let mut rollout = hopper(seeds, |seed| Counter.begin(seed));
         while !rollout.is_done() {
-            rollout.step(|observations, states, actions| Counter.act(observations, states, actions)).unwrap();
+            rollout
+                .step(|observations, states, actions| {
+                    Counter.act(observations, states, actions).unwrap();
+                    Ok::<_, EnvironmentError>(())
+                })
+                .unwrap();
         }
         rollout.into_outcomes()
     };
@@ -172,10 +183,67 @@ fn no_seeds_are_done_at_once() {
 
 #[test]
 fn a_policy_that_fails_stops_the_batch_where_it_is() {
-    let mut rollout = Rollout::new(find("hopper").unwrap(), 0, &[1, 2], ChaCha8Rng::seed_from_u64).unwrap();
+    let mut rollout = hopper(&[1, 2], ChaCha8Rng::seed_from_u64);
     rollout.step(select).unwrap();
-    assert_eq!(rollout.step(|_, _, _| Err("no action")), Err("no action"));
+    let failed = rollout.step(|_, _, _| Err(anyhow::anyhow!("no action")));
+    assert_eq!(failed.unwrap_err().to_string(), "no action");
     assert_eq!((rollout.environment_steps(), rollout.episodes_done()), (2, 0));
     rollout.step(select).unwrap();
     assert_eq!(rollout.environment_steps(), 4);
+}
+
+/// An environment of another make: it observes and pays how many steps it has taken, and breaks down in the third if it is to.
+struct Made {
+    steps: [f64; 2],
+    breaks: bool,
+}
+
+impl Environment for Made {
+    fn reset(&mut self, seed: u64) -> Result<(), EnvironmentError> {
+        self.steps = [0.0, seed as f64];
+        Ok(())
+    }
+
+    fn step(&mut self, action: &[f32]) -> Result<Step, EnvironmentError> {
+        assert_eq!(action, [0.5]);
+        self.steps[0] += 1.0;
+        if self.breaks && self.steps[0] == 3.0 {
+            return Err(EnvironmentError::Failed { name: "made".to_owned(), reason: "a cable is loose".to_owned() });
+        }
+        Ok(Step { reward: self.steps[0], terminated: self.steps[0] == 4.0, truncated: false })
+    }
+
+    fn observation(&self) -> &[f64] {
+        &self.steps
+    }
+
+    fn score(&mut self, episode_return: f64) -> Result<f64, EnvironmentError> {
+        Ok(episode_return / 10.0)
+    }
+}
+
+fn made(breaks: bool, sizes: (usize, usize)) -> Result<Vec<EpisodeOutcome>, EnvironmentError> {
+    let make = || Ok(Box::new(Made { steps: [0.0; 2], breaks }) as Box<dyn Environment>);
+    let mut rollout = Rollout::new(make, sizes, &[7, 8], |_| ())?;
+    while !rollout.is_done() {
+        rollout.step(|observations, _, actions| {
+            assert_eq!(observations, [observations[0], 7.0, observations[0], 8.0]);
+            actions.fill(0.5);
+            Ok::<_, EnvironmentError>(())
+        })?;
+    }
+    Ok(rollout.into_outcomes())
+}
+
+#[test]
+fn an_environment_of_another_make_has_scores_of_its_own() {
+    let outcome = |index, seed| EpisodeOutcome { index, seed, episode_return: 10.0, length: 4, score: 1.0 };
+    assert_eq!(made(false, (2, 1)).unwrap(), [outcome(0, 7), outcome(1, 8)]);
+}
+
+#[test]
+fn an_environment_that_breaks_down_or_does_not_fit_says_so() {
+    let error = |breaks, sizes| made(breaks, sizes).unwrap_err().to_string();
+    assert_eq!(error(true, (2, 1)), "the environment \"made\" failed: a cable is loose");
+    assert_eq!(error(false, (3, 1)), "an observation has 2 numbers, but the policy takes 3");
 }

@@ -3,7 +3,6 @@
 use std::sync::Arc;
 use std::time::Duration;
 
-use quad_dataset::EnvironmentSpec;
 use quad_policy::{Policy, Precision};
 use quad_protocol::{EpisodeScore, Hash, Job, Name, ScoreReport};
 use quad_service::Beat;
@@ -13,6 +12,7 @@ use super::client::RunClient;
 use super::job::{self, Running};
 use super::policy::load;
 use crate::metrics::Metrics;
+use crate::sim::Environments;
 
 /// Bounds of the time between two reports of progress that a learner may ask for.
 const HEARTBEAT: [Duration; 2] = [Duration::from_millis(50), Duration::from_secs(20)];
@@ -21,28 +21,36 @@ const HEARTBEAT: [Duration; 2] = [Duration::from_millis(50), Duration::from_secs
 pub struct Evaluator {
     /// Its name in every run.
     pub name: Name,
+    /// Where it can act.
+    pub environments: Arc<dyn Environments>,
     precision: Precision,
     metrics: Metrics,
     /// The policy of the last job, by its weights and its environment: the next job is often about the same.
-    policy: Option<(Hash, &'static str, Arc<dyn Policy>)>,
+    policy: Option<(Hash, String, Arc<dyn Policy>)>,
     /// Says that it is not stuck.
     pub beat: Beat,
 }
 
 impl Evaluator {
     /// An evaluator that computes policies in `precision`, as far as they can be.
-    pub fn new(name: Name, precision: Precision, metrics: Metrics, beat: Beat) -> Evaluator {
-        Evaluator { name, precision, metrics, policy: None, beat }
+    pub fn new(
+        name: Name,
+        environments: Arc<dyn Environments>,
+        precision: Precision,
+        metrics: Metrics,
+        beat: Beat,
+    ) -> Evaluator {
+        Evaluator { name, environments, precision, metrics, policy: None, beat }
     }
 
     /// Runs all episodes of `job`, which the learner of `client` has given out, on one snapshot.
     pub async fn evaluate(&mut self, job: &Job, client: &RunClient) -> anyhow::Result<ScoreReport> {
         let metrics = self.metrics.clone();
-        let spec = job::check(job).inspect_err(|error| metrics.rejected(error.label()))?;
+        job::check(job, self.environments.as_ref()).inspect_err(|error| metrics.rejected(error.label()))?;
         let policy = {
             // The learner grants some time for this, as long as it hears that the evaluator is at it.
             client.tell(job, 0, 0);
-            let mut loading = std::pin::pin!(self.policy(job, spec, client));
+            let mut loading = std::pin::pin!(self.policy(job, client));
             loop {
                 tokio::select! {
                     policy = &mut loading => break policy?,
@@ -53,27 +61,23 @@ impl Evaluator {
         job::check_memory(job, policy.as_ref()).inspect_err(|error| metrics.rejected(error.label()))?;
         let arithmetic = Name::new(policy.precision().arithmetic())?;
         info!(run = %job.run, step = job.step, episodes = job.seeds.len(), "evaluating");
-        let episodes = self.roll_out(job, spec, policy, |steps, episodes| client.tell(job, steps, episodes)).await?;
+        let episodes = self.roll_out(job, policy, |steps, episodes| client.tell(job, steps, episodes)).await?;
         Ok(ScoreReport::of(job, self.name.clone(), arithmetic, episodes))
     }
 
     /// The policy that `job` names, from the last job or from a snapshot.
-    async fn policy(
-        &mut self,
-        job: &Job,
-        spec: &'static EnvironmentSpec,
-        client: &RunClient,
-    ) -> anyhow::Result<Arc<dyn Policy>> {
-        let name = spec.name.as_str();
-        if let Some((.., policy)) = self.policy.as_ref().filter(|last| (last.0, last.1) == (job.weights, name)) {
+    async fn policy(&mut self, job: &Job, client: &RunClient) -> anyhow::Result<Arc<dyn Policy>> {
+        let name = &job.environment;
+        if let Some((.., policy)) = self.policy.as_ref().filter(|last| (last.0, &last.1) == (job.weights, name)) {
             return Ok(policy.clone());
         }
         // Freed before the next one is built: an evaluator holds one policy.
         self.policy = None;
         let (snapshot, precision) = (client.snapshot(job).await?, self.precision);
-        let loaded = tokio::task::spawn_blocking(move || load(&snapshot, spec, precision)).await?;
+        let (wanted, sizes) = (name.clone(), self.environments.sizes(name));
+        let loaded = tokio::task::spawn_blocking(move || load(&snapshot, (&wanted, sizes), precision)).await?;
         let policy: Arc<dyn Policy> = loaded.inspect_err(|error| self.metrics.rejected(error.label()))?.into();
-        self.policy = Some((job.weights, name, policy.clone()));
+        self.policy = Some((job.weights, name.clone(), policy.clone()));
         Ok(policy)
     }
 
@@ -82,11 +86,10 @@ impl Evaluator {
     async fn roll_out(
         &self,
         job: &Job,
-        spec: &'static EnvironmentSpec,
         policy: Arc<dyn Policy>,
         tell: impl Fn(u64, u32),
     ) -> anyhow::Result<Vec<EpisodeScore>> {
-        let mut running = Running::start(job, spec, policy, self.metrics.clone());
+        let mut running = Running::start(job, self.environments.clone(), policy, self.metrics.clone());
         let mut told = 0;
         loop {
             if let Some(episodes) = running.finished_within(heartbeat(job)).await {
@@ -118,6 +121,7 @@ mod tests {
 
     use super::super::fixtures::job;
     use super::*;
+    use crate::sim::Simulations;
 
     const LIMIT: Duration = Duration::from_secs(1);
 
@@ -158,10 +162,10 @@ mod tests {
         for (stuck_at, expected) in [(u32::MAX, false), (3, true)] {
             let health = Health::default();
             let (name, metrics) = (Name::new("evaluator").unwrap(), Metrics::new().unwrap());
-            let evaluator = Evaluator::new(name, Precision::F32, metrics, health.part("worker", LIMIT));
+            let beat = health.part("worker", LIMIT);
+            let evaluator = Evaluator::new(name, Arc::new(Simulations), Precision::F32, metrics, beat);
             let policy = Arc::new(Sleeper { stuck_at, calls: AtomicU32::new(0) });
-            let spec = super::job::check(&job).unwrap();
-            let mut work = std::pin::pin!(evaluator.roll_out(&job, spec, policy, |_, _| ()));
+            let mut work = std::pin::pin!(evaluator.roll_out(&job, policy, |_, _| ()));
             let (begin, mut was_stuck) = (std::time::Instant::now(), false);
             loop {
                 tokio::select! {

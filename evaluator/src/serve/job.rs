@@ -5,12 +5,11 @@ use std::sync::atomic::{AtomicBool, AtomicU32, AtomicU64, Ordering::Relaxed};
 use std::time::{Duration, Instant};
 
 use anyhow::Context;
-use quad_dataset::environment::{self, EnvironmentSpec, UnknownEnvironment};
 use quad_policy::{EpisodeState, Policy};
 use quad_protocol::{EpisodeScore, Job};
 
 use crate::metrics::{JobOutcome, Metrics};
-use crate::sim::{EnvironmentError, EpisodeOutcome, Rollout};
+use crate::sim::{EnvironmentError, Environments, EpisodeOutcome, Rollout};
 
 /// Most episodes: each is a simulation of its own. A learner gives forty at most.
 const MAX_EPISODES: usize = 256;
@@ -31,8 +30,8 @@ pub enum JobError {
     #[error("its episodes did not end within {} s", Job::LONGEST.as_secs())]
     TooLong,
     /// Its environment is not known.
-    #[error(transparent)]
-    Environment(#[from] UnknownEnvironment),
+    #[error("this evaluator has no environment \"{0}\"")]
+    Environment(String),
 }
 
 impl JobError {
@@ -46,13 +45,16 @@ impl JobError {
     }
 }
 
-/// Checks a job from the wire; gives its environment.
-pub fn check(job: &Job) -> Result<&'static EnvironmentSpec, JobError> {
+/// Checks a job from the wire.
+pub fn check(job: &Job, environments: &dyn Environments) -> Result<(), JobError> {
     let episodes = job.seeds.len();
     if !(1..=MAX_EPISODES).contains(&episodes) {
         return Err(JobError::Size(episodes));
     }
-    Ok(environment::find(&job.environment)?)
+    match environments.names().contains(&job.environment) {
+        true => Ok(()),
+        false => Err(JobError::Environment(job.environment.clone())),
+    }
 }
 
 /// Checks that a job does not take too much memory with its policy.
@@ -79,12 +81,16 @@ pub struct Running {
 
 impl Running {
     /// Starts the episodes of a checked job.
-    pub fn start(job: &Job, spec: &'static EnvironmentSpec, policy: Arc<dyn Policy>, metrics: Metrics) -> Running {
+    pub fn start(job: &Job, environments: Arc<dyn Environments>, policy: Arc<dyn Policy>, metrics: Metrics) -> Running {
         let shared = Arc::new(Shared::default());
         let thread = tokio::task::spawn_blocking({
             let (shared, metrics, job) = (shared.clone(), metrics.clone(), job.clone());
             // On a thread of rayon's pool: otherwise each parallel part of each step would wake one and wait for it.
-            move || rayon::scope(|_| roll_out(spec, &job, policy.as_ref(), &shared, &metrics, Job::LONGEST))
+            move || {
+                let roll_out =
+                    |_: &_| roll_out(environments.as_ref(), &job, policy.as_ref(), &shared, &metrics, Job::LONGEST);
+                rayon::scope(roll_out)
+            }
         });
         Running { shared, metrics, started: Instant::now(), thread: Some(thread) }
     }
@@ -125,10 +131,10 @@ impl Drop for Running {
     }
 }
 
-/// Runs all episodes to their end, or gives `None` when cancelled. Fails if the policy cannot act, or it takes longer than
-/// `longest`.
+/// Runs all episodes to their end, or gives `None` when cancelled. Fails if the policy cannot act, an environment breaks down,
+/// or it takes longer than `longest`.
 fn roll_out(
-    spec: &'static EnvironmentSpec,
+    environments: &dyn Environments,
     job: &Job,
     policy: &dyn Policy,
     shared: &Shared,
@@ -136,7 +142,7 @@ fn roll_out(
     longest: Duration,
 ) -> anyhow::Result<Option<Vec<EpisodeOutcome>>> {
     let started = Instant::now();
-    let mut rollout = episodes(spec, job, policy)?;
+    let mut rollout = episodes(environments, job, policy)?;
     while !rollout.is_done() {
         if shared.cancelled.load(Relaxed) {
             return Ok(None);
@@ -148,9 +154,9 @@ fn roll_out(
         let steps = rollout.environment_steps();
         let times = [rollout.select_time(), rollout.physics_time()];
         let done = rollout.episodes_done();
-        rollout
-            .step(|observations, states, actions| policy.act(observations, states, actions))
-            .context("the policy cannot act")?;
+        rollout.step(|observations, states, actions| {
+            policy.act(observations, states, actions).context("the policy cannot act")
+        })?;
         metrics.environment_steps.inc_by(rollout.environment_steps() - steps);
         metrics.select_seconds.inc_by((rollout.select_time() - times[0]).as_secs_f64());
         metrics.physics_seconds.inc_by((rollout.physics_time() - times[1]).as_secs_f64());
@@ -164,11 +170,12 @@ fn roll_out(
 
 /// The job's episodes, at their beginning.
 fn episodes(
-    spec: &'static EnvironmentSpec,
+    environments: &dyn Environments,
     job: &Job,
     policy: &dyn Policy,
 ) -> Result<Rollout<EpisodeState>, EnvironmentError> {
-    Rollout::new(spec, job.environment_seed, &job.seeds, |seed| policy.begin(seed))
+    let make = || environments.make(&job.environment, job.environment_seed);
+    Rollout::new(make, (policy.observation_dim(), policy.action_dim()), &job.seeds, |seed| policy.begin(seed))
 }
 
 fn episode_score(outcome: &EpisodeOutcome) -> EpisodeScore {
@@ -178,11 +185,13 @@ fn episode_score(outcome: &EpisodeOutcome) -> EpisodeScore {
 
 #[cfg(test)]
 mod tests {
+    use std::sync::Mutex;
+
     use quad_policy::{DiffusionShape, MlpConfig, Precision, load_policy};
 
     use super::super::fixtures::{self, file};
     use super::*;
-    use crate::sim;
+    use crate::sim::{Environment, Simulations};
 
     fn job(episodes: u64) -> Job {
         Job { seeds: (0..episodes).collect(), ..fixtures::job() }
@@ -195,7 +204,7 @@ mod tests {
 
     #[test]
     fn a_job_that_is_empty_or_huge_is_refused() {
-        let label = |episodes| check(&job(episodes)).err().map(|error| error.label());
+        let label = |episodes| check(&job(episodes), &Simulations).err().map(|error| error.label());
         assert_eq!([1, 256].map(label), [None; 2]);
         assert_eq!([0, 257, 65_536].map(label), [Some("job_size"); 3]);
     }
@@ -203,24 +212,40 @@ mod tests {
     #[test]
     fn a_job_has_a_longest_time() {
         let (job, policy, metrics) = (job(2), policy(8, 2, 1), Metrics::new().unwrap());
-        let spec = check(&job).unwrap();
-        let run = |longest| roll_out(spec, &job, policy.as_ref(), &Shared::default(), &metrics, longest);
+        let run = |longest| roll_out(&Simulations, &job, policy.as_ref(), &Shared::default(), &metrics, longest);
         assert_eq!(run(Job::LONGEST).unwrap().unwrap().len(), 2);
         let error = run(Duration::ZERO).unwrap_err();
         assert!(matches!(error.downcast_ref(), Some(JobError::TooLong)), "{error}");
     }
 
+    /// Hopper under another name, which remembers the seeds that environments are made with.
+    #[derive(Default)]
+    struct Renamed(Mutex<Vec<u64>>);
+
+    impl Environments for Renamed {
+        fn names(&self) -> Vec<String> {
+            vec!["my-robot".to_owned()]
+        }
+
+        fn sizes(&self, _: &str) -> Option<(usize, usize)> {
+            None
+        }
+
+        fn make(&self, _: &str, environment_seed: u64) -> Result<Box<dyn Environment>, EnvironmentError> {
+            self.0.lock().unwrap().push(environment_seed);
+            Simulations.make("hopper", environment_seed)
+        }
+    }
+
     #[test]
-    fn episodes_have_the_goal_of_the_environment_s_seed() {
-        let (spec, policy) = (environment::find("antmaze-umaze-v0").unwrap(), policy(1, 1, 1));
-        let goals = |environment_seed| -> Vec<Vec<f64>> {
-            let rollout = episodes(spec, &Job { environment_seed, ..job(2) }, policy.as_ref()).unwrap();
-            rollout.environments().map(|environment| environment.goal().unwrap().to_vec()).collect()
-        };
-        let (one, other) = (goals(5), goals(6));
-        assert!(one[0] == one[1] && other[0] == other[1], "the goal is kept over the episodes");
-        assert_ne!(one, other);
-        assert_eq!(one[0], sim::make(spec, 5).unwrap().goal().unwrap());
+    fn environments_are_made_by_the_job_s_name_and_seed() {
+        let job = Job { environment: "my-robot".to_owned(), environment_seed: 5, ..job(2) };
+        assert!(matches!(check(&job, &Simulations), Err(JobError::Environment(name)) if name == "my-robot"));
+        let renamed = Renamed::default();
+        check(&job, &renamed).unwrap();
+        assert_eq!(check(&fixtures::job(), &renamed).map_err(|error| error.label()), Err("environment"));
+        episodes(&renamed, &job, policy(1, 1, 1).as_ref()).unwrap();
+        assert_eq!(renamed.0.into_inner().unwrap(), [5, 5]);
     }
 
     /// A file of some megabytes asks for 66 GB: a value of each of 65,535 tiny critics for each of 256,000 candidates.

@@ -30,6 +30,7 @@ mod worker;
 
 use std::net::SocketAddr;
 use std::path::{Path, PathBuf};
+use std::sync::Arc;
 use std::time::Duration;
 
 use anyhow::Context;
@@ -43,6 +44,7 @@ use rand::Rng;
 use tracing::{info, warn};
 
 use crate::metrics::Metrics;
+use crate::sim::Environments;
 use discovery::Discovery;
 use evaluate::Evaluator;
 use worker::Worker;
@@ -66,20 +68,20 @@ pub struct ServeArgs {
     /// Zenoh endpoint of a learner or a router; may be given several times
     /// [default: tcp/127.0.0.1:7447, or tls/… with --certificates]
     #[arg(long, value_name = "ENDPOINT", value_parser = parse_endpoint)]
-    connect: Vec<String>,
+    pub connect: Vec<String>,
     /// Folder with ca.pem, cert.pem and key.pem, with which this evaluator proves who it is at endpoints like tls/HOST:PORT
     /// (docs/security.md)
     #[arg(long, value_name = "DIR", env = "QUAD_CERTIFICATES")]
-    certificates: Option<PathBuf>,
+    pub certificates: Option<PathBuf>,
     /// Where to serve /metrics and /healthz; port 0 takes a free one
     #[arg(long, value_name = "ADDR:PORT")]
-    metrics: Option<SocketAddr>,
+    pub metrics: Option<SocketAddr>,
     /// Name in scores and metrics, unique among the evaluators of a run [default: HOST-PID-RANDOM]
     #[arg(long, value_parser = |text: &str| Name::new(text))]
-    name: Option<Name>,
+    pub name: Option<Name>,
     /// Arithmetic of the networks, f32 or bf16, which rounds and is faster on CPUs with AMX or AMD's AVX512-BF16
     #[arg(long, value_name = "NAME", default_value = "f32")]
-    precision: Precision,
+    pub precision: Precision,
 }
 
 /// Where a learner of this machine listens by default.
@@ -90,8 +92,11 @@ const LEAVE: Duration = Duration::from_secs(1);
 /// The evaluator counts as stuck when it has got nowhere for this long. It waits up to half a minute for weights.
 const STUCK: Duration = Duration::from_secs(60);
 
-/// Serves until SIGINT or SIGTERM.
-pub fn serve(args: ServeArgs) -> anyhow::Result<()> {
+/// Serves until SIGINT or SIGTERM, with these environments.
+///
+/// # Errors
+/// An endpoint or a folder of certificates that cannot be used, or a session that closed for good.
+pub fn serve(args: ServeArgs, environments: Arc<dyn Environments>) -> anyhow::Result<()> {
     keep_heap_small();
     // Two threads for the network; episodes run on their own.
     let runtime = tokio::runtime::Builder::new_multi_thread()
@@ -99,12 +104,12 @@ pub fn serve(args: ServeArgs) -> anyhow::Result<()> {
         .enable_all()
         .build()
         .context("cannot start the asynchronous runtime")?;
-    let result = runtime.block_on(serve_until_stopped(args));
+    let result = runtime.block_on(serve_until_stopped(args, environments));
     runtime.shutdown_timeout(LEAVE);
     result
 }
 
-async fn serve_until_stopped(args: ServeArgs) -> anyhow::Result<()> {
+async fn serve_until_stopped(args: ServeArgs, environments: Arc<dyn Environments>) -> anyhow::Result<()> {
     let stop = quad_service::shutdown_signal();
     let metrics = Metrics::new().context("cannot register the metrics")?;
     let name = args.name.map_or_else(unique_name, Ok)?;
@@ -126,7 +131,8 @@ async fn serve_until_stopped(args: ServeArgs) -> anyhow::Result<()> {
         None => None,
     };
     let mut discovery = Discovery::start(endpoints.connect, endpoints.certificates.as_ref(), &metrics);
-    let evaluator = Evaluator::new(name, args.precision, metrics.clone(), health.part("worker", STUCK));
+    let beat = health.part("worker", STUCK);
+    let evaluator = Evaluator::new(name, environments, args.precision, metrics.clone(), beat);
     let worker = Worker::new(evaluator, metrics.clone(), discovery.runs());
     let end = async {
         tokio::select! {

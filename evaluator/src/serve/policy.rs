@@ -1,6 +1,5 @@
 //! Makes of a snapshot the policy that acts in a job's environment.
 
-use quad_dataset::EnvironmentSpec;
 use quad_policy::{Header, Policy, PolicyError, Precision, load_policy};
 use quad_protocol::{Origin, Snapshot};
 
@@ -33,16 +32,20 @@ impl LoadError {
     }
 }
 
-/// Loads the policy of `snapshot`, which is to act in the environment `spec`.
-pub fn load(snapshot: &Snapshot, spec: &EnvironmentSpec, precision: Precision) -> Result<Box<dyn Policy>, LoadError> {
+/// Loads the policy of `snapshot`, which is to act in the environment `wanted`, whose sizes may be known.
+pub fn load(
+    snapshot: &Snapshot,
+    (wanted, wanted_sizes): (&str, Option<(usize, usize)>),
+    precision: Precision,
+) -> Result<Box<dyn Policy>, LoadError> {
     let Header { origin: Origin { environment, .. }, .. } = Header::read(&snapshot.file)?;
     let policy = load_policy(&snapshot.file, precision)?;
     let sizes = (policy.observation_dim(), policy.action_dim());
-    if (&environment, sizes) == (&spec.name, (spec.observation_dim, spec.action_dim)) {
+    let wanted_sizes = wanted_sizes.unwrap_or(sizes);
+    if (environment.as_str(), sizes) == (wanted, wanted_sizes) {
         return Ok(policy);
     }
-    let wanted = described(&spec.name, (spec.observation_dim, spec.action_dim));
-    Err(LoadError::Environment { found: described(&environment, sizes), wanted })
+    Err(LoadError::Environment { found: described(&environment, sizes), wanted: described(wanted, wanted_sizes) })
 }
 
 /// An environment with its sizes.
@@ -53,7 +56,6 @@ fn described(name: &str, (observation_dim, action_dim): (usize, usize)) -> Strin
 
 #[cfg(test)]
 mod tests {
-    use quad_dataset::environment::find;
     use quad_policy::DiffusionShape;
 
     use super::super::fixtures::{file, smallest, snapshot};
@@ -62,7 +64,7 @@ mod tests {
     #[test]
     fn a_snapshot_is_loaded_only_for_its_own_environment() {
         let label =
-            |file| load(&snapshot(file), find("hopper").unwrap(), Precision::F32).err().map(|error| error.label());
+            |file| load(&snapshot(file), ("hopper", Some((11, 3))), Precision::F32).err().map(|error| error.label());
         let (observes_more, acts_more) =
             (DiffusionShape { observation_dim: 17, ..smallest() }, DiffusionShape { action_dim: 6, ..smallest() });
         let hopper = file("hopper", smallest(), 1);

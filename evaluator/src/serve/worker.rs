@@ -14,7 +14,6 @@ use super::evaluate::Evaluator;
 use super::scheduler;
 use super::snapshot::Snapshots;
 use crate::metrics::Metrics;
-use crate::sim;
 
 /// Scores are kept this long for a learner that is gone, which may be disconnected only for a while.
 const KEEP_SCORES: Duration = Duration::from_secs(600);
@@ -128,8 +127,7 @@ impl Worker {
 /// Delivers scores if there are any, else does one job.
 async fn serve(client: &mut RunClient, evaluator: &mut Evaluator) -> anyhow::Result<()> {
     if !client.has_scores() {
-        let environments = sim::simulated().map(|spec| spec.name.clone()).collect();
-        let Some(job) = client.claim(environments).await? else { return Ok(()) };
+        let Some(job) = client.claim(evaluator.environments.names()).await? else { return Ok(()) };
         match evaluator.evaluate(&job, client).await {
             Ok(report) => client.keep(report),
             Err(error) => {
@@ -143,17 +141,21 @@ async fn serve(client: &mut RunClient, evaluator: &mut Evaluator) -> anyhow::Res
 
 #[cfg(test)]
 mod tests {
+    use std::sync::Arc;
+
     use quad_policy::Precision;
     use quad_protocol::Name;
     use quad_service::Health;
 
     use super::*;
+    use crate::sim::Simulations;
 
     #[tokio::test(flavor = "multi_thread")]
     async fn an_evaluator_without_work_is_well() {
         let (health, (_keep, found)) = (Health::default(), watch::channel(Runs::new()));
         let (name, metrics, limit) = (Name::new("idle").unwrap(), Metrics::new().unwrap(), Duration::from_secs(1));
-        let evaluator = Evaluator::new(name, Precision::F32, metrics.clone(), health.part("worker", limit));
+        let (environments, beat) = (Arc::new(Simulations), health.part("worker", limit));
+        let evaluator = Evaluator::new(name, environments, Precision::F32, metrics.clone(), beat);
         let stop = async {
             for _ in 0..60 {
                 tokio::time::sleep(limit / 20).await;

@@ -17,8 +17,9 @@ use quad_dataset::environment::{EnvironmentSpec, Goal};
 use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 
-use super::environment::{Environment, EnvironmentError, GOAL_STREAM, Step};
+use super::environment::{EnvironmentError, Step};
 use super::physics::{self, Noise, Physics};
+use super::simulation::{GOAL_STREAM, Simulation};
 
 /// The ant on its floor; the walls go where it has [`WALLS`].
 const ANT: &str = include_str!("../../assets/ant.xml");
@@ -99,7 +100,7 @@ pub(super) struct AntMaze {
 }
 
 impl AntMaze {
-    /// An ant that waits for its first [`reset`](Environment::reset). `environment_seed` is that of a goal that is kept.
+    /// An ant that waits for its first [`reset`](Simulation::reset). `environment_seed` is that of a goal that is kept.
     pub fn new(maze: &'static Maze, spec: &EnvironmentSpec, environment_seed: u64) -> Result<Self, EnvironmentError> {
         let model = physics::model(maze.name, || maze.mjcf())?;
         Ok(Self {
@@ -125,7 +126,7 @@ impl AntMaze {
     }
 }
 
-impl Environment for AntMaze {
+impl Simulation for AntMaze {
     fn reset(&mut self, seed: u64) {
         if self.goal_drawn == Goal::EachEpisode {
             self.goal = self.maze.draw_goal(seed);

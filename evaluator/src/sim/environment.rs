@@ -1,11 +1,9 @@
-//! What an environment is: the seam between a policy and whatever moves the task.
+//! What an environment is: the seam between a policy and whatever moves the task, in this program or in another language.
 
+use quad_dataset::EnvironmentSpec;
 use thiserror::Error;
 
-/// The stream that initial states are drawn from, among those of an episode's seed.
-pub(super) const RESET_STREAM: u64 = 1;
-/// The stream that a goal is drawn from, among those of an episode's or an environment's seed.
-pub(super) const GOAL_STREAM: u64 = 4;
+use super::simulation::Simulation;
 
 /// What one step of an environment gave.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -18,44 +16,93 @@ pub struct Step {
     pub truncated: bool,
 }
 
-/// One simulated task, with the semantics of D4RL's files.
-///
-/// Positions `qpos`, velocities `qvel` and observations are MuJoCo's own `f64`; a rollout rounds them to `f32` for the policy.
+/// A place to act in, as a rollout needs it.
 pub trait Environment: Send {
-    /// Starts an episode. The noise on the initial state is drawn from a stream of `seed`'s own, so an episode is a function of
-    /// its seed and its actions alone.
-    fn reset(&mut self, seed: u64);
+    /// Starts an episode, which is a function of its seed and its actions alone.
+    ///
+    /// # Errors
+    /// The environment broke down. So may each of the next two.
+    fn reset(&mut self, seed: u64) -> Result<(), EnvironmentError>;
 
-    /// Starts an episode in a given state (`nq` positions, `nv` velocities).
-    fn set_state(&mut self, qpos: &[f64], qvel: &[f64]);
+    /// Applies an action for one control period.
+    ///
+    /// # Errors
+    /// As [`Self::reset`].
+    fn step(&mut self, action: &[f32]) -> Result<Step, EnvironmentError>;
 
-    /// Puts the goal somewhere (x and y, metres) until it is drawn again; does nothing in a task without a goal.
-    fn set_goal(&mut self, _goal: &[f64]) {}
-
-    /// Where the goal is (x and y, metres), in a task that has one.
-    fn goal(&self) -> Option<&[f64]> {
-        None
-    }
-
-    /// Applies `action` (`action_dim` values, clipped to [-1, 1]) for one control period.
-    fn step(&mut self, action: &[f32]) -> Step;
-
-    /// The current observation, `observation_dim` values.
+    /// The current observation.
     fn observation(&self) -> &[f64];
 
-    /// The current generalised positions.
-    fn qpos(&self) -> &[f64];
-
-    /// The current generalised velocities.
-    fn qvel(&self) -> &[f64];
+    /// The score of the episode that has ended, given the undiscounted sum of its rewards.
+    ///
+    /// # Errors
+    /// As [`Self::reset`].
+    fn score(&mut self, episode_return: f64) -> Result<f64, EnvironmentError>;
 }
 
-/// Why an environment could not be made.
+/// What an evaluator can make environments of.
+pub trait Environments: Send + Sync {
+    /// The names that learners may ask for.
+    fn names(&self) -> Vec<String>;
+
+    /// Numbers in an observation and in an action, where they are known before there is an environment.
+    fn sizes(&self, name: &str) -> Option<(usize, usize)>;
+
+    /// Makes an environment. `environment_seed` is that of what it draws once and keeps over all episodes, if there is any
+    /// such thing.
+    ///
+    /// # Errors
+    /// The name is none of [`Self::names`], or the environment cannot be made.
+    fn make(&self, name: &str, environment_seed: u64) -> Result<Box<dyn Environment>, EnvironmentError>;
+}
+
+/// A simulation of this program as an environment, with D4RL's normalised score.
+pub(super) struct Simulated {
+    pub simulation: Box<dyn Simulation>,
+    pub spec: &'static EnvironmentSpec,
+}
+
+impl Environment for Simulated {
+    fn reset(&mut self, seed: u64) -> Result<(), EnvironmentError> {
+        self.simulation.reset(seed);
+        Ok(())
+    }
+
+    fn step(&mut self, action: &[f32]) -> Result<Step, EnvironmentError> {
+        Ok(self.simulation.step(action))
+    }
+
+    fn observation(&self) -> &[f64] {
+        self.simulation.observation()
+    }
+
+    fn score(&mut self, episode_return: f64) -> Result<f64, EnvironmentError> {
+        Ok(self.spec.normalised_score(episode_return))
+    }
+}
+
+/// Why there is no environment, or none any more.
 #[derive(Debug, Error)]
 pub enum EnvironmentError {
     /// The name is known to the dataset crate, but this evaluator has no simulation of it.
     #[error("this evaluator cannot simulate the environment \"{0}\"")]
     NotSimulated(String),
+    /// It gave an observation of another size than the policy takes.
+    #[error("an observation has {found} numbers, but the policy takes {wanted}")]
+    Observation {
+        /// Numbers that it gave.
+        found: usize,
+        /// Numbers that the policy takes.
+        wanted: usize,
+    },
+    /// It broke down, in its own words.
+    #[error("the environment \"{name}\" failed: {reason}")]
+    Failed {
+        /// Which.
+        name: String,
+        /// Why.
+        reason: String,
+    },
     /// MuJoCo refused the embedded model: the library is not the version that this program was built for.
     #[error("MuJoCo could not compile the model of \"{simulation}\": {reason}")]
     Model {

@@ -15,8 +15,9 @@
 
 use quad_dataset::environment::EnvironmentSpec;
 
-use super::environment::{Environment, EnvironmentError, Step};
+use super::environment::{EnvironmentError, Step};
 use super::physics::{self, Noise, Physics};
+use super::simulation::Simulation;
 
 /// What tells one robot from another.
 pub(super) struct Robot {
@@ -88,7 +89,7 @@ pub(super) struct Locomotion {
 }
 
 impl Locomotion {
-    /// A robot that waits for its first [`reset`](Environment::reset).
+    /// A robot that waits for its first [`reset`](Simulation::reset).
     pub fn new(robot: &'static Robot, spec: &EnvironmentSpec) -> Result<Self, EnvironmentError> {
         let model = physics::model(robot.name, || robot.mjcf.to_owned())?;
         Ok(Self {
@@ -110,7 +111,7 @@ impl Locomotion {
     }
 }
 
-impl Environment for Locomotion {
+impl Simulation for Locomotion {
     fn reset(&mut self, seed: u64) {
         self.physics.reset(seed, self.robot.noise);
         self.steps = 0;

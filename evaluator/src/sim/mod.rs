@@ -7,7 +7,7 @@
 //!
 //! In reading order:
 //!
-//! - `environment`: what an environment is, whatever moves it.
+//! - `environment`: what an environment is, whatever moves it; `simulation`: one that this program simulates.
 //! - `locomotion` (Hopper, HalfCheetah, Walker2d), `antmaze`: the tasks, with the rules that D4RL's scores are defined by;
 //!   `physics`: drives MuJoCo for them.
 //! - `simulations`: makes an environment by its name in the dataset crate's table.
@@ -18,8 +18,10 @@ mod environment;
 mod locomotion;
 mod physics;
 mod rollout;
+mod simulation;
 mod simulations;
 
-pub use environment::{Environment, EnvironmentError, Step};
+pub use environment::{Environment, EnvironmentError, Environments, Step};
 pub use rollout::{EpisodeOutcome, Rollout};
-pub use simulations::{make, mjcf, simulated};
+pub use simulation::Simulation;
+pub use simulations::{Simulations, make, mjcf, simulated};

@@ -11,7 +11,8 @@ use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 use rand_distr::{Distribution, StandardNormal};
 
-use super::environment::{EnvironmentError, RESET_STREAM};
+use super::environment::EnvironmentError;
+use super::simulation::RESET_STREAM;
 
 /// The model of a simulation, compiled from the text that `mjcf` writes if the process does not have it yet.
 pub(super) fn model(simulation: &'static str, mjcf: impl FnOnce() -> String) -> Result<Arc<MjModel>, EnvironmentError> {

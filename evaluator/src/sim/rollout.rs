@@ -2,11 +2,9 @@
 
 use std::time::{Duration, Instant};
 
-use quad_dataset::environment::EnvironmentSpec;
 use rayon::prelude::*;
 
 use super::environment::{Environment, EnvironmentError};
-use super::simulations::make;
 
 /// A batch of episodes that advance together: one policy call and one control period per [`step`](Rollout::step).
 ///
@@ -14,13 +12,14 @@ use super::simulations::make;
 /// its seed and the policy, whatever else is in the batch, as long as the policy treats its rows independently. For that,
 /// each episode has its own `S`: what the policy carries through it.
 pub struct Rollout<S> {
-    spec: &'static EnvironmentSpec,
+    /// Numbers in an observation and in an action.
+    sizes: (usize, usize),
     live: Vec<Episode>,
     /// Row i belongs to `live[i]`, as in the next two.
     states: Vec<S>,
-    /// live × observation_dim
+    /// live × numbers in an observation
     observations: Vec<f32>,
-    /// live × action_dim
+    /// live × numbers in an action
     actions: Vec<f32>,
     outcomes: Vec<EpisodeOutcome>,
     environment_steps: u64,
@@ -48,35 +47,35 @@ pub struct EpisodeOutcome {
     pub episode_return: f64,
     /// Its number of steps.
     pub length: u32,
-    /// D4RL's normalised score, 100 · (return - min) / (max - min).
+    /// Its score, as the environment says: D4RL's normalised one in the environments of this program.
     pub score: f64,
 }
 
 impl<S> Rollout<S> {
-    /// Makes one environment for each seed and resets it to that seed. `environment_seed` is as in [`make`], the same for all;
-    /// `begin` makes what the policy carries through the episode of a seed.
+    /// Begins an episode for each seed, in an environment of its own that `make` makes. `sizes` are the numbers in an
+    /// observation and in an action of the policy; `begin` makes what the policy carries through the episode of a seed.
     ///
     /// # Errors
     ///
-    /// The environment cannot be made.
+    /// An environment cannot be made, or cannot begin.
     pub fn new(
-        spec: &'static EnvironmentSpec,
-        environment_seed: u64,
+        mut make: impl FnMut() -> Result<Box<dyn Environment>, EnvironmentError>,
+        sizes: (usize, usize),
         seeds: &[u64],
         begin: impl FnMut(u64) -> S,
     ) -> Result<Self, EnvironmentError> {
         let mut live = Vec::with_capacity(seeds.len());
         for (index, &seed) in seeds.iter().enumerate() {
-            let mut environment = make(spec, environment_seed)?;
-            environment.reset(seed);
+            let mut environment = make()?;
+            environment.reset(seed)?;
             live.push(Episode { environment, index, seed, episode_return: 0.0, length: 0, ended: false });
         }
         Ok(Self {
-            spec,
+            sizes,
             live,
             states: seeds.iter().copied().map(begin).collect(),
-            observations: Vec::with_capacity(seeds.len() * spec.observation_dim),
-            actions: Vec::with_capacity(seeds.len() * spec.action_dim),
+            observations: Vec::with_capacity(seeds.len() * sizes.0),
+            actions: Vec::with_capacity(seeds.len() * sizes.1),
             outcomes: Vec::with_capacity(seeds.len()),
             environment_steps: 0,
             select_time: Duration::ZERO,
@@ -86,54 +85,62 @@ impl<S> Rollout<S> {
 
     /// Advances every live episode by one control period.
     ///
-    /// `select` is called once, with n × observation_dim observations, the states of the same n episodes, and the
-    /// n × action_dim actions it is to fill in.
+    /// `select` is called once, with the observations of n episodes in a row, the states of the same episodes, and the room for
+    /// their actions, which it is to fill in.
     ///
     /// # Errors
     ///
-    /// That of `select`; no episode has advanced then.
-    pub fn step<E>(&mut self, select: impl FnOnce(&[f32], &mut [S], &mut [f32]) -> Result<(), E>) -> Result<(), E> {
+    /// That of `select`; no episode has advanced then. Or an environment broke down, after which the batch is of no use.
+    pub fn step<E: From<EnvironmentError>>(
+        &mut self,
+        select: impl FnOnce(&[f32], &mut [S], &mut [f32]) -> Result<(), E>,
+    ) -> Result<(), E> {
         if self.live.is_empty() {
             return Ok(());
         }
         let start = Instant::now();
-        self.observations.clear();
-        for episode in &self.live {
-            self.observations.extend(episode.environment.observation().iter().map(|&value| value as f32));
-        }
-        self.actions.resize(self.live.len() * self.spec.action_dim, 0.0);
+        self.observe()?;
+        let (_, action_dim) = self.sizes;
+        self.actions.resize(self.live.len() * action_dim, 0.0);
         select(&self.observations, &mut self.states, &mut self.actions)?;
         let selected = Instant::now();
         self.select_time += selected - start;
 
-        let actions = self.actions.chunks_exact(self.spec.action_dim);
         if rayon::current_num_threads() > 1 && self.live.len() > 1 {
-            let actions = self.actions.par_chunks_exact(self.spec.action_dim);
-            self.live.par_iter_mut().zip(actions).for_each(|(episode, action)| episode.step(action));
+            let actions = self.actions.par_chunks_exact(action_dim);
+            self.live.par_iter_mut().zip(actions).try_for_each(|(episode, action)| episode.step(action))?;
         } else {
-            self.live.iter_mut().zip(actions).for_each(|(episode, action)| episode.step(action));
+            let mut actions = self.actions.chunks_exact(action_dim);
+            self.live.iter_mut().zip(&mut actions).try_for_each(|(episode, action)| episode.step(action))?;
         }
         self.environment_steps += self.live.len() as u64;
-        self.collect_ended();
+        self.collect_ended()?;
         self.physics_time += selected.elapsed();
         Ok(())
     }
 
-    fn collect_ended(&mut self) {
+    fn observe(&mut self) -> Result<(), EnvironmentError> {
+        self.observations.clear();
+        for episode in &self.live {
+            let observation = episode.environment.observation();
+            if observation.len() != self.sizes.0 {
+                return Err(EnvironmentError::Observation { found: observation.len(), wanted: self.sizes.0 });
+            }
+            self.observations.extend(observation.iter().map(|&value| value as f32));
+        }
+        Ok(())
+    }
+
+    fn collect_ended(&mut self) -> Result<(), EnvironmentError> {
         for row in (0..self.live.len()).rev() {
             if self.live[row].ended {
-                let Episode { index, seed, episode_return, length, .. } = self.live.swap_remove(row);
+                let Episode { mut environment, index, seed, episode_return, length, .. } = self.live.swap_remove(row);
                 self.states.swap_remove(row);
-                let score = self.spec.normalised_score(episode_return);
+                let score = environment.score(episode_return)?;
                 self.outcomes.push(EpisodeOutcome { index, seed, episode_return, length, score });
             }
         }
-    }
-
-    /// The environments of the episodes that have not ended.
-    #[cfg(test)]
-    pub(crate) fn environments(&self) -> impl Iterator<Item = &dyn Environment> {
-        self.live.iter().map(|episode| episode.environment.as_ref())
+        Ok(())
     }
 
     /// Whether every episode has ended.
@@ -169,10 +176,11 @@ impl<S> Rollout<S> {
 }
 
 impl Episode {
-    fn step(&mut self, action: &[f32]) {
-        let step = self.environment.step(action);
+    fn step(&mut self, action: &[f32]) -> Result<(), EnvironmentError> {
+        let step = self.environment.step(action)?;
         self.episode_return += step.reward;
         self.length += 1;
         self.ended = step.terminated || step.truncated;
+        Ok(())
     }
 }

@@ -4,16 +4,17 @@
 use quad_dataset::environment::{self, EnvironmentSpec};
 
 use super::antmaze::{AntMaze, MAZES, Maze};
-use super::environment::{Environment, EnvironmentError};
+use super::environment::{Environment, EnvironmentError, Environments, Simulated};
 use super::locomotion::{Locomotion, ROBOTS, Robot};
+use super::simulation::Simulation;
 
 /// How an environment moves.
-enum Simulation {
+enum Kind {
     Locomotion(&'static Robot),
     AntMaze(&'static Maze),
 }
 
-impl Simulation {
+impl Kind {
     fn of(spec: &EnvironmentSpec) -> Result<Self, EnvironmentError> {
         let name = spec.simulation();
         let robot = ROBOTS.iter().find(|robot| robot.name == name).map(Self::Locomotion);
@@ -24,21 +25,39 @@ impl Simulation {
 
 /// The environments of the table that [`make`] makes.
 pub fn simulated() -> impl Iterator<Item = &'static EnvironmentSpec> {
-    environment::all().iter().filter(|spec| Simulation::of(spec).is_ok())
+    environment::all().iter().filter(|spec| Kind::of(spec).is_ok())
 }
 
-/// Makes an environment. Those of one simulation share one compiled model, so the second costs little.
+/// Makes the simulation of an environment. Those of one model share one compiled model, so the second costs little.
 ///
 /// `environment_seed` is that of what the environment draws once and keeps over all episodes, if there is any such thing.
 ///
 /// # Errors
 ///
 /// There is no simulation of the environment, or MuJoCo fails.
-pub fn make(spec: &EnvironmentSpec, environment_seed: u64) -> Result<Box<dyn Environment>, EnvironmentError> {
-    Ok(match Simulation::of(spec)? {
-        Simulation::Locomotion(robot) => Box::new(Locomotion::new(robot, spec)?),
-        Simulation::AntMaze(maze) => Box::new(AntMaze::new(maze, spec, environment_seed)?),
+pub fn make(spec: &EnvironmentSpec, environment_seed: u64) -> Result<Box<dyn Simulation>, EnvironmentError> {
+    Ok(match Kind::of(spec)? {
+        Kind::Locomotion(robot) => Box::new(Locomotion::new(robot, spec)?),
+        Kind::AntMaze(maze) => Box::new(AntMaze::new(maze, spec, environment_seed)?),
     })
+}
+
+/// The environments that this program simulates, for evaluators.
+pub struct Simulations;
+
+impl Environments for Simulations {
+    fn names(&self) -> Vec<String> {
+        simulated().map(|spec| spec.name.clone()).collect()
+    }
+
+    fn sizes(&self, name: &str) -> Option<(usize, usize)> {
+        environment::find(name).ok().map(|spec| (spec.observation_dim, spec.action_dim))
+    }
+
+    fn make(&self, name: &str, environment_seed: u64) -> Result<Box<dyn Environment>, EnvironmentError> {
+        let spec = environment::find(name).map_err(|_| EnvironmentError::NotSimulated(name.to_owned()))?;
+        Ok(Box::new(Simulated { simulation: make(spec, environment_seed)?, spec }))
+    }
 }
 
 /// The MJCF text that an environment's model is compiled from.
@@ -47,9 +66,9 @@ pub fn make(spec: &EnvironmentSpec, environment_seed: u64) -> Result<Box<dyn Env
 ///
 /// There is no simulation of the environment.
 pub fn mjcf(spec: &EnvironmentSpec) -> Result<String, EnvironmentError> {
-    Ok(match Simulation::of(spec)? {
-        Simulation::Locomotion(robot) => robot.mjcf.to_owned(),
-        Simulation::AntMaze(maze) => maze.mjcf(),
+    Ok(match Kind::of(spec)? {
+        Kind::Locomotion(robot) => robot.mjcf.to_owned(),
+        Kind::AntMaze(maze) => maze.mjcf(),
     })
 }
 

@@ -10,7 +10,7 @@ use rayon::prelude::*;
 use serde::Serialize;
 use thiserror::Error;
 
-use crate::sim::{self, Environment, EnvironmentError};
+use crate::sim::{self, EnvironmentError, Simulation};
 
 /// Rewards differ when they are further apart than this, relative to 1 or to the recorded one, whichever is larger, and
 /// further than the next observation.
@@ -143,7 +143,7 @@ struct RowError {
     terminal_differs: bool,
 }
 
-fn replay(environment: &mut dyn Environment, row: &Row<'_>, goal: Option<&[f64]>) -> RowError {
+fn replay(environment: &mut dyn Simulation, row: &Row<'_>, goal: Option<&[f64]>) -> RowError {
     if let Some(goal) = goal {
         environment.set_goal(goal);
     }

@@ -6,8 +6,7 @@ mod learner;
 
 use std::time::Duration;
 
-use quad_dataset::environment::find;
-use quad_evaluator::sim::Rollout;
+use quad_evaluator::sim::{EnvironmentError, Environments, Rollout, Simulations};
 use quad_policy::{Precision, load_policy};
 use quad_protocol::{EpisodeScore, Job, ScoreReport, encode, keys};
 
@@ -16,10 +15,15 @@ use learner::{Answer, Heard, Learner, file, job, name, reports, snapshot};
 /// The scores that `job` must have, to the last bit.
 fn expected(job: &Job, file: &[u8]) -> Vec<EpisodeScore> {
     let policy = load_policy(file, Precision::F32).unwrap();
-    let spec = find(&job.environment).unwrap();
-    let mut rollout = Rollout::new(spec, job.environment_seed, &job.seeds, |seed| policy.begin(seed)).unwrap();
+    let make = || Simulations.make(&job.environment, job.environment_seed);
+    let mut rollout = Rollout::new(make, (11, 3), &job.seeds, |seed| policy.begin(seed)).unwrap();
     while !rollout.is_done() {
-        rollout.step(|observations, states, actions| policy.act(observations, states, actions)).unwrap();
+        rollout
+            .step(|observations, states, actions| {
+                policy.act(observations, states, actions).unwrap();
+                Ok::<_, EnvironmentError>(())
+            })
+            .unwrap();
     }
     let outcomes = rollout.into_outcomes().into_iter();
     outcomes

@@ -10,7 +10,7 @@ use tracing::info;
 use super::error::CollectError;
 use super::linear::LinearPolicy;
 use super::recipe::Recipe;
-use crate::sim::{self, Environment, EnvironmentError, Step};
+use crate::sim::{self, EnvironmentError, Simulation, Step};
 
 /// Each episode adds Gaussian noise to its actions (which span ±1), of a standard deviation drawn uniformly from this
 /// range: enough to show what other actions in a state lead to, up to more than most gaits survive.
@@ -77,7 +77,7 @@ pub fn record(
 /// An environment and the episode last run in it.
 struct Recorder {
     spec: &'static EnvironmentSpec,
-    environment: Box<dyn Environment>,
+    environment: Box<dyn Simulation>,
     /// (steps + 1) × observation_dim, as the next two: from the state before the first step to that after the last.
     observations: Vec<f64>,
     qpos: Vec<f64>,

@@ -14,7 +14,7 @@ use tracing::info;
 
 use super::linear::{LinearPolicy, Moments};
 use super::recipe::Recipe;
-use crate::sim::{self, Environment, EnvironmentError};
+use crate::sim::{self, EnvironmentError, Simulation};
 
 /// N: directions tried in one iteration, each forwards and backwards.
 const DIRECTIONS: usize = 8;
@@ -62,7 +62,7 @@ struct Search {
 
 /// One perturbed policy and the environment it is tried in.
 struct Trial {
-    environment: Box<dyn Environment>,
+    environment: Box<dyn Simulation>,
     policy: LinearPolicy,
     action: Vec<f32>,
     moments: Moments,

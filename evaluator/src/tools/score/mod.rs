@@ -12,7 +12,7 @@ use quad_protocol::episode_seeds;
 use rayon::prelude::*;
 use tracing::{info, warn};
 
-use crate::sim::{EpisodeOutcome, Rollout};
+use crate::sim::{Environments, EpisodeOutcome, Rollout, Simulations};
 pub(crate) use args::ScoreArgs;
 use results::{Episode, Scored, Spread, table};
 use subject::Subject;
@@ -40,11 +40,14 @@ pub(crate) fn score(args: &ScoreArgs) -> anyhow::Result<String> {
 fn measure(subject: &Subject) -> anyhow::Result<Scored> {
     let Subject { path, weights, spec, seed, step, episodes, policy } = subject;
     let batch = |seeds: &[u64]| -> anyhow::Result<Vec<EpisodeOutcome>> {
-        let mut rollout = Rollout::new(spec, *seed, seeds, |seed| policy.begin(seed))?;
+        let sizes = (policy.observation_dim(), policy.action_dim());
+        let make = || Simulations.make(&spec.name, *seed);
+        let mut rollout = Rollout::new(make, sizes, seeds, |seed| policy.begin(seed))?;
         while !rollout.is_done() {
-            rollout
-                .step(|observations, states, actions| policy.act(observations, states, actions))
-                .with_context(|| format!("{}: the policy cannot act", path.display()))?;
+            rollout.step(|observations, states, actions| {
+                let acted = policy.act(observations, states, actions);
+                acted.with_context(|| format!("{}: the policy cannot act", path.display()))
+            })?;
         }
         Ok(rollout.into_outcomes())
     };
