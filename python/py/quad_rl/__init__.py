@@ -1,0 +1,5 @@
+"""QUAD from Python."""
+
+from quad_rl._evaluate import Evaluators, evaluate
+
+__all__ = ["Evaluators", "evaluate"]

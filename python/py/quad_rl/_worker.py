@@ -1,0 +1,174 @@
+"""One process of `quad_rl.evaluate`: it moves environments for a learner, until its standard input ends.
+
+`quad_rl.evaluate` starts it as `python -m quad_rl._worker`, and writes what it is to do to its standard input. The worker
+answers with one line of JSON: the sizes of the environment, or an error.
+"""
+
+import json
+import os
+import signal
+import sys
+import threading
+import traceback
+
+import cloudpickle
+import numpy as np
+
+from quad_rl import _quad_rl
+
+
+class EnvironmentFailed(RuntimeError):
+    """What the user's code raised, in one line, as a learner is told."""
+
+
+def _call(function, *arguments, **keywords):
+    """Calls the user's code. What it raises goes to this process's log as it is, and to the learner in one line."""
+    try:
+        return function(*arguments, **keywords)
+    except Exception as error:
+        traceback.print_exc(file=sys.stderr)
+        frame = traceback.extract_tb(error.__traceback__)[-1]
+        place = f"{os.path.basename(frame.filename)}:{frame.lineno}, in {frame.name}"
+        raise EnvironmentFailed(f"{type(error).__name__}: {error} ({place})") from None
+
+
+class Made:
+    """An environment of the user's, with observations and actions as plain rows of numbers."""
+
+    def __init__(self, environment, score):
+        self.environment = environment
+        self.score_rule = score
+        self.info = {}
+        self.broken = False
+        self.space = getattr(environment, "observation_space", None)
+        action_space = getattr(environment, "action_space", None)
+        self.action_shape = getattr(action_space, "shape", None)
+        if action_space is not None and not self.action_shape:
+            raise EnvironmentFailed(f"actions must be a box of numbers (gymnasium.spaces.Box), not {action_space}")
+        self.bounds = (action_space.low, action_space.high) if hasattr(action_space, "low") else None
+
+    def sizes(self):
+        """Numbers in an observation and in an action, if the environment says them."""
+        if self.action_shape is None or self.space is None:
+            return None
+        shape = getattr(self.space, "shape", None)
+        if shape is None:
+            from gymnasium.spaces import flatdim
+
+            return int(flatdim(self.space)), int(np.prod(self.action_shape))
+        return int(np.prod(shape)), int(np.prod(self.action_shape))
+
+    def _row(self, observation):
+        if self.space is not None and getattr(self.space, "shape", None) is None:
+            from gymnasium.spaces import flatten
+
+            observation = flatten(self.space, observation)
+        return np.ascontiguousarray(observation, dtype=np.float64).ravel()
+
+    def reset(self, seed):
+        # Many simulators take seeds of 32 bits at most.
+        self.broken = True
+        observation, _ = _call(self.environment.reset, seed=seed % 2**31)
+        self.broken = False
+        return self._row(observation)
+
+    def step(self, action):
+        if self.action_shape is not None:
+            action = action.reshape(self.action_shape)
+        if self.bounds is not None:
+            action = np.clip(action, *self.bounds)
+        self.broken = True
+        observation, reward, terminated, truncated, self.info = _call(self.environment.step, action)
+        self.broken = False
+        return self._row(observation), float(reward), bool(terminated), bool(truncated)
+
+    def score(self, episode_return):
+        if self.score_rule == "return":
+            return float(episode_return)
+        if self.score_rule == "success":
+            success = self.info.get("success", self.info.get("is_success"))
+            if success is None:
+                raise EnvironmentFailed('the last info of an episode has neither "success" nor "is_success"')
+            return 100.0 * bool(success)
+        low, high = self.score_rule
+        return 100.0 * (episode_return - low) / (high - low)
+
+
+class Factory:
+    """Makes environments, and keeps those that are free: making one may take seconds."""
+
+    def __init__(self, make, score):
+        self.make_environment = make
+        self.score = score
+        self.seed = None
+        self.free = []
+
+    def make(self, seed):
+        if seed != self.seed:
+            self.close()
+            self.seed = seed
+        return self.free.pop() if self.free else Made(_call(self.make_environment, seed), self.score)
+
+    def release(self, made):
+        if made.broken:
+            _close(made)
+        else:
+            self.free.append(made)
+
+    def close(self):
+        while self.free:
+            _close(self.free.pop())
+
+
+def _close(made):
+    if hasattr(made.environment, "close"):
+        try:
+            _call(made.environment.close)
+        except EnvironmentFailed:
+            pass  # It is in the log, and the environment is not needed any more.
+
+
+def _read(stream):
+    length = int.from_bytes(stream.read(8), "little")
+    return stream.read(length)
+
+
+def _end_with(stream):
+    """Ends this process in order when the process that started it closes the stream, or is gone."""
+    stream.read()
+    os.kill(os.getpid(), signal.SIGTERM)
+
+
+def main():
+    # What the user's code prints must not get into the answer.
+    answer = os.fdopen(os.dup(1), "w")
+    os.dup2(2, 1)
+
+    def tell(**what):
+        print(json.dumps(what), file=answer, flush=True)
+
+    paths, task = _read(sys.stdin.buffer), _read(sys.stdin.buffer)
+    sys.path[:] = json.loads(paths)
+    try:
+        task = cloudpickle.loads(task)
+        factory = Factory(task["make"], task["score"])
+        made = factory.make(task.pop("seed"))
+        sizes = made.sizes()
+        factory.release(made)
+        tell(sizes=sizes)
+        threading.Thread(target=_end_with, args=(sys.stdin.buffer,), daemon=True).start()
+        _quad_rl.serve_environment(task["name"], factory, sizes=sizes, **task["serve"])
+        factory.close()
+    except Exception as error:
+        if not isinstance(error, EnvironmentFailed):
+            traceback.print_exc(file=sys.stderr)
+        tell(error=f"{error}")
+        sys.stderr.flush()
+        os._exit(1)
+    # Threads of the user's or of a simulator's must not hold up the end.
+    sys.stderr.flush()
+    os._exit(0)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,132 @@
+//! Environments that Python moves, and the evaluator that serves them: the one of `evaluator serve`, with another body.
+//!
+//! `quad_rl/_worker.py` is the other side: its objects make, reset and step environments, and say what went wrong.
+
+use std::path::PathBuf;
+use std::sync::Arc;
+
+use numpy::{PyArray1, PyReadonlyArray1};
+use pyo3::exceptions::{PyRuntimeError, PyValueError};
+use pyo3::prelude::*;
+use quad_evaluator::serve::{ServeArgs, serve};
+use quad_evaluator::sim::{Environment, EnvironmentError, Environments, Simulations, Step};
+use quad_service::init_logging;
+
+/// What Python's object can make environments of.
+struct PythonEnvironments {
+    name: String,
+    sizes: Option<(usize, usize)>,
+    factory: Arc<Py<PyAny>>,
+}
+
+/// One that was made. Dropped, it goes back to the factory, which may give it out again.
+struct PythonEnvironment {
+    name: String,
+    environment: Py<PyAny>,
+    factory: Arc<Py<PyAny>>,
+    observation: Vec<f64>,
+}
+
+impl Environments for PythonEnvironments {
+    fn names(&self) -> Vec<String> {
+        vec![self.name.clone()]
+    }
+
+    fn sizes(&self, _: &str) -> Option<(usize, usize)> {
+        self.sizes
+    }
+
+    fn make(&self, name: &str, environment_seed: u64) -> Result<Box<dyn Environment>, EnvironmentError> {
+        let made = Python::attach(|py| self.factory.call_method1(py, "make", (environment_seed,)));
+        Ok(Box::new(PythonEnvironment {
+            name: name.to_owned(),
+            environment: made.map_err(|error| failed(name, &error))?,
+            factory: self.factory.clone(),
+            observation: Vec::new(),
+        }))
+    }
+}
+
+impl PythonEnvironment {
+    /// Calls a method and keeps the observation that comes first in what it gives.
+    fn observe<T>(
+        &mut self,
+        call: impl FnOnce(&Bound<'_, PyAny>) -> PyResult<(Py<PyAny>, T)>,
+    ) -> Result<T, EnvironmentError> {
+        let Self { name, environment, observation, .. } = self;
+        let called = Python::attach(|py| {
+            let (observed, rest) = call(environment.bind(py))?;
+            let observed: PyReadonlyArray1<'_, f64> = observed.bind(py).extract()?;
+            observation.clear();
+            observation.extend(observed.as_array());
+            Ok(rest)
+        });
+        called.map_err(|error| failed(name, &error))
+    }
+}
+
+impl Environment for PythonEnvironment {
+    fn reset(&mut self, seed: u64) -> Result<(), EnvironmentError> {
+        self.observe(|environment| Ok((environment.call_method1("reset", (seed,))?.unbind(), ())))
+    }
+
+    fn step(&mut self, action: &[f32]) -> Result<Step, EnvironmentError> {
+        let stepped = self.observe(|environment| {
+            let action = PyArray1::from_slice(environment.py(), action);
+            let (observed, reward, terminated, truncated) = environment.call_method1("step", (action,))?.extract()?;
+            Ok((observed, (reward, terminated, truncated)))
+        });
+        stepped.map(|(reward, terminated, truncated)| Step { reward, terminated, truncated })
+    }
+
+    fn observation(&self) -> &[f64] {
+        &self.observation
+    }
+
+    fn score(&mut self, episode_return: f64) -> Result<f64, EnvironmentError> {
+        let scored = Python::attach(|py| self.environment.bind(py).call_method1("score", (episode_return,))?.extract());
+        scored.map_err(|error| failed(&self.name, &error))
+    }
+}
+
+impl Drop for PythonEnvironment {
+    fn drop(&mut self) {
+        // What closing it may say is the worker's to log.
+        Python::attach(|py| self.factory.call_method1(py, "release", (&self.environment,)).ok());
+    }
+}
+
+/// What the worker says of an error, in one line.
+fn failed(name: &str, error: &PyErr) -> EnvironmentError {
+    let reason = Python::attach(|py| error.value(py).to_string());
+    EnvironmentError::Failed { name: name.to_owned(), reason }
+}
+
+/// Serves learners with `factory`'s environments until this process gets SIGTERM. `factory` has `make(seed)`, `release(made)`,
+/// and what it makes has `reset(seed)`, `step(action)` and `score(return)`.
+#[pyfunction]
+#[pyo3(signature = (name, factory, *, sizes, connect, certificates, precision))]
+pub fn serve_environment(
+    py: Python<'_>,
+    name: String,
+    factory: Py<PyAny>,
+    sizes: Option<(usize, usize)>,
+    connect: Vec<String>,
+    certificates: Option<PathBuf>,
+    precision: &str,
+) -> PyResult<()> {
+    let precision = precision.parse().map_err(|error| PyValueError::new_err(format!("precision: {error}")))?;
+    let args = ServeArgs { connect, certificates, metrics: None, name: None, precision };
+    let environments = Arc::new(PythonEnvironments { name, sizes, factory: Arc::new(factory) });
+    let served = py.detach(|| {
+        let _logging = init_logging();
+        serve(args, environments)
+    });
+    served.map_err(|error| PyRuntimeError::new_err(format!("{error:#}")))
+}
+
+/// Names of the environments that `evaluator serve` simulates.
+#[pyfunction]
+pub fn simulated() -> Vec<String> {
+    Simulations.names()
+}
