@@ -26,6 +26,9 @@ pub enum PolicyError {
     /// It is to choose among candidates, but draws none.
     #[error("this policy draws no candidates, so there is nothing to choose among")]
     NoCandidates,
+    /// It is to say what actions are worth, but has no critics.
+    #[error("this policy has no critics: its file holds one network, whose output is the action")]
+    NoCritics,
     /// It is to choose by a value function, but has none.
     #[error("the rule `nearest` takes a value function, which this policy does not have")]
     NoValue,
@@ -62,4 +65,9 @@ pub(crate) const MOST: usize = u16::MAX as usize;
 /// That a number of a shape is from 1 to `most`.
 pub(crate) fn check_range(field: &'static str, value: usize, most: usize) -> Result<(), PolicyError> {
     if (1..=most).contains(&value) { Ok(()) } else { Err(PolicyError::Range { field, value }) }
+}
+
+/// That none of these is a NaN.
+pub(crate) fn check_numbers(what: &'static str, numbers: &[f32]) -> Result<(), PolicyError> {
+    if numbers.iter().any(|x| x.is_nan()) { Err(PolicyError::NotANumber(what)) } else { Ok(()) }
 }

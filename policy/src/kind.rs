@@ -201,8 +201,10 @@ mod tests {
 
     #[test]
     fn a_policy_says_the_precision_that_it_has() {
-        let mut policy = load_policy(&gaussian(""), Precision::Bf16).unwrap();
+        let policy = load_policy(&gaussian(""), Precision::Bf16).unwrap();
         assert_eq!((policy.precision(), policy.choice()), (Precision::F32, None));
-        assert!(matches!(policy.choose(Choice::best_of(1)), Err(PolicyError::NoCandidates)));
+        assert!(matches!(policy.with_choice(Choice::best_of(1)), Err(PolicyError::NoCandidates)));
+        assert!(matches!(policy.sample(&[0.0; 3], &mut [policy.begin(0)]), Err(PolicyError::NoCritics)));
+        assert!(matches!(policy.value(&[0.0; 3], &[0.0]), Err(PolicyError::NoCritics)));
     }
 }

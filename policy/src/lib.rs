@@ -69,7 +69,7 @@ pub use kind::{Header, PolicyConfig, load_policy, read_header, read_tensors, wri
 pub use mlp_config::{Initial, MlpConfig};
 pub use noise_predictor::NoisePredictor;
 pub use optimiser::{Adam, AdamStep, cosine_decay};
-pub use policy::Policy;
+pub use policy::{Policy, Sampled};
 pub use precision::Precision;
 pub use quad_kernels::activation::Activation;
 pub use schedule::{Reverse, Schedule};
