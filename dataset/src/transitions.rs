@@ -3,11 +3,12 @@
 use std::ops::Range;
 use std::path::Path;
 
+use crate::arrays::Arrays;
 use crate::checks;
 use crate::environment::EnvironmentSpec;
 use crate::error::{DatasetError, Problem};
 use crate::formats::Source;
-use crate::recording::{Recording, RowKind};
+use crate::recording::Recording;
 use crate::reward::{RewardRule, Scaling};
 use crate::statistics::Statistics;
 
@@ -39,27 +40,6 @@ impl Batch {
             array.clear();
         }
     }
-}
-
-/// Transitions in memory, N of them, in the order of their episodes.
-#[derive(Clone, Debug, Default)]
-pub struct Arrays {
-    /// Numbers in an observation, o.
-    pub observation_dim: usize,
-    /// Numbers in an action, a, each within ±1.
-    pub action_dim: usize,
-    /// s, N × o.
-    pub observations: Vec<f32>,
-    /// a, N × a.
-    pub actions: Vec<f32>,
-    /// r, N.
-    pub rewards: Vec<f32>,
-    /// s', N × o.
-    pub next_observations: Vec<f32>,
-    /// Whether the episode ended here for good; N.
-    pub terminals: Vec<bool>,
-    /// Whether it was cut off here; N.
-    pub timeouts: Vec<bool>,
 }
 
 /// How a source is to be read.
@@ -120,22 +100,8 @@ impl Transitions {
     /// # Errors
     /// What would spoil training, as in a file.
     pub fn of(arrays: Arrays) -> Result<Self, DatasetError> {
-        let Arrays { observation_dim, action_dim, terminals, timeouts, .. } = arrays;
-        let ends = terminals.iter().zip(&timeouts).map(|(terminal, timeout)| *terminal || *timeout).collect();
-        let recording = Recording {
-            observation_dim,
-            action_dim,
-            kinds: vec![RowKind::Transition; arrays.rewards.len()],
-            observations: arrays.observations,
-            actions: arrays.actions,
-            rewards: arrays.rewards,
-            next_observations: Some(arrays.next_observations),
-            terminals,
-            timeouts,
-            ends,
-            ..Recording::default()
-        };
         let error = |problem| DatasetError::new("arrays in memory", problem);
+        let recording = arrays.into_recording().map_err(error)?;
         Self::of_recording(recording, None, RewardRule::AsIs).map_err(error)
     }
 
@@ -144,7 +110,8 @@ impl Transitions {
         environment: Option<&'static EnvironmentSpec>,
         reward: RewardRule,
     ) -> Result<Self, Problem> {
-        if let Some(problem) = checks::problems(&recording, environment).into_iter().next() {
+        let problems = checks::problems(&recording, environment);
+        if let Some(problem) = problems.into_iter().chain(checks::actions_outside(&recording)).next() {
             return Err(problem);
         }
         let scaling = reward.scaling(&recording.trajectory_returns()).ok_or(Problem::SameReturns)?;
