@@ -5,7 +5,7 @@
 //! In reading order: [`environment`] is what is known of an environment without simulating it; `task` is one that may
 //! be unknown. `hdf5_file` and `npz_file` read one `array` of a file and check everything about its form; `formats` has a
 //! file for each format, which turns arrays into a `recording`. `transitions` are what is learnt from, unless `checks`
-//! has objections, with `reward` and `statistics` beside it; `sampler` draws mini-batches; `inspect` describes a source to
+//! has objections, with `reward`, `scale` and `statistics` beside it; `sampler` draws mini-batches; `inspect` describes a source to
 //! people, whatever is wrong with it. `recorded` is a D4RL file as it was recorded, row by row; `writer` writes such a file, and `arrays`
 //! one of people's own layout, both by `new_file`;
 //! [`catalogue`] lists the files that can be asked for by name; `error` is what can go wrong with any of them.
@@ -29,6 +29,7 @@ mod recorded;
 mod recording;
 mod reward;
 mod sampler;
+mod scale;
 mod statistics;
 mod task;
 mod transitions;
@@ -44,6 +45,7 @@ pub use inspect::{Inspection, inspect};
 pub use recorded::{RecordedRows, Row, environments_of_its_sizes};
 pub use reward::RewardRule;
 pub use sampler::BatchSampler;
+pub use scale::{Scale, Scaled};
 pub use statistics::Statistics;
 pub use task::Task;
 pub use transitions::{Batch, ReadOptions, Transitions};

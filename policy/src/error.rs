@@ -20,6 +20,14 @@ pub enum PolicyError {
         /// What it says.
         value: usize,
     },
+    /// A map to the user's units that does not fit the policy.
+    #[error("the scaling of {what} in the file is not {columns} finite offsets and as many finite scales above 0")]
+    Scaling {
+        /// Observations or actions.
+        what: &'static str,
+        /// Their numbers.
+        columns: usize,
+    },
     /// A temperature that nothing can be drawn with.
     #[error("the softmax's temperature is {0}, but must be above 0")]
     Temperature(f32),

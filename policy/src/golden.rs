@@ -16,6 +16,7 @@ use crate::precision::Precision;
 use crate::schedule::Reverse;
 use crate::weights::{Layout, Tensors, Weights};
 use candle_core::{Device, Tensor};
+use quad_kernels::scaling::Scaling;
 use reader::{Golden, goldens};
 
 fn layers(golden: &Golden, pointer: &str) -> MlpConfig {
@@ -36,7 +37,8 @@ fn shape(golden: &Golden) -> DiffusionShape {
 }
 
 fn file(shape: DiffusionShape, choice: Choice, tensors: &Tensors) -> Vec<u8> {
-    Header { policy: PolicyConfig::Diffusion { shape, choice }, origin: () }.to_safetensors(tensors).unwrap()
+    let policy = PolicyConfig::Diffusion { shape, choice };
+    Header { policy, scaling: None, origin: () }.to_safetensors(tensors).unwrap()
 }
 
 #[test]
@@ -89,9 +91,13 @@ fn small() -> DiffusionShape {
     DiffusionShape::quad((4, 2), &MlpConfig::mish(&[8; 3]), 2, 2)
 }
 
-/// A policy, read from its file, whose critics' weights are so large, of both signs, and whose value function says `v` in every
-/// state, if it has one.
 fn policy(choice: Choice, critic: f32, v: Option<f32>) -> Result<Box<dyn Policy>, PolicyError> {
+    load_policy(&file_of(choice, critic, v, None), Precision::F32)
+}
+
+/// The file of a policy whose critics' weights are so large, of both signs, and whose value function says `v` in every state, if
+/// it has one.
+pub(crate) fn file_of(choice: Choice, critic: f32, v: Option<f32>, scaling: Option<Scaling>) -> Vec<u8> {
     let shape = DiffusionShape { value: v.map(|_| small().critic), ..small() };
     let weights = |layout: Layout, size: f32, last: f32| {
         let values = (1..=layout.count()).map(|i| match i / 3 % 2 {
@@ -106,7 +112,8 @@ fn policy(choice: Choice, critic: f32, v: Option<f32>) -> Result<Box<dyn Policy>
     let value = shape.value().zip(v);
     let value = value.map(|(of, v)| Ensemble::new(of.clone(), weights(of.layout(), 0.0, v), Precision::F32));
     let tensors = DiffusionPolicy::tensors(&actor, &critics, value.as_ref()).unwrap();
-    load_policy(&file(shape, choice, &tensors), Precision::F32)
+    let policy = PolicyConfig::Diffusion { shape, choice };
+    Header { policy, scaling, origin: () }.to_safetensors(&tensors).unwrap()
 }
 
 /// What it does at the first step of an episode.

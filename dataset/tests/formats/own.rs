@@ -2,7 +2,7 @@
 
 use std::path::Path;
 
-use quad_dataset::{Arrays, DatasetError, ReadOptions, RewardRule, Transitions, inspect, write_own};
+use quad_dataset::{Arrays, DatasetError, ReadOptions, RewardRule, Scale, Transitions, inspect, write_own};
 use tempfile::tempdir;
 
 use crate::{all, peers, peers_in, read};
@@ -41,7 +41,8 @@ fn the_ten_lines_of_the_page_write_what_is_read() {
     assert_eq!(figures, (3, 6.0, 39.0, None));
 }
 
-const OPTIONS: ReadOptions = ReadOptions { environment: None, reward: RewardRule::AsIs };
+const OPTIONS: ReadOptions =
+    ReadOptions { environment: None, reward: RewardRule::AsIs, scale: Scale { actions: false, states: false } };
 
 /// Writes a small file with `peers.py write-own` and reads it; `None` where there is no Python.
 fn read_own(arguments: &[&str]) -> Option<Result<Transitions, DatasetError>> {
