@@ -67,8 +67,8 @@ fn actions_reach_from_least_to_largest() {
     assert_eq!((batch.observations, &scaling.observations), (arrays().observations, &None), "as they are");
     assert_eq!(batch.rewards, arrays().rewards);
     // What follows what is told by the numbers of the file.
-    assert_eq!(transitions.episodes(), [0..4]);
-    assert_eq!(scaled(true, true).episodes(), [0..4]);
+    assert_eq!(transitions.episodes().len(), 1, "as without scaling");
+    assert_eq!(scaled(true, true).episodes(), transitions.episodes());
 }
 
 #[test]
