@@ -33,7 +33,6 @@ pub(crate) fn problems(recording: &Recording, environment: Option<&EnvironmentSp
     problems.extend(not_finite(recording, "next_observations", next_observations, o, |_| true));
     problems.extend(not_finite(recording, "actions", &recording.actions, a, is_step));
     problems.extend(not_finite(recording, "rewards", &recording.rewards, 1, is_step));
-    problems.extend(actions_outside(recording));
     problems.extend(strays(recording).and_then(|(problem, refused)| refused.then_some(problem)));
     let limit = environment.map_or(0, |environment| environment.max_episode_steps);
     if rows > limit && !recording.ends.contains(&true) && !recording.terminals.contains(&true) {
@@ -65,7 +64,8 @@ fn not_finite(
     Some(Problem::NotFinite { array, row, value, rows })
 }
 
-fn actions_outside(recording: &Recording) -> Option<Problem> {
+/// Actions that no policy here can take, unless they are scaled: refused by who trains on them as they are.
+pub(crate) fn actions_outside(recording: &Recording) -> Option<Problem> {
     let is_outside = |row: usize, value: f32| {
         let is_step = recording.kinds[row] != RowKind::LastState;
         is_step && value.is_finite() && value.abs() > 1.0 + ACTION_TOLERANCE

@@ -67,6 +67,9 @@ pub enum Problem {
     /// An array has another shape than the environment and the other arrays ask for.
     #[error("array `{array}` has shape {found:?}, but must have {expected:?}")]
     Shape { array: String, found: Vec<usize>, expected: Vec<usize> },
+    /// An array in memory has another length than the sizes ask for.
+    #[error("array `{array}` has {found} numbers, but {rows} rows of {width} are {}", .rows * .width)]
+    Numbers { array: String, found: usize, rows: usize, width: usize },
     /// An array claims more elements than a file of that size can hold.
     #[error("array `{array}` claims the shape {found:?}, more than a file of {bytes} bytes can hold")]
     Oversized { array: String, found: Vec<usize>, bytes: u64 },
@@ -108,7 +111,7 @@ pub enum Problem {
     /// A flag that is neither 0 nor 1.
     #[error("array `{array}`, row {row}: {value} is neither 0 nor 1")]
     NotBoolean { array: String, row: usize, value: f32 },
-    /// An action that no policy here can take.
+    /// An action that no policy here can take unless it is scaled.
     #[error("array `{array}`, row {row}: the action {value} is outside [-1, 1]{}", such_rows(*.rows))]
     ActionOutside {
         array: String,
@@ -185,20 +188,22 @@ impl Problem {
                  save what its make_env_and_datasets returns with numpy.savez"
             }
             Self::Missing { .. } => "docs/data.md says which arrays each kind of file must have",
+            Self::Numbers { .. } => "all arrays need the same number of rows, which is that of `rewards`",
             Self::Type { .. } | Self::Axes { .. } | Self::Shape { .. } | Self::NotBoolean { .. } => {
                 "docs/data.md says which shape and type each array must have; all arrays need the same number of rows"
             }
             Self::Episodes { .. } => "the dataset is incomplete: fetch it again",
             Self::NotFinite { .. } => "leave out or repair these rows: a single one would spoil every weight",
             Self::ActionOutside { .. } => {
-                "scale the actions so that each number lies within [-1, 1], and scale them back where they are applied"
+                "`learner train --scale actions` trains on them: it maps the least and the largest of each number to ±1, and the \
+                 policy's actions back"
             }
             Self::Group { .. } => {
                 "an observation may be an array or a Dict of arrays, but not a Dict of Dicts: write the numbers that you need \
                  as one array into an HDF5 file of your own, as docs/data.md describes"
             }
             Self::DiscreteActions { .. } => {
-                "store continuous actions as float32, scaled so that each number lies within [-1, 1]"
+                "store continuous actions as float32; where they leave [-1, 1], `learner train --scale actions` scales them"
             }
             Self::Stray { .. } => {
                 "keep the rows in the order of recording and mark where episodes end in `terminals` and `timeouts`; for \

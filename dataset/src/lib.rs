@@ -1,12 +1,13 @@
-//! What the files mean: D4RL, Minari, OGBench and people's own logs in, transitions and mini-batches out; and D4RL HDF5
-//! written.
+//! What the files mean: D4RL, Minari, OGBench and people's own logs in, transitions and mini-batches out; D4RL's
+//! and people's own HDF5 written.
 //!
 //! # Layout
 //! In reading order: [`environment`] is what is known of an environment without simulating it; `task` is one that may
 //! be unknown. `hdf5_file` and `npz_file` read one `array` of a file and check everything about its form; `formats` has a
 //! file for each format, which turns arrays into a `recording`. `transitions` are what is learnt from, unless `checks`
-//! has objections, with `reward` and `statistics` beside it; `sampler` draws mini-batches; `inspect` describes a source to
-//! people, whatever is wrong with it. `recorded` is a D4RL file as it was recorded, row by row; `writer` writes such a file;
+//! has objections, with `reward`, `scale` and `statistics` beside it; `sampler` draws mini-batches; `inspect` describes a source to
+//! people, whatever is wrong with it. `recorded` is a D4RL file as it was recorded, row by row; `writer` writes such a file, and `arrays`
+//! one of people's own layout, both by `new_file`;
 //! [`catalogue`] lists the files that can be asked for by name; `error` is what can go wrong with any of them.
 //!
 //! This crate knows nothing of networks, simulators or the wire.
@@ -14,6 +15,7 @@
 #![deny(unsafe_code)]
 
 mod array;
+mod arrays;
 pub mod catalogue;
 mod checks;
 pub mod environment;
@@ -21,16 +23,19 @@ mod error;
 mod formats;
 mod hdf5_file;
 mod inspect;
+mod new_file;
 mod npz_file;
 mod recorded;
 mod recording;
 mod reward;
 mod sampler;
+mod scale;
 mod statistics;
 mod task;
 mod transitions;
 mod writer;
 
+pub use arrays::{Arrays, write_own};
 pub use catalogue::NamedDataset;
 pub use environment::{EnvironmentSpec, Goal, UnknownEnvironment};
 pub use error::{DatasetError, Problem};
@@ -40,7 +45,8 @@ pub use inspect::{Inspection, inspect};
 pub use recorded::{RecordedRows, Row, environments_of_its_sizes};
 pub use reward::RewardRule;
 pub use sampler::BatchSampler;
+pub use scale::{Scale, Scaled};
 pub use statistics::Statistics;
 pub use task::Task;
-pub use transitions::{Arrays, Batch, ReadOptions, Transitions};
+pub use transitions::{Batch, ReadOptions, Transitions};
 pub use writer::{D4rlWriter, Metadata};

@@ -22,12 +22,12 @@ pub enum RewardRule {
 
 /// Training rewards as a function of recorded ones: `(r - subtract) · times`.
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub(crate) struct Scaling {
+pub(crate) struct RewardScaling {
     subtract: f64,
     times: f64,
 }
 
-impl Scaling {
+impl RewardScaling {
     pub(crate) fn apply(self, reward: f32) -> f32 {
         ((f64::from(reward) - self.subtract) * self.times) as f32
     }
@@ -35,7 +35,7 @@ impl Scaling {
 
 impl RewardRule {
     /// What it does, given the returns of the trajectories; none where their spread is zero but needed.
-    pub(crate) fn scaling(self, returns: &[f64]) -> Option<Scaling> {
+    pub(crate) fn scaling(self, returns: &[f64]) -> Option<RewardScaling> {
         let (subtract, times) = match self {
             Self::Locomotion => {
                 let max = returns.iter().copied().fold(f64::NEG_INFINITY, f64::max);
@@ -49,7 +49,7 @@ impl RewardRule {
             Self::Subtract1 => (1.0, 1.0),
             Self::CentreTimes4 => (0.5, 4.0),
         };
-        Some(Scaling { subtract, times })
+        Some(RewardScaling { subtract, times })
     }
 }
 

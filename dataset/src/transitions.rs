@@ -3,12 +3,16 @@
 use std::ops::Range;
 use std::path::Path;
 
+use quad_kernels::scaling::Scaling;
+
+use crate::arrays::Arrays;
 use crate::checks;
 use crate::environment::EnvironmentSpec;
 use crate::error::{DatasetError, Problem};
 use crate::formats::Source;
-use crate::recording::{Recording, RowKind};
-use crate::reward::{RewardRule, Scaling};
+use crate::recording::Recording;
+use crate::reward::{RewardRule, RewardScaling};
+use crate::scale::{self, Scale};
 use crate::statistics::Statistics;
 
 /// Actions are kept this far within ±1, where policies that squash can still reach them.
@@ -41,27 +45,6 @@ impl Batch {
     }
 }
 
-/// Transitions in memory, N of them, in the order of their episodes.
-#[derive(Clone, Debug, Default)]
-pub struct Arrays {
-    /// Numbers in an observation, o.
-    pub observation_dim: usize,
-    /// Numbers in an action, a, each within ±1.
-    pub action_dim: usize,
-    /// s, N × o.
-    pub observations: Vec<f32>,
-    /// a, N × a.
-    pub actions: Vec<f32>,
-    /// r, N.
-    pub rewards: Vec<f32>,
-    /// s', N × o.
-    pub next_observations: Vec<f32>,
-    /// Whether the episode ended here for good; N.
-    pub terminals: Vec<bool>,
-    /// Whether it was cut off here; N.
-    pub timeouts: Vec<bool>,
-}
-
 /// How a source is to be read.
 #[derive(Clone, Copy, Debug)]
 pub struct ReadOptions {
@@ -70,6 +53,8 @@ pub struct ReadOptions {
     pub environment: Option<&'static EnvironmentSpec>,
     /// What happens to its rewards.
     pub reward: RewardRule,
+    /// What is scaled; actions that are not must lie within [-1, 1].
+    pub scale: Scale,
 }
 
 /// Transitions to learn from, in the order of the recording. They do not change, so threads can share them.
@@ -83,13 +68,13 @@ pub struct ReadOptions {
 pub struct Transitions {
     observation_dim: usize,
     action_dim: usize,
-    /// N × o.
+    /// N × o, scaled.
     observations: Vec<f32>,
-    /// N × a, clipped.
+    /// N × a, scaled and clipped.
     actions: Vec<f32>,
     /// N, scaled.
     rewards: Vec<f32>,
-    /// N × o, if there are any.
+    /// N × o, scaled, if there are any.
     next_observations: Option<Vec<f32>>,
     /// N.
     terminals: Vec<bool>,
@@ -98,21 +83,23 @@ pub struct Transitions {
     /// Whether the next row is the next step of the episode; N.
     goes_on: Vec<bool>,
     statistics: Statistics,
+    scaling: Scaling,
 }
 
 impl Transitions {
     /// Reads a D4RL file, a Minari dataset, an OGBench file or one of people's own layout; docs/data.md has the rules of
-    /// each. Data that would spoil training is refused: numbers that are not finite, actions outside [-1, 1], other sizes
-    /// than the environment's or another environment, a file that is one endless episode or makes no transition.
+    /// each. Data that would spoil training is refused: numbers that are not finite, actions outside [-1, 1] that are not to be
+    /// scaled, other sizes than the environment's or another environment, a file that is one endless episode or makes no
+    /// transition.
     pub fn read(path: impl AsRef<Path>, options: &ReadOptions) -> Result<Self, DatasetError> {
-        let (path, ReadOptions { environment, reward }) = (path.as_ref(), *options);
+        let (path, ReadOptions { environment, .. }) = (path.as_ref(), *options);
         let error = |problem| DatasetError::new(path, problem);
         let mut source = Source::open(path)?;
         if let Some(environment) = environment {
             source.check_environment(environment).map_err(error)?;
         }
         let recording = source.read(environment)?;
-        Self::of_recording(recording, environment, reward).map_err(error)
+        Self::of_recording(recording, options).map_err(error)
     }
 
     /// Transitions of arrays in memory, with their rewards as they are.
@@ -120,44 +107,37 @@ impl Transitions {
     /// # Errors
     /// What would spoil training, as in a file.
     pub fn of(arrays: Arrays) -> Result<Self, DatasetError> {
-        let Arrays { observation_dim, action_dim, terminals, timeouts, .. } = arrays;
-        let ends = terminals.iter().zip(&timeouts).map(|(terminal, timeout)| *terminal || *timeout).collect();
-        let recording = Recording {
-            observation_dim,
-            action_dim,
-            kinds: vec![RowKind::Transition; arrays.rewards.len()],
-            observations: arrays.observations,
-            actions: arrays.actions,
-            rewards: arrays.rewards,
-            next_observations: Some(arrays.next_observations),
-            terminals,
-            timeouts,
-            ends,
-            ..Recording::default()
-        };
         let error = |problem| DatasetError::new("arrays in memory", problem);
-        Self::of_recording(recording, None, RewardRule::AsIs).map_err(error)
+        let recording = arrays.into_recording().map_err(error)?;
+        let options = ReadOptions { environment: None, reward: RewardRule::AsIs, scale: Scale::default() };
+        Self::of_recording(recording, &options).map_err(error)
     }
 
-    fn of_recording(
-        recording: Recording,
-        environment: Option<&'static EnvironmentSpec>,
-        reward: RewardRule,
-    ) -> Result<Self, Problem> {
-        if let Some(problem) = checks::problems(&recording, environment).into_iter().next() {
+    fn of_recording(recording: Recording, options: &ReadOptions) -> Result<Self, Problem> {
+        let ReadOptions { environment, reward, scale } = *options;
+        let problems = checks::problems(&recording, environment);
+        let outside = if scale.actions { None } else { checks::actions_outside(&recording) };
+        if let Some(problem) = problems.into_iter().chain(outside).next() {
             return Err(problem);
         }
-        let scaling = reward.scaling(&recording.trajectory_returns()).ok_or(Problem::SameReturns)?;
-        Ok(Self::new(recording, environment, scaling))
+        let rewards = reward.scaling(&recording.trajectory_returns()).ok_or(Problem::SameReturns)?;
+        let scaling = scale.of(&recording);
+        Ok(Self::new(recording, environment, rewards, scaling))
     }
 
-    fn new(recording: Recording, environment: Option<&EnvironmentSpec>, scaling: Scaling) -> Self {
+    fn new(
+        mut recording: Recording,
+        environment: Option<&EnvironmentSpec>,
+        of_rewards: RewardScaling,
+        scaling: Scaling,
+    ) -> Self {
         let rows: Vec<u32> = recording.transitions().collect();
         let statistics = Statistics::new(environment, rows.len(), &recording.episodes());
         let goes_on = (0..recording.rows()).map(|row| recording.goes_on(row)).collect();
+        scale::apply(&scaling, &mut recording);
         let Recording { observation_dim, action_dim, observations, mut actions, mut rewards, .. } = recording;
         actions.iter_mut().for_each(|action| *action = action.clamp(-ACTION_LIMIT, ACTION_LIMIT));
-        rewards.iter_mut().for_each(|reward| *reward = scaling.apply(*reward));
+        rewards.iter_mut().for_each(|reward| *reward = of_rewards.apply(*reward));
         Self {
             observation_dim,
             action_dim,
@@ -169,6 +149,7 @@ impl Transitions {
             rows,
             goes_on,
             statistics,
+            scaling,
         }
     }
 
@@ -186,6 +167,11 @@ impl Transitions {
     /// Numbers in an action.
     pub fn action_dim(&self) -> usize {
         self.action_dim
+    }
+
+    /// How the observations and actions here, which are the networks', follow from those of the recording.
+    pub fn scaling(&self) -> &Scaling {
+        &self.scaling
     }
 
     /// What the file holds, from the rewards as they were recorded.

@@ -30,7 +30,7 @@ fn policy(precision: Precision) -> Box<dyn Policy> {
     let critics = Ensemble::new(shape.critics(), weights(shape.critics().layout()), Precision::F32);
     let tensors = DiffusionPolicy::tensors(&actor, &critics, None).expect("tensors");
     let policy = PolicyConfig::Diffusion { shape, choice: Choice::best_of(CANDIDATES) };
-    let file = Header { policy, origin: () }.to_safetensors(&tensors).expect("finite weights");
+    let file = Header { policy, scaling: None, origin: () }.to_safetensors(&tensors).expect("finite weights");
     load_policy(&file, precision).expect("what was just written")
 }
 

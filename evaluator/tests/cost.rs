@@ -41,7 +41,7 @@ fn zeros(layout: Layout) -> Weights {
 }
 
 fn loaded(policy: PolicyConfig, tensors: &Tensors) -> Box<dyn Policy> {
-    load_policy(&Header { policy, origin: () }.to_safetensors(tensors).unwrap(), Precision::F32).unwrap()
+    load_policy(&Header { policy, scaling: None, origin: () }.to_safetensors(tensors).unwrap(), Precision::F32).unwrap()
 }
 
 fn diffusion(hidden: usize, critics: usize, diffusion_steps: usize, choice: Choice) -> Box<dyn Policy> {

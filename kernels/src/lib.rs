@@ -6,6 +6,7 @@
 //! - `avx512`: the products that the libraries at hand do more slowly (docs/results.md says by how much).
 //! - [`activation`]: Mish and its derivative; [`narrow`]: the first and last layer of a network, fused with it.
 //! - [`optimiser`]: Adam and EMA over whole parameter vectors.
+//! - [`scaling`]: between a user's units and those of networks.
 //! - [`Buffer`] (`buffer`): memory that is used again and again, aligned to cache lines.
 //! - `vectorised`: the macro that the loops of the two above are written with.
 //!
@@ -19,6 +20,7 @@ mod buffer;
 pub mod narrow;
 pub mod optimiser;
 pub mod product;
+pub mod scaling;
 mod vectorised;
 
 pub use buffer::Buffer;

@@ -20,12 +20,23 @@ pub enum PolicyError {
         /// What it says.
         value: usize,
     },
+    /// A map to the user's units that does not fit the policy.
+    #[error("the scaling of {what} in the file is not {columns} finite offsets and as many finite scales above 0")]
+    Scaling {
+        /// Observations or actions.
+        what: &'static str,
+        /// Their numbers.
+        columns: usize,
+    },
     /// A temperature that nothing can be drawn with.
     #[error("the softmax's temperature is {0}, but must be above 0")]
     Temperature(f32),
     /// It is to choose among candidates, but draws none.
     #[error("this policy draws no candidates, so there is nothing to choose among")]
     NoCandidates,
+    /// It is to say what actions are worth, but has no critics.
+    #[error("this policy has no critics: its file holds one network, whose output is the action")]
+    NoCritics,
     /// It is to choose by a value function, but has none.
     #[error("the rule `nearest` takes a value function, which this policy does not have")]
     NoValue,
@@ -62,4 +73,9 @@ pub(crate) const MOST: usize = u16::MAX as usize;
 /// That a number of a shape is from 1 to `most`.
 pub(crate) fn check_range(field: &'static str, value: usize, most: usize) -> Result<(), PolicyError> {
     if (1..=most).contains(&value) { Ok(()) } else { Err(PolicyError::Range { field, value }) }
+}
+
+/// That none of these is a NaN.
+pub(crate) fn check_numbers(what: &'static str, numbers: &[f32]) -> Result<(), PolicyError> {
+    if numbers.iter().any(|x| x.is_nan()) { Err(PolicyError::NotANumber(what)) } else { Ok(()) }
 }

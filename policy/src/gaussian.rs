@@ -2,7 +2,7 @@
 
 use crate::ensemble::Ensemble;
 use crate::episode::EpisodeState;
-use crate::error::{MOST, PolicyError, check_range};
+use crate::error::{MOST, PolicyError, check_numbers, check_range};
 use crate::mlp_config::MlpConfig;
 use crate::policy::Policy;
 use crate::precision::Precision;
@@ -90,9 +90,6 @@ impl Policy for GaussianPolicy {
         let observations = Tensor::from_slice(observations, (states.len(), self.shape.observation_dim), &Device::Cpu)?;
         let means = gaussian_mean(&self.actor, &observations)?;
         read(&means, |means: &[f32]| actions.copy_from_slice(means))?;
-        if actions.iter().any(|x| x.is_nan()) {
-            return Err(PolicyError::NotANumber("an action"));
-        }
-        Ok(())
+        check_numbers("an action", actions)
     }
 }

@@ -11,11 +11,12 @@ use crate::error::PolicyError;
 use crate::kind::{Header, PolicyConfig, load_policy};
 use crate::mlp_config::MlpConfig;
 use crate::noise_predictor::NoisePredictor;
-use crate::policy::Policy;
+use crate::policy::{Policy, Sampled};
 use crate::precision::Precision;
 use crate::schedule::Reverse;
 use crate::weights::{Layout, Tensors, Weights};
 use candle_core::{Device, Tensor};
+use quad_kernels::scaling::Scaling;
 use reader::{Golden, goldens};
 
 fn layers(golden: &Golden, pointer: &str) -> MlpConfig {
@@ -36,7 +37,8 @@ fn shape(golden: &Golden) -> DiffusionShape {
 }
 
 fn file(shape: DiffusionShape, choice: Choice, tensors: &Tensors) -> Vec<u8> {
-    Header { policy: PolicyConfig::Diffusion { shape, choice }, origin: () }.to_safetensors(tensors).unwrap()
+    let policy = PolicyConfig::Diffusion { shape, choice };
+    Header { policy, scaling: None, origin: () }.to_safetensors(tensors).unwrap()
 }
 
 #[test]
@@ -89,9 +91,13 @@ fn small() -> DiffusionShape {
     DiffusionShape::quad((4, 2), &MlpConfig::mish(&[8; 3]), 2, 2)
 }
 
-/// A policy, read from its file, whose critics' weights are so large, of both signs, and whose value function says `v` in every
-/// state, if it has one.
 fn policy(choice: Choice, critic: f32, v: Option<f32>) -> Result<Box<dyn Policy>, PolicyError> {
+    load_policy(&file_of(choice, critic, v, None), Precision::F32)
+}
+
+/// The file of a policy whose critics' weights are so large, of both signs, and whose value function says `v` in every state, if
+/// it has one.
+pub(crate) fn file_of(choice: Choice, critic: f32, v: Option<f32>, scaling: Option<Scaling>) -> Vec<u8> {
     let shape = DiffusionShape { value: v.map(|_| small().critic), ..small() };
     let weights = |layout: Layout, size: f32, last: f32| {
         let values = (1..=layout.count()).map(|i| match i / 3 % 2 {
@@ -106,7 +112,8 @@ fn policy(choice: Choice, critic: f32, v: Option<f32>) -> Result<Box<dyn Policy>
     let value = shape.value().zip(v);
     let value = value.map(|(of, v)| Ensemble::new(of.clone(), weights(of.layout(), 0.0, v), Precision::F32));
     let tensors = DiffusionPolicy::tensors(&actor, &critics, value.as_ref()).unwrap();
-    load_policy(&file(shape, choice, &tensors), Precision::F32)
+    let policy = PolicyConfig::Diffusion { shape, choice };
+    Header { policy, scaling, origin: () }.to_safetensors(&tensors).unwrap()
 }
 
 /// What it does at the first step of an episode.
@@ -118,14 +125,17 @@ fn first_action(policy: &dyn Policy, observation: [f32; 4]) -> Result<Vec<f32>, 
 /// Finite weights so large that values overflow: the error says what is not a number, and nothing is chosen.
 #[test]
 fn a_candidate_without_a_value_is_an_error() {
-    let [good, mut broken] = [0.1, 1e38].map(|critic| policy(Choice::best_of(5), critic, None).unwrap());
+    let [good, broken] = [0.1, 1e38].map(|critic| policy(Choice::best_of(5), critic, None).unwrap());
     // Of both signs, so that infinities meet.
     let observation = [1.0, -1.0, 1.0, 1.0];
     assert!(first_action(&*good, observation).is_ok());
     let value = first_action(&*broken, observation).unwrap_err().to_string();
     assert!(value.contains("value of a candidate is not a number"), "{value}");
-    broken.choose(Choice::best_of(1)).unwrap();
-    assert!(first_action(&*broken, observation).is_ok(), "of one candidate the critics are not asked");
+    let of_one = broken.with_choice(Choice::best_of(1)).unwrap();
+    assert!(first_action(&*of_one, observation).is_ok(), "of one candidate the critics are not asked");
+    let sampled = of_one.sample(&observation, &mut [of_one.begin(3)]).unwrap_err().to_string();
+    assert!(sampled.contains("value of a candidate is not a number"), "{sampled}");
+    assert!(of_one.value(&observation, &[0.5, -0.5]).is_err());
     let action = first_action(&*good, [f32::NAN, 0.0, 0.0, 0.0]).unwrap_err().to_string();
     assert!(action.contains("not a number"), "{action}");
 }
@@ -152,13 +162,43 @@ fn the_file_s_rule_chooses_unless_another_is_asked_for() {
     let act = |policy: &dyn Policy| first_action(policy, [0.5; 4]).unwrap();
     // A value above that of all actions: the nearest is the best. Below: the worst.
     let [high, low] = [1e3, -1e3].map(|v| act(&*policy(nearest, 1.0, Some(v)).unwrap()));
-    let mut policy_of_best = policy(best, 1.0, None).unwrap();
+    let policy_of_best = policy(best, 1.0, None).unwrap();
     assert_eq!((policy_of_best.choice(), act(&*policy_of_best)), (Some(best), high.clone()));
     assert_ne!(high, low);
     let cold = Choice { rule: Rule::Softmax { temperature: 1e-6 }, ..best };
-    policy_of_best.choose(cold).unwrap();
-    assert_eq!((policy_of_best.choice(), act(&*policy_of_best)), (Some(cold), high));
-    assert!(matches!(policy_of_best.choose(nearest), Err(PolicyError::NoValue)));
+    let other = policy_of_best.with_choice(cold).unwrap();
+    assert_eq!((other.choice(), act(&*other)), (Some(cold), high.clone()));
+    assert!(matches!(policy_of_best.with_choice(nearest), Err(PolicyError::NoValue)));
     assert!(matches!(policy(nearest, 0.1, None), Err(PolicyError::NoValue)));
-    assert!(matches!(policy_of_best.choose(Choice::best_of(1001)), Err(PolicyError::Range { .. })));
+    assert!(matches!(policy_of_best.with_choice(Choice::best_of(1001)), Err(PolicyError::Range { .. })));
+    assert_eq!((policy_of_best.choice(), act(&*policy_of_best)), (Some(best), high), "it stays as it is");
+}
+
+/// What is drawn in some states: `act` takes of each state's candidates the one of the largest value, which `value` gives, too.
+#[test]
+fn what_is_sampled_is_what_is_chosen_among() {
+    for value in [Reduce::Mean, Reduce::Min] {
+        let policy = policy(Choice { value, ..Choice::best_of(6) }, 1.0, None).unwrap();
+        let observations: Vec<f32> = (0..12).map(|i| (i as f32).sin()).collect();
+        let begin = || [7, 8, 9].map(|seed| policy.begin(seed));
+        let Sampled { actions, values } = policy.sample(&observations, &mut begin()).unwrap();
+        assert_eq!((actions.len(), values.len()), (3 * 6 * 2, 3 * 6));
+        let mut taken = vec![0.0; 6];
+        policy.act(&observations, &mut begin(), &mut taken).unwrap();
+        for (i, taken) in taken.chunks_exact(2).enumerate() {
+            let (actions, values) = (&actions[i * 12..][..12], &values[i * 6..][..6]);
+            let largest = (1..6).fold(0, |best, j| if values[j] > values[best] { j } else { best });
+            assert_eq!(taken, &actions[largest * 2..][..2], "state {i}");
+            assert!(values.iter().any(|value| value != &values[0]), "there is something to choose");
+            let observations = observations[i * 4..][..4].repeat(6);
+            assert_eq!(policy.value(&observations, actions).unwrap(), values, "state {i}");
+        }
+        let alone = policy.sample(&observations[4..8], &mut [policy.begin(8)]).unwrap();
+        assert_eq!(
+            (&alone.actions[..], &alone.values[..]),
+            (&actions[12..24], &values[6..12]),
+            "of its own seed alone"
+        );
+        assert!(policy.value(&observations, &actions).is_err(), "3 observations, 18 actions");
+    }
 }

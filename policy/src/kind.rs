@@ -6,9 +6,11 @@ use crate::error::PolicyError;
 use crate::gaussian::{GaussianPolicy, GaussianShape};
 use crate::policy::Policy;
 use crate::precision::Precision;
+use crate::scaled::scaled;
 use crate::weights::{Tensors, check_finite};
 use candle_core::Device;
 use candle_core::safetensors::Load;
+use quad_kernels::scaling::Scaling;
 use safetensors::{SafeTensorError, SafeTensors};
 use serde::de::{DeserializeOwned, IgnoredAny};
 use serde::{Deserialize, Serialize};
@@ -45,6 +47,9 @@ pub enum PolicyConfig {
 pub struct Header<O> {
     /// What it is.
     pub policy: PolicyConfig,
+    /// The maps between the units that its networks have learnt in and those that it is asked in, unless they are the same.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub scaling: Option<Scaling>,
     /// Where it comes from.
     pub origin: O,
 }
@@ -69,12 +74,13 @@ impl<O: DeserializeOwned> Header<O> {
     }
 }
 
-/// Reads a policy from its file: exactly the tensors that its header asks for, all finite.
+/// Reads a policy from its file: exactly the tensors that its header asks for, all finite. Where the file has a scaling, the
+/// policy takes and gives the user's units.
 ///
 /// # Errors
 /// A file that is not what it should be, or a kind of policy that is not known here.
 pub fn load_policy(file: &[u8], precision: Precision) -> Result<Box<dyn Policy>, PolicyError> {
-    let Header { policy, origin: IgnoredAny } = Header::read(file)?;
+    let Header { policy, scaling, origin: IgnoredAny } = Header::read(file)?;
     let mut tensors = read_tensors(file)?;
     let policy: Box<dyn Policy> = match policy {
         PolicyConfig::Diffusion { shape, choice } => {
@@ -84,7 +90,7 @@ pub fn load_policy(file: &[u8], precision: Precision) -> Result<Box<dyn Policy>,
     };
     match tensors.into_keys().next() {
         Some(name) => Err(PolicyError::Unexpected(name)),
-        None => Ok(policy),
+        None => scaled(policy, scaling),
     }
 }
 
@@ -177,7 +183,7 @@ mod tests {
         let layout = shape.actor().layout();
         let values = Tensor::zeros(layout.count(), DType::F32, &Device::Cpu).unwrap();
         let actor = Ensemble::new(shape.actor(), Weights::constant(layout, values), Precision::F32);
-        let header = Header { policy: PolicyConfig::Gaussian { shape }, origin };
+        let header = Header { policy: PolicyConfig::Gaussian { shape }, scaling: None, origin };
         header.to_safetensors(&GaussianPolicy::tensors(&actor).unwrap()).unwrap()
     }
 
@@ -201,8 +207,10 @@ mod tests {
 
     #[test]
     fn a_policy_says_the_precision_that_it_has() {
-        let mut policy = load_policy(&gaussian(""), Precision::Bf16).unwrap();
+        let policy = load_policy(&gaussian(""), Precision::Bf16).unwrap();
         assert_eq!((policy.precision(), policy.choice()), (Precision::F32, None));
-        assert!(matches!(policy.choose(Choice::best_of(1)), Err(PolicyError::NoCandidates)));
+        assert!(matches!(policy.with_choice(Choice::best_of(1)), Err(PolicyError::NoCandidates)));
+        assert!(matches!(policy.sample(&[0.0; 3], &mut [policy.begin(0)]), Err(PolicyError::NoCritics)));
+        assert!(matches!(policy.value(&[0.0; 3], &[0.0]), Err(PolicyError::NoCritics)));
     }
 }

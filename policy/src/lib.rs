@@ -12,7 +12,7 @@
 //!   with respect to them; [`Adam`] (`optimiser`).
 //! - [`Policy`] (`policy`): what any policy can do; [`EpisodeState`] (`episode`): what it carries through an episode. `kind`
 //!   reads one from a file whose [`Header`] says what it is: [`DiffusionPolicy`] (`diffusion`, one of N_a samples by its
-//!   [`Choice`], in `choice`) or [`GaussianPolicy`] (`gaussian`, a mean).
+//!   [`Choice`], in `choice`) or [`GaussianPolicy`] (`gaussian`, a mean); one with a [`Scaling`] is asked in its user's units (`scaled`).
 //! - [`Precision`] (`precision`): how exactly networks are evaluated that no gradient is taken of.
 //! - Below: `layers` (where each layer lies in the vector), `network` (one network on one tile of rows, over the crate
 //!   `kernels`), `saved` and `kept_gradient` (what forward and backward passes leave), `operation` (candle's custom
@@ -52,6 +52,7 @@ mod precision;
 mod rounded;
 mod sampler;
 mod saved;
+mod scaled;
 mod schedule;
 mod shape;
 mod slices;
@@ -69,9 +70,10 @@ pub use kind::{Header, PolicyConfig, load_policy, read_header, read_tensors, wri
 pub use mlp_config::{Initial, MlpConfig};
 pub use noise_predictor::NoisePredictor;
 pub use optimiser::{Adam, AdamStep, cosine_decay};
-pub use policy::Policy;
+pub use policy::{Policy, Sampled};
 pub use precision::Precision;
 pub use quad_kernels::activation::Activation;
+pub use quad_kernels::scaling::{Affine, Scaling};
 pub use schedule::{Reverse, Schedule};
 pub use shape::{EnsembleShape, NoiseShape};
 pub use statistics::mean_and_variance;

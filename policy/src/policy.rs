@@ -21,11 +21,11 @@ pub trait Policy: Send + Sync {
         None
     }
 
-    /// Lets it choose in another way.
+    /// The same networks, which share their memory with these, choosing in another way. This one stays as it is.
     ///
     /// # Errors
     /// It draws no actions, it lacks a network that this takes, or a number is out of range.
-    fn choose(&mut self, _choice: Choice) -> Result<(), PolicyError> {
+    fn with_choice(&self, _choice: Choice) -> Result<Box<dyn Policy>, PolicyError> {
         Err(PolicyError::NoCandidates)
     }
 
@@ -46,4 +46,35 @@ pub trait Policy: Send + Sync {
     /// # Errors
     /// An action or its value is not a number, or candle fails.
     fn act(&self, observations: &[f32], states: &mut [EpisodeState], actions: &mut [f32]) -> Result<(), PolicyError>;
+
+    /// Draws the actions that [`Self::act`] would choose among in each of n states, and says what the critics give each.
+    ///
+    /// `observations` is `n × observation_dim`, n at least 1; `states` has what the policy carries through each state's episode.
+    /// From equal states, [`Self::act`] takes one of these actions.
+    ///
+    /// # Errors
+    /// It has no critics, an action or its value is not a number, or candle fails.
+    fn sample(&self, _observations: &[f32], _states: &mut [EpisodeState]) -> Result<Sampled, PolicyError> {
+        Err(PolicyError::NoCritics)
+    }
+
+    /// What the critics say of n actions, each in a state of its own: n numbers, by the choice's [`Reduce`](crate::Reduce), in
+    /// units of the return that they were trained for.
+    ///
+    /// `observations` is `n × observation_dim`, `actions` `n × action_dim`, n at least 1.
+    ///
+    /// # Errors
+    /// It has no critics, a value is not a number, the lengths do not fit, or candle fails.
+    fn value(&self, _observations: &[f32], _actions: &[f32]) -> Result<Vec<f32>, PolicyError> {
+        Err(PolicyError::NoCritics)
+    }
+}
+
+/// What a policy has drawn in n states.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Sampled {
+    /// The actions, `n × candidates × action_dim`, in the order in which they were drawn.
+    pub actions: Vec<f32>,
+    /// Of each its value, `n × candidates`, by the choice's [`Reduce`](crate::Reduce).
+    pub values: Vec<f32>,
 }

@@ -5,7 +5,7 @@ use crate::hdf5_file::Hdf5File;
 use crate::recording::{Recording, RowKind};
 
 /// The value of the root attribute `layout` that tells this layout from D4RL's.
-pub(super) const LAYOUT: &str = "transitions";
+pub(crate) const LAYOUT: &str = "transitions";
 
 /// Reads `observations`, `actions`, `rewards`, `next_observations`, `terminals` and, if there, `timeouts`. Every row is a
 /// transition, with the next observation that the file stores. Terminals and timeouts end an episode; without timeouts,

@@ -23,6 +23,8 @@ pub(super) fn findings(source: &Source, recording: &Recording, environment: Opti
     }
     let strays = checks::strays(recording).filter(|(_, refused)| !refused);
     findings.extend(strays.map(|(problem, _)| format!("{problem}; is a timeout missing?")));
+    let outside = checks::actions_outside(recording);
+    findings.extend(outside.map(|problem| format!("{problem}; `learner train --scale actions` trains on it")));
     if recording.goal {
         findings.extend(leaps(recording));
     }

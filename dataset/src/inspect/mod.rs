@@ -72,7 +72,7 @@ pub struct Inspection {
     pub lengths: Histogram,
     /// What is wrong, one sentence each: first what training refuses, then what it puts up with.
     pub problems: Vec<String>,
-    /// Whether `learner train` refuses it.
+    /// Whether `learner train` refuses it, also with `--scale actions`.
     pub refused: bool,
 }
 

@@ -23,7 +23,7 @@ fn recording(kinds: &[RowKind]) -> Recording {
 
 fn transitions(recording: Recording) -> Transitions {
     let scaling = RewardRule::AsIs.scaling(&[]).unwrap();
-    Transitions::new(recording, None, scaling)
+    Transitions::new(recording, None, scaling, Scaling::default())
 }
 
 /// D4RL: 0 1 2(timeout) | 3 4(terminal) | 5 6(the last row).

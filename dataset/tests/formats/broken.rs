@@ -5,7 +5,7 @@ use std::path::{Path, PathBuf};
 
 use hdf5::H5Type;
 use ndarray::ArrayViewD;
-use quad_dataset::{DatasetError, Problem, ReadOptions, RecordedRows, RewardRule, Transitions};
+use quad_dataset::{DatasetError, Problem, ReadOptions, RecordedRows, RewardRule, Scale, Transitions};
 use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 use tempfile::{TempDir, tempdir};
@@ -42,7 +42,7 @@ impl Subject {
     }
 
     fn read(&self, reward: RewardRule) -> Result<Transitions, DatasetError> {
-        Transitions::read(self.path(), &ReadOptions { environment: Some(hopper()), reward })
+        Transitions::read(self.path(), &ReadOptions { environment: Some(hopper()), reward, scale: Scale::default() })
     }
 
     /// The error's text after the file's path, which every error starts with.
@@ -66,8 +66,10 @@ fn the_subject_itself_is_whole() {
 
 #[test]
 fn a_missing_file() {
-    let error =
-        Transitions::read("/nowhere/x.hdf5", &ReadOptions { environment: Some(hopper()), reward: RewardRule::AsIs });
+    let error = Transitions::read(
+        "/nowhere/x.hdf5",
+        &ReadOptions { environment: Some(hopper()), reward: RewardRule::AsIs, scale: Scale::default() },
+    );
     let error = error.err().unwrap();
     assert!(matches!(error.problem, Problem::Io(_)) && error.path == Path::new("/nowhere/x.hdf5"));
 }
@@ -218,7 +220,7 @@ fn an_endless_episode() {
     assert!(long(1000).read(RewardRule::AsIs).is_ok(), "a single episode of as many steps as Hopper allows");
     let subject = long(1001);
     assert_eq!(subject.error(), "1001 rows without any terminal or timeout, as if they were one endless episode");
-    let unknown = ReadOptions { environment: None, reward: RewardRule::AsIs };
+    let unknown = ReadOptions { environment: None, reward: RewardRule::AsIs, scale: Scale::default() };
     assert!(Transitions::read(long(50).path(), &unknown).is_err());
     // Without the array, Hopper's time limit cuts it.
     hdf5::File::open_rw(subject.path()).unwrap().unlink("timeouts").unwrap();

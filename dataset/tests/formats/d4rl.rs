@@ -4,7 +4,8 @@ use std::path::Path;
 
 use ndarray::Array2;
 use quad_dataset::{
-    Batch, BatchSampler, EnvironmentSpec, ReadOptions, RewardRule, Transitions, environment, recorded_environment,
+    Batch, BatchSampler, EnvironmentSpec, ReadOptions, RewardRule, Scale, Transitions, environment,
+    recorded_environment,
 };
 use tempfile::tempdir;
 
@@ -65,7 +66,7 @@ fn rows_that_do_not_follow_one_another_are_refused() {
     let folder = tempdir().unwrap();
     let path = folder.path().join("generated.hdf5");
     if peers(&["generate", "shuffled", path.to_str().unwrap()]) {
-        let options = ReadOptions { environment: Some(hopper()), reward: RewardRule::AsIs };
+        let options = ReadOptions { environment: Some(hopper()), reward: RewardRule::AsIs, scale: Scale::default() };
         let error = Transitions::read(&path, &options).err().unwrap();
         // Of 600 rows two end an episode, and after the last one there is nothing to compare it with.
         let expected = "array `next_observations`, row 0: not the observation of the row that follows, though the episode \

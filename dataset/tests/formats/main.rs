@@ -4,7 +4,7 @@
 use std::path::{Path, PathBuf};
 use std::process::Command;
 
-use quad_dataset::{Batch, EnvironmentSpec, ReadOptions, RewardRule, Transitions, environment};
+use quad_dataset::{Batch, EnvironmentSpec, ReadOptions, RewardRule, Scale, Transitions, environment};
 
 mod broken;
 mod d4rl;
@@ -13,6 +13,7 @@ mod minari;
 mod ogbench;
 mod own;
 mod round_trip;
+mod scale;
 mod speed;
 
 fn hopper() -> &'static EnvironmentSpec {
@@ -30,7 +31,7 @@ fn shared(path: &str) -> Option<PathBuf> {
 }
 
 fn read(path: &Path, environment: Option<&'static EnvironmentSpec>, reward: RewardRule) -> Transitions {
-    Transitions::read(path, &ReadOptions { environment, reward }).unwrap()
+    Transitions::read(path, &ReadOptions { environment, reward, scale: Scale::default() }).unwrap()
 }
 
 fn all(transitions: &Transitions) -> Batch {

@@ -3,7 +3,7 @@
 use std::path::{Path, PathBuf};
 
 use quad_dataset::{
-    DatasetError, EnvironmentSpec, ReadOptions, RewardRule, Transitions, environment, recorded_environment,
+    DatasetError, EnvironmentSpec, ReadOptions, RewardRule, Scale, Transitions, environment, recorded_environment,
 };
 use tempfile::{TempDir, tempdir};
 
@@ -27,7 +27,10 @@ impl Root {
     }
 
     fn read(&self, environment: Option<&'static EnvironmentSpec>) -> Result<Transitions, DatasetError> {
-        Transitions::read(self.dataset(), &ReadOptions { environment, reward: RewardRule::AsIs })
+        Transitions::read(
+            self.dataset(),
+            &ReadOptions { environment, reward: RewardRule::AsIs, scale: Scale::default() },
+        )
     }
 
     fn error(&self) -> DatasetError {

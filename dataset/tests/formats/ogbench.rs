@@ -2,7 +2,7 @@
 
 use std::path::{Path, PathBuf};
 
-use quad_dataset::{DatasetError, ReadOptions, RewardRule, Transitions, environment};
+use quad_dataset::{DatasetError, ReadOptions, RewardRule, Scale, Transitions, environment};
 use tempfile::{TempDir, tempdir};
 
 use crate::{compare, hopper, peers};
@@ -14,7 +14,7 @@ fn written(variant: &str) -> Option<(TempDir, PathBuf)> {
 }
 
 fn error(path: &Path) -> DatasetError {
-    let options = ReadOptions { environment: Some(hopper()), reward: RewardRule::AsIs };
+    let options = ReadOptions { environment: Some(hopper()), reward: RewardRule::AsIs, scale: Scale::default() };
     Transitions::read(path, &options).err().unwrap()
 }
 
@@ -41,7 +41,9 @@ fn without_rewards_there_is_nothing_to_learn() {
 #[test]
 fn a_maze_of_ogbench_is_learnt_from_but_not_scored_in_one_of_ours() {
     let Some((_folder, path)) = written("maze") else { return };
-    let read = |environment| Transitions::read(&path, &ReadOptions { environment, reward: RewardRule::AsIs });
+    let read = |environment| {
+        Transitions::read(&path, &ReadOptions { environment, reward: RewardRule::AsIs, scale: Scale::default() })
+    };
     assert!(read(None).is_ok());
     let error = read(environment::find("antmaze-medium").ok()).err().unwrap();
     assert!(error.to_string().ends_with("recorded in `OGBench`, which is not `antmaze-medium`"), "{error}");

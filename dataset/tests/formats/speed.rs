@@ -2,7 +2,7 @@
 
 use std::time::{Duration, Instant};
 
-use quad_dataset::{D4rlWriter, Metadata, ReadOptions, RewardRule, Row, Transitions};
+use quad_dataset::{D4rlWriter, Metadata, ReadOptions, RewardRule, Row, Scale, Transitions};
 use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 use tempfile::tempdir;
@@ -33,7 +33,7 @@ fn a_hundred_thousand_transitions_load_in_half_a_second() {
     }
     writer.finish(&Metadata { algorithm: "noise", iteration: 0, seed: 0 }).unwrap();
 
-    let options = ReadOptions { environment: Some(hopper()), reward: RewardRule::Locomotion };
+    let options = ReadOptions { environment: Some(hopper()), reward: RewardRule::Locomotion, scale: Scale::default() };
     let timed = || {
         let start = Instant::now();
         assert_eq!(Transitions::read(&path, &options).unwrap().len(), 100_000);

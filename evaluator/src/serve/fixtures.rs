@@ -43,5 +43,5 @@ pub fn file(environment: &str, shape: DiffusionShape, candidates: u32) -> Vec<u8
     let tensors = DiffusionPolicy::tensors(&actor, &critics, None).unwrap();
     let policy = PolicyConfig::Diffusion { shape, choice: Choice::best_of(candidates) };
     let origin = Origin { environment: environment.to_owned(), seed: 1, step: 1, episodes: 2 };
-    Header { policy, origin }.to_safetensors(&tensors).unwrap()
+    Header { policy, scaling: None, origin }.to_safetensors(&tensors).unwrap()
 }

@@ -69,7 +69,7 @@ pub fn file(candidates: u32) -> Vec<u8> {
     let tensors = DiffusionPolicy::tensors(&actor, &critics, None).unwrap();
     let policy = PolicyConfig::Diffusion { shape, choice: Choice::best_of(candidates) };
     let origin = Origin { environment: "hopper".to_owned(), seed: 1, step: 10, episodes: 3 };
-    Header { policy, origin }.to_safetensors(&tensors).unwrap()
+    Header { policy, scaling: None, origin }.to_safetensors(&tensors).unwrap()
 }
 
 pub fn name(text: &str) -> Name {

@@ -120,7 +120,7 @@ pub(super) fn check_definition(definition: &Definition, goldens: Vec<Golden>) {
 /// Checks that a policy that draws nothing acts as a golden folder expects.
 pub(super) fn check_actions(golden: &Golden, algorithm: &dyn Algorithm) {
     let (policy, tensors) = algorithm.policy().unwrap();
-    let file = Header { policy, origin: () }.to_safetensors(&tensors).unwrap();
+    let file = Header { policy, scaling: None, origin: () }.to_safetensors(&tensors).unwrap();
     let policy = load_policy(&file, Precision::F32).unwrap();
     let observations = golden.input("select_observations", &Device::Cpu);
     let mut states: Vec<_> = (0..observations.dim(0).unwrap() as u64).map(|seed| policy.begin(seed)).collect();
@@ -144,7 +144,7 @@ pub(super) struct Drawn {
 /// Checks that the networks of a published diffusion policy draw and value candidates as a golden folder expects.
 pub(super) fn check_candidates(golden: &Golden, algorithm: &dyn Algorithm) -> Drawn {
     let (policy, tensors) = algorithm.policy().unwrap();
-    let file = Header { policy: policy.clone(), origin: () }.to_safetensors(&tensors).unwrap();
+    let file = Header { policy: policy.clone(), scaling: None, origin: () }.to_safetensors(&tensors).unwrap();
     load_policy(&file, Precision::F32).unwrap();
     let PolicyConfig::Diffusion { shape, choice } = policy else { panic!("{policy:?}") };
     let mut tensors = read_tensors(&file).unwrap();

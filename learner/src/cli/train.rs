@@ -46,6 +46,10 @@ pub struct TrainArgs {
     /// or minari:ID [default: the task's]
     #[arg(long, value_name = "FILE|NAME")]
     dataset: Option<String>,
+    /// Scale actions from their least and largest value to ±1, states to mean 0 and standard deviation 1, or both; the policy
+    /// takes and gives the data's own units all the same
+    #[arg(long, value_name = "actions,states", value_delimiter = ',', value_parser = ["actions", "states"], hide_possible_values = true)]
+    scale: Vec<String>,
     /// Folder of this run; its last part names the run. A run of the same configuration that is there already goes on
     /// [default: runs/TASK-VARIANT-seedSEED]
     #[arg(long, value_name = "DIR")]
@@ -123,6 +127,7 @@ impl TrainArgs {
         for (key, value) in [
             ("algorithm", self.algorithm.clone().map(Value::from)),
             ("dataset", self.dataset.clone().map(Value::from)),
+            ("scale", Some(&self.scale).filter(|scale| !scale.is_empty()).map(|scale| Value::from(scale.clone()))),
             ("steps", number(flags.steps)),
             ("eval_interval", number(flags.eval_interval)),
             ("episodes", number(flags.episodes)),

@@ -46,8 +46,11 @@ pub fn train(args: &TrainArgs) -> anyhow::Result<()> {
     args.device.check(experiment.precision)?;
     let dataset = source.obtain().hint(record_hint(&experiment))?;
 
-    let options =
-        ReadOptions { environment: environment::find(&experiment.environment).ok(), reward: experiment.reward };
+    let options = ReadOptions {
+        environment: environment::find(&experiment.environment).ok(),
+        reward: experiment.reward,
+        scale: experiment.scale,
+    };
     let transitions = read_dataset(&dataset.path, &options)?;
     check_batch(&transitions, &experiment).hint("record more data, or ask for less with --set batch_size=N")?;
     let config = run_config(args, &name, preset.task_name(), experiment, dataset, &transitions)?;

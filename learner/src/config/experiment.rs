@@ -1,7 +1,7 @@
 //! One experiment, every value of which is checked.
 
 use anyhow::{Context, ensure};
-use quad_dataset::RewardRule;
+use quad_dataset::{RewardRule, Scale};
 use quad_policy::Precision;
 use quad_service::Hint;
 use serde::{Deserialize, Serialize};
@@ -29,6 +29,9 @@ pub struct Experiment {
     pub dataset: Option<String>,
     /// How rewards are scaled before training; a file that does not say takes the environment's rule.
     pub reward: RewardRule,
+    /// What of the data is scaled for the networks; the snapshots have the maps, so that policies take and give the data's units.
+    #[serde(default)]
+    pub scale: Scale,
     /// Gradient steps.
     pub steps: u64,
     /// Gradient steps between two evaluations; 0: none at all.

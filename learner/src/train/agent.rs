@@ -5,7 +5,7 @@ use super::pool::run_awake;
 use crate::algorithms::Parts;
 use crate::algorithms::{Algorithm, AlgorithmError, Context, Definition, Metric};
 use candle_core::Device;
-use quad_policy::{Header, PolicyError, read_header, read_tensors, write_tensors};
+use quad_policy::{Header, PolicyError, Scaling, read_header, read_tensors, write_tensors};
 use quad_protocol::Origin;
 use serde::{Deserialize, Serialize};
 
@@ -17,6 +17,8 @@ pub struct Agent {
     definition: Definition,
     algorithm: Box<dyn Algorithm>,
     device: Device,
+    /// The maps between the data's units and the algorithm's, unless they are the same.
+    scaling: Option<Scaling>,
     /// Updates done.
     step: u64,
 }
@@ -52,7 +54,8 @@ impl Agent {
     /// They cannot be used, or candle fails.
     pub fn new(definition: Definition, table: &toml::Table, context: Context) -> Result<Self, AlgorithmError> {
         let device = context.device.clone();
-        Ok(Self { definition, algorithm: (definition.start)(table, context)?, device, step: 0 })
+        let scaling = Some(context.transitions.scaling().clone()).filter(|scaling| *scaling != Scaling::default());
+        Ok(Self { definition, algorithm: (definition.start)(table, context)?, device, scaling, step: 0 })
     }
 
     /// The algorithm's state.
@@ -97,7 +100,7 @@ impl Agent {
     pub fn policy(&self, origin: &Origin) -> Result<Vec<u8>, AlgorithmError> {
         let (policy, tensors) = self.algorithm.policy()?;
         let origin = Origin { step: self.step, ..origin.clone() };
-        Ok(Header { policy, origin }.to_safetensors(&tensors)?)
+        Ok(Header { policy, scaling: self.scaling.clone(), origin }.to_safetensors(&tensors)?)
     }
 
     /// Everything that decides the future of the run, as one safetensors file: the same bytes for the same state.

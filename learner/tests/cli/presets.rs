@@ -150,6 +150,7 @@ fn data_of_ones_own_is_not_evaluated_and_not_scaled() {
     for algorithm in ["quad", "iql"] {
         let own: Table = printed(&["presets", "own-data", "--algorithm", algorithm]).parse().unwrap();
         assert_eq!((value(&own, "reward"), number(&own, "eval_interval")), (Some("as-is".into()), Some(0.0)));
+        assert_eq!(value(&own, "scale"), Some(Vec::<Value>::new().into()));
     }
 }
 
@@ -174,6 +175,7 @@ fn a_file_changes_its_task_and_takes_its_environments_reward_rule() {
         assert_eq!(value(&preset(path), "reward"), Some(rule.into()));
     }
     for (text, words) in [
+        ("task = \"own-data\"\nscale = [\"reward\"]", "unknown variant `reward`, expected `actions` or `states`"),
         ("steps = 1", "names neither a task nor an environment"),
         ("task = \"hoper-demo\"", "did you mean hopper-demo"),
         ("task = 3", "no task named 3"),

@@ -71,11 +71,16 @@ fn what_is_not_the_papers_protocol_is_called_so() {
         departures
     };
     let stopped = &paper(HOPPER, 400_000, |_| 50.0)[..1];
-    let changes = [("experiment.dataset", "x.hdf5".into()), ("experiment.agent.tau", 1.0.into())];
+    let changes = [
+        ("experiment.dataset", "x.hdf5".into()),
+        ("experiment.agent.tau", 1.0.into()),
+        ("experiment.scale", vec!["states"].into()),
+    ];
     let stopped = stopped[0].clone().set(&changes);
     let expected = [
         "dataset is x.hdf5, not hopper-medium-replay-v2",
         "agent.tau is 1.0, not 0.1",
+        "scale is [\"states\"], not []",
         "20 of 100 evaluations are complete, the last of them after 400000 of 2000000 steps",
         "1 of 4 seeds",
     ];

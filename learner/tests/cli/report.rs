@@ -142,6 +142,7 @@ fn unlike_runs_are_no_seeds_of_each_other_and_the_report_says_what_differs() {
         ("dataset.mean_return", 21.0.into(), &["dataset.mean_return = 20.0", "dataset.mean_return = 21.0"]),
         ("experiment.agent.eta.threshold", 1.0.into(), &["no agent.eta.threshold", "agent.eta.threshold = 1.0"]),
         ("experiment.reward", "as-is".into(), &["reward = \"locomotion\"", "reward = \"as-is\""]),
+        ("experiment.scale", vec!["states"].into(), &["scale = []", "scale = [\"states\"]"]),
         // The same file in another place.
         ("dataset.path", "elsewhere.hdf5".into(), &[]),
         ("experiment.dataset", "elsewhere.hdf5".into(), &[]),

@@ -5,7 +5,7 @@ use std::sync::atomic::AtomicBool;
 use std::time::Duration;
 
 use candle_core::Device;
-use quad_dataset::{BatchSampler, D4rlWriter, Metadata, ReadOptions, RewardRule, Row, Transitions, environment};
+use quad_dataset::{BatchSampler, D4rlWriter, Metadata, ReadOptions, RewardRule, Row, Scale, Transitions, environment};
 use quad_policy::Precision;
 use quad_protocol::Origin;
 use quad_service::{Beat, Health};
@@ -55,7 +55,11 @@ fn transitions() -> Transitions {
         writer.push(&row).unwrap();
     }
     writer.finish(&Metadata { algorithm: "made up", iteration: 0, seed: 0 }).unwrap();
-    Transitions::read(&path, &ReadOptions { environment: Some(hopper), reward: RewardRule::Locomotion }).unwrap()
+    Transitions::read(
+        &path,
+        &ReadOptions { environment: Some(hopper), reward: RewardRule::Locomotion, scale: Scale::default() },
+    )
+    .unwrap()
 }
 
 /// Hyper-parameters of the demonstration with small networks.

@@ -8,8 +8,8 @@ use std::path::Path;
 use candle_core::{DType, Device, Tensor};
 use libfuzzer_sys::fuzz_target;
 use quad_policy::{
-    Choice, DiffusionPolicy, DiffusionShape, Ensemble, EnsembleShape, GaussianPolicy, GaussianShape, Header, Layout, MlpConfig,
-    NoisePredictor, PolicyConfig, Precision, Rule, Weights, load_policy,
+    Affine, Choice, DiffusionPolicy, DiffusionShape, Ensemble, EnsembleShape, GaussianPolicy, GaussianShape, Header,
+    Layout, MlpConfig, NoisePredictor, PolicyConfig, Precision, Rule, Scaling, Weights, load_policy,
 };
 
 const STATES: usize = 2;
@@ -34,14 +34,19 @@ fn write_seeds() {
         let ensemble = |of: EnsembleShape| Ensemble::new(of.clone(), halves(of.layout()), Precision::F32);
         let (critics, value) = (ensemble(shape.critics()), shape.value().map(ensemble));
         let tensors = DiffusionPolicy::tensors(&actor, &critics, value.as_ref()).unwrap();
-        Header { policy: PolicyConfig::Diffusion { shape, choice }, origin: () }.to_safetensors(&tensors).unwrap()
+        Header { policy: PolicyConfig::Diffusion { shape, choice }, scaling: None, origin: () }
+            .to_safetensors(&tensors)
+            .unwrap()
     };
     let (best, nearest) = (diffusion(Rule::Best), diffusion(Rule::Nearest));
     let softmax = diffusion(Rule::Softmax { temperature: 0.5 });
     let shape = GaussianShape { observation_dim: 2, action_dim: 1, actor: layers };
     let actor = Ensemble::new(shape.actor(), halves(shape.actor().layout()), Precision::F32);
     let tensors = GaussianPolicy::tensors(&actor).unwrap();
-    let gaussian = Header { policy: PolicyConfig::Gaussian { shape }, origin: () }.to_safetensors(&tensors).unwrap();
+    let actions = Some(Affine { offset: vec![3.0], scale: vec![2.0] });
+    let scaling = Some(Scaling { observations: None, actions });
+    let gaussian = Header { policy: PolicyConfig::Gaussian { shape }, scaling, origin: () };
+    let gaussian = gaussian.to_safetensors(&tensors).unwrap();
     for (name, file) in [("best", best), ("nearest", nearest), ("softmax", softmax), ("gaussian", gaussian)] {
         fs::write(corpus.join(name), file).unwrap();
     }

@@ -1,9 +1,12 @@
 //! `evaluator score` measures what a run measured, and says clearly what it cannot score.
 
+use std::collections::BTreeMap;
 use std::fs;
 use std::path::Path;
 use std::process::{Command, Output};
 
+use quad_policy::Header;
+use quad_protocol::Origin;
 use quad_tests::PATIENCE;
 use quad_tests::learner::{Learner, Score};
 use quad_tests::process::binary;
@@ -68,6 +71,27 @@ fn a_snapshot_gets_the_scores_that_its_run_has() {
             again.sort_unstable();
             assert_eq!(again, of_run, "step {step} in {precision}");
         }
+    }
+}
+
+/// The simulator's units go in and come out, in a run's evaluations as in `evaluator score`.
+#[test]
+fn a_policy_that_learnt_from_scaled_states_is_scored_like_any_other() {
+    let scratch = Scratch::new();
+    let mut learner =
+        scratch.learner_with("scaled", SETTING, &["--listen", "tcp/127.0.0.1:0", "--scale", "states,actions"]);
+    let _evaluator = scratch.evaluator("evaluator-of-scaled", &learner.endpoint());
+    learner.assert_completes(&SETTING, PATIENCE);
+    let of_run: BTreeMap<_, _> = learner.scores().iter().map(|score| (score.key(), score.number("return"))).collect();
+    let snapshot = learner.snapshot(SETTING.steps);
+    let header = Header::<Origin>::read(&fs::read(&snapshot).unwrap()).unwrap();
+    assert!(header.scaling.is_some_and(|scaling| scaling.observations.is_some() && scaling.actions.is_some()));
+    let scored = read(&score("2", &[&snapshot], &["--json"]));
+    let again = scored[0]["episodes"].as_array().unwrap();
+    assert_eq!(again.len(), SETTING.episodes as usize);
+    for episode in again {
+        let key = (SETTING.steps, episode["seed"].as_u64().unwrap());
+        assert_eq!(of_run[&key], episode["return"].as_f64().unwrap(), "{key:?}");
     }
 }
 

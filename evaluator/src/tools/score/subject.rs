@@ -47,9 +47,8 @@ impl Subject {
     pub fn read(path: &Path, args: &ScoreArgs) -> anyhow::Result<Vec<Self>> {
         let name = path.display();
         let file = fs::read(path).with_context(|| format!("cannot read {name}")).hint(ONE)?;
-        let load =
-            || load_policy(&file, args.precision).with_context(|| format!("{name} is not a saved policy")).hint(ONE);
-        let policy = load()?;
+        let policy = load_policy(&file, args.precision);
+        let policy = policy.with_context(|| format!("{name} is not a saved policy")).hint(ONE)?;
         let header = Header::read(&file).with_context(|| format!("{name} is not a snapshot of a run")).hint(ONE)?;
         let Origin { environment, seed, step, episodes } = header.origin;
         let spec = match args.env {
@@ -67,8 +66,8 @@ impl Subject {
             return Ok(vec![subject]);
         }
         let choosing = |choice| {
-            let mut policy = load()?;
-            policy.choose(choice).with_context(|| format!("{name} cannot be scored so")).hint(OTHER_CHOICE)?;
+            let policy = subject.policy.with_choice(choice);
+            let policy = policy.with_context(|| format!("{name} cannot be scored so")).hint(OTHER_CHOICE)?;
             Ok(Self { path: path.clone(), weights, policy, spec, seed, step, episodes })
         };
         choices.into_iter().map(choosing).collect()

@@ -1,0 +1,107 @@
+//! Transitions that a program has in memory, and the file that it writes of them: the layout for people's own data.
+
+use std::path::Path;
+use std::str::FromStr;
+
+use hdf5::types::VarLenUnicode;
+
+use crate::checks;
+use crate::error::{DatasetError, Problem};
+use crate::formats::OWN_LAYOUT;
+use crate::new_file::{Column, NewFile};
+use crate::recording::{Recording, RowKind};
+
+/// Transitions in memory, N of them, in the order of their episodes.
+#[derive(Clone, Debug, Default)]
+pub struct Arrays {
+    /// Numbers in an observation, o.
+    pub observation_dim: usize,
+    /// Numbers in an action, a.
+    pub action_dim: usize,
+    /// s, N × o.
+    pub observations: Vec<f32>,
+    /// a, N × a, in any unit.
+    pub actions: Vec<f32>,
+    /// r, N.
+    pub rewards: Vec<f32>,
+    /// s', N × o.
+    pub next_observations: Vec<f32>,
+    /// Whether the episode ended here for good; N.
+    pub terminals: Vec<bool>,
+    /// Whether it was cut off here; N.
+    pub timeouts: Vec<bool>,
+}
+
+impl Arrays {
+    /// The same as rows of a recording, not judged yet.
+    pub(crate) fn into_recording(self) -> Result<Recording, Problem> {
+        let (rows, o, a) = (self.rewards.len(), self.observation_dim, self.action_dim);
+        for (array, width, found) in [
+            ("observations", o, self.observations.len()),
+            ("actions", a, self.actions.len()),
+            ("next_observations", o, self.next_observations.len()),
+            ("terminals", 1, self.terminals.len()),
+            ("timeouts", 1, self.timeouts.len()),
+        ] {
+            let array = array.to_owned();
+            if width == 0 {
+                return Err(Problem::Axes { array, found: vec![rows, 0] });
+            }
+            if found != rows * width {
+                return Err(Problem::Numbers { array, found, rows, width });
+            }
+        }
+        let ends = self.terminals.iter().zip(&self.timeouts).map(|(terminal, timeout)| *terminal || *timeout);
+        Ok(Recording {
+            observation_dim: o,
+            action_dim: a,
+            kinds: vec![RowKind::Transition; rows],
+            ends: ends.collect(),
+            observations: self.observations,
+            actions: self.actions,
+            rewards: self.rewards,
+            next_observations: Some(self.next_observations),
+            terminals: self.terminals,
+            timeouts: self.timeouts,
+            ..Recording::default()
+        })
+    }
+}
+
+/// Writes the layout for people's own data (docs/data.md) in float32, compressed. The file appears under its name when it is
+/// whole; one that was there is replaced. The folder is made if need be.
+///
+/// # Errors
+/// The disk, or what would be refused when the file is read: arrays that do not fit one another, numbers that are not finite,
+/// no transition, rows without any end of an episode. Actions may have any range: whether they are to be scaled is decided
+/// by who trains on them.
+pub fn write_own(path: impl AsRef<Path>, arrays: Arrays) -> Result<(), DatasetError> {
+    let path = path.as_ref();
+    let error = |problem| DatasetError::new(path, problem);
+    let recording = arrays.into_recording().map_err(error)?;
+    if let Some(problem) = checks::problems(&recording, None).into_iter().next() {
+        return Err(error(problem));
+    }
+    let file = NewFile::create(path)?;
+    write(&file, &recording).map_err(|source| file.failed(source))?;
+    file.finish()
+}
+
+fn write(file: &NewFile, recording: &Recording) -> hdf5::Result<()> {
+    let layout = VarLenUnicode::from_str(OWN_LAYOUT).map_err(|error| error.to_string())?;
+    file.hdf5.new_attr::<VarLenUnicode>().create("layout")?.write_scalar(&layout)?;
+    let (o, a) = (Some(recording.observation_dim), Some(recording.action_dim));
+    let next_observations = recording.next_observations.as_deref().unwrap_or_default();
+    for (name, width, values) in [
+        ("observations", o, &*recording.observations),
+        ("actions", a, &recording.actions),
+        ("rewards", None, &recording.rewards),
+        ("next_observations", o, next_observations),
+    ] {
+        Column::create::<f32>(file, name, width)?.append(values)?;
+    }
+    for (name, flags) in [("terminals", &recording.terminals), ("timeouts", &recording.timeouts)] {
+        Column::create::<bool>(file, name, None)?.append(flags)?;
+    }
+    Ok(())
+}

@@ -1,0 +1,98 @@
+//! An HDF5 file that is being written, and its arrays, which grow by rows: gzip 4, chunked, booleans as h5py writes them.
+
+use std::fs;
+use std::path::{Path, PathBuf};
+
+use hdf5::{H5Type, Hyperslab, SliceOrIndex};
+use ndarray::ArrayViewD;
+
+use crate::error::{DatasetError, Problem};
+
+/// Rows in a chunk, unless they are wide.
+pub(crate) const CHUNK_ROWS: usize = 4096;
+
+/// Numbers in a chunk at most.
+const CHUNK_NUMBERS: usize = 1 << 20;
+
+/// D4RL's.
+const GZIP_LEVEL: u8 = 4;
+
+/// It appears under its name when [`finish`](Self::finish) says so, and not before: until then it is `<path>.partial`,
+/// which the next one of that path replaces.
+pub(crate) struct NewFile {
+    path: PathBuf,
+    partial: PathBuf,
+    /// Where its arrays and groups are made.
+    pub(crate) hdf5: hdf5::File,
+}
+
+impl NewFile {
+    /// Starts a file, and the folder it lies in.
+    pub(crate) fn create(path: &Path) -> Result<Self, DatasetError> {
+        let mut partial = path.to_owned().into_os_string();
+        partial.push(".partial");
+        let partial = PathBuf::from(partial);
+        if let Some(folder) = path.parent() {
+            fs::create_dir_all(folder).map_err(|source| DatasetError::new(path, Problem::Io(source)))?;
+        }
+        let hdf5 = hdf5::File::create(&partial);
+        let hdf5 = hdf5.map_err(|source| DatasetError::new(path, Problem::Write(source)))?;
+        Ok(Self { path: path.to_owned(), partial, hdf5 })
+    }
+
+    pub(crate) fn path(&self) -> &Path {
+        &self.path
+    }
+
+    /// What is told of a failed write.
+    pub(crate) fn failed(&self, source: hdf5::Error) -> DatasetError {
+        DatasetError::new(&self.partial, Problem::Write(source))
+    }
+
+    /// Closes the file, whose columns must be dropped by then, and gives it its name.
+    pub(crate) fn finish(self) -> Result<(), DatasetError> {
+        let Self { path, partial, hdf5 } = self;
+        drop(hdf5);
+        fs::File::open(&partial)
+            .and_then(|file| file.sync_all())
+            .and_then(|()| fs::rename(&partial, &path))
+            .map_err(|source| DatasetError::new(path, Problem::Io(source)))
+    }
+}
+
+/// An array that grows by rows: N, or N × width.
+pub(crate) struct Column {
+    pub(crate) name: &'static str,
+    width: Option<usize>,
+    dataset: hdf5::Dataset,
+    rows: usize,
+}
+
+impl Column {
+    /// An array without rows, of numbers of type `T`.
+    pub(crate) fn create<T: H5Type>(file: &NewFile, name: &'static str, width: Option<usize>) -> hdf5::Result<Self> {
+        let builder = file.hdf5.new_dataset::<T>().deflate(GZIP_LEVEL);
+        let dataset = match width {
+            None => builder.chunk((CHUNK_ROWS,)).shape((0..,)).create(name)?,
+            Some(width) => {
+                let rows = (CHUNK_NUMBERS / width).clamp(1, CHUNK_ROWS);
+                builder.chunk((rows, width)).shape((0.., width)).create(name)?
+            }
+        };
+        Ok(Self { name, width, dataset, rows: 0 })
+    }
+
+    /// Appends whole rows.
+    pub(crate) fn append<T: H5Type>(&mut self, values: &[T]) -> hdf5::Result<()> {
+        let shape = |rows: usize| -> Vec<usize> { [rows].into_iter().chain(self.width).collect() };
+        let new = values.len() / self.width.unwrap_or(1);
+        let rows = self.rows + new;
+        let view = ArrayViewD::from_shape(shape(new), values)?;
+        self.dataset.resize(shape(rows))?;
+        let mut slab = vec![SliceOrIndex::from(self.rows..rows)];
+        slab.extend(self.width.map(|width| SliceOrIndex::from(0..width)));
+        self.dataset.write_slice(view, Hyperslab::from(slab))?;
+        self.rows = rows;
+        Ok(())
+    }
+}

@@ -1,0 +1,92 @@
+//! Data in units of its owner's, scaled by what it holds.
+
+use std::path::PathBuf;
+
+use quad_dataset::{Arrays, Batch, ReadOptions, RewardRule, Scale, Transitions, write_own};
+use tempfile::{TempDir, tempdir};
+
+use crate::{all, assert_close};
+
+/// Four rows. A large number with a small spread, a small one, and one that is always the same; actions of one number from
+/// -30 to 50, and one that is always the same.
+fn arrays() -> Arrays {
+    let o = |a: f32, b: f32, c: f32| [1e6 + a, b, c];
+    Arrays {
+        observation_dim: 3,
+        action_dim: 2,
+        observations: [o(0.0, 7.0, 0.1), o(2.0, -1.0, 0.1), o(3.0, 4.0, 0.1), o(7.0, 4.0, 0.1)].concat(),
+        actions: vec![-30.0, 0.25, 10.0, 0.25, 0.0, 0.25, 50.0, 0.25],
+        rewards: vec![1.0, 2.0, 3.0, 4.0],
+        next_observations: [o(2.0, -1.0, 0.1), o(3.0, 4.0, 0.1), o(7.0, 4.0, 0.1), o(9.0, 0.0, 0.5)].concat(),
+        terminals: vec![false; 4],
+        timeouts: vec![false, false, false, true],
+    }
+}
+
+fn file() -> (TempDir, PathBuf) {
+    let folder = tempdir().unwrap();
+    let path = folder.path().join("own.hdf5");
+    write_own(&path, arrays()).unwrap();
+    (folder, path)
+}
+
+fn scaled(actions: bool, states: bool) -> Transitions {
+    let options = ReadOptions { environment: None, reward: RewardRule::AsIs, scale: Scale { actions, states } };
+    Transitions::read(file().1, &options).unwrap()
+}
+
+/// The expected numbers are NumPy's: (x - x.mean(0)) / x.std(0), in float64.
+#[test]
+fn states_have_mean_0_and_deviation_1() {
+    let transitions = scaled(true, true);
+    let Batch { observations, next_observations, .. } = all(&transitions);
+    #[rustfmt::skip]
+    let expected = [
+        -1.176_696_8, 1.218_543_6, 0.0,
+        -0.392_232_27, -1.566_698_9, 0.0,
+        0.0, 0.174_077_66, 0.0,
+        1.568_929_1, 0.174_077_66, 0.0,
+        2.353_393_6, -1.218_543_6, 0.4,
+    ];
+    assert_close("observations", &observations, &expected[..12]);
+    assert_close("next observations", &next_observations, &expected[3..]);
+    let affine = transitions.scaling().observations.clone().unwrap();
+    assert_eq!(affine.offset, [1_000_003.0, 3.5, 0.1]);
+    assert_eq!(affine.scale, [2.549_509_8, 2.872_281_3, 1.0], "a constant column keeps its unit");
+}
+
+#[test]
+fn actions_reach_from_least_to_largest() {
+    let transitions = scaled(true, false);
+    let batch = all(&transitions);
+    // As unscaled ones they are kept a little within ±1.
+    assert_close("actions", &batch.actions, &[-0.999_99, 0.0, 0.0, 0.0, -0.25, 0.0, 0.999_99, 0.0]);
+    let scaling = transitions.scaling();
+    let affine = scaling.actions.clone().unwrap();
+    assert_eq!((affine.offset, affine.scale), (vec![10.0, 0.25], vec![40.0, 1.0]));
+    assert_eq!((batch.observations, &scaling.observations), (arrays().observations, &None), "as they are");
+    assert_eq!(batch.rewards, arrays().rewards);
+    // What follows what is told by the numbers of the file.
+    assert_eq!(transitions.episodes().len(), 1, "as without scaling");
+    assert_eq!(scaled(true, true).episodes(), transitions.episodes());
+}
+
+#[test]
+fn states_alone_leave_the_range_of_actions_to_be_checked() {
+    let options =
+        ReadOptions { environment: None, reward: RewardRule::AsIs, scale: Scale { actions: false, states: true } };
+    let (_folder, path) = file();
+    let error = Transitions::read(path, &options).err().unwrap();
+    assert!(error.to_string().contains("the action -30 is outside [-1, 1]"), "{error}");
+}
+
+#[test]
+fn the_names_of_what_is_scaled() {
+    let read = |json: &str| serde_json::from_str::<Scale>(json);
+    let both = Scale { actions: true, states: true };
+    assert_eq!(read(r#"["states", "actions", "states"]"#).unwrap(), both);
+    assert_eq!(read("[]").unwrap(), Scale::default());
+    assert_eq!(serde_json::to_string(&both).unwrap(), r#"["actions","states"]"#);
+    let error = read(r#"["rewards"]"#).unwrap_err().to_string();
+    assert!(error.contains("unknown variant `rewards`, expected `actions` or `states`"), "{error}");
+}

@@ -1,0 +1,77 @@
+//! Between a user's units and those of networks: an affine map of each number of an observation or an action. Training scales
+//! its data by the same arithmetic by which the policy scales what it is given.
+
+use serde::{Deserialize, Serialize};
+
+/// The maps of a policy and of its data. Where there is none, the units are the user's.
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Scaling {
+    /// Of observations.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub observations: Option<Affine>,
+    /// Of actions.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub actions: Option<Affine>,
+}
+
+/// user's = offset + scale · network's, column by column. The file of a policy has both as they are here.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Affine {
+    /// What a network's 0 is to the user, a number for each column.
+    pub offset: Vec<f32>,
+    /// What a network's 1 is to the user beyond that, as many.
+    pub scale: Vec<f32>,
+}
+
+impl Affine {
+    /// Whether it is a map of so many columns that has an inverse: all finite, each scale above 0.
+    pub fn is_usable(&self, columns: usize) -> bool {
+        let lengths = (self.offset.len(), self.scale.len()) == (columns, columns);
+        let offsets = self.offset.iter().all(|offset| offset.is_finite());
+        lengths && offsets && self.scale.iter().all(|scale| scale.is_finite() && *scale > 0.0)
+    }
+
+    /// From the user's numbers to the network's, in place; `numbers` is `rows × columns`.
+    pub fn to_network(&self, numbers: &mut [f32]) {
+        self.change(numbers, |x, offset, scale| (x - offset) / scale);
+    }
+
+    /// From the network's numbers to the user's, in place; `numbers` is `rows × columns`.
+    pub fn to_user(&self, numbers: &mut [f32]) {
+        self.change(numbers, |x, offset, scale| offset + scale * x);
+    }
+
+    /// In f64, so that a large offset costs no digits.
+    fn change(&self, numbers: &mut [f32], with: impl Fn(f64, f64, f64) -> f64) {
+        let columns = self.offset.iter().zip(&self.scale).cycle();
+        for (x, (offset, scale)) in numbers.iter_mut().zip(columns) {
+            *x = with(f64::from(*x), f64::from(*offset), f64::from(*scale)) as f32;
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn there_and_back() {
+        let affine = Affine { offset: vec![10.0, -3.0], scale: vec![4.0, 0.5] };
+        assert!(affine.is_usable(2) && !affine.is_usable(3));
+        let mut numbers = [14.0, -3.0, 2.0, -2.0];
+        affine.to_network(&mut numbers);
+        assert_eq!(numbers, [1.0, 0.0, -2.0, 2.0]);
+        affine.to_user(&mut numbers);
+        assert_eq!(numbers, [14.0, -3.0, 2.0, -2.0]);
+    }
+
+    #[test]
+    fn a_map_without_an_inverse_is_not_usable() {
+        for scale in [0.0, -1.0, f32::NAN, f32::INFINITY] {
+            assert!(!Affine { offset: vec![0.0], scale: vec![scale] }.is_usable(1), "{scale}");
+        }
+        assert!(!Affine { offset: vec![f32::NAN], scale: vec![1.0] }.is_usable(1));
+    }
+}
