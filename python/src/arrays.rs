@@ -34,8 +34,9 @@ impl<'a> Rows<'a> {
             }
         };
         let values = match array.as_slice() {
-            Ok(values) => Cow::Borrowed(values),
-            Err(_) => Cow::Owned(array.as_array().iter().copied().collect()),
+            // Columns may lie side by side, too.
+            Ok(values) if array.is_c_contiguous() => Cow::Borrowed(values),
+            _ => Cow::Owned(array.as_array().iter().copied().collect()),
         };
         if let Some(i) = values.iter().position(|value| !value.is_finite()) {
             let (row, column, value) = (i / width, i % width, values[i]);
