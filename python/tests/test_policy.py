@@ -144,6 +144,7 @@ def test_what_it_says_of_itself(snapshots, hopper_runs):
         assert Policy.load(snapshots["iql"], "bf16").precision == "f32"
 
 
+@pytest.mark.filterwarnings("ignore:overflow")
 def test_what_cannot_be_is_refused(snapshots, tmp_path):
     policy, states = Policy.load(snapshots["quad"]), observations(3)
     bad = states.copy()

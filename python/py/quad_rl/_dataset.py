@@ -133,7 +133,7 @@ def _episode(where: str, episode: Any) -> _Rows:
         ends.append(flags if flags.ndim else np.arange(steps) == (steps - 1 if flags else steps))
     observations = np.asarray(of("observations"))
     after = observations[1:] if len(observations) == steps + 1 else None
-    rows = _rows(where, observations[:steps], of("actions"), of("rewards"), *ends, after)
+    rows = _rows(where, observations[:steps], of("actions"), of("rewards"), ends[0], ends[1], after)
     if after is None:
         return _followed(rows)
     rows.timeouts[-1] |= not rows.terminals[-1]
@@ -168,18 +168,18 @@ def _array(
     """Finite numbers, N or N × width."""
     with np.errstate(over="ignore"):
         array = np.ascontiguousarray(values, dtype=np.float32)
-    shape = array.shape
-    if array.ndim == 1 and axes == 2:
-        array = array[:, None]
-    elif array.ndim == 2 and axes == 1 and shape[1] == 1:
-        array = array[:, 0]
-    if array.ndim != axes or len(array) != (len(array) if rows is None else rows) or width not in (None, *array.shape[1:]):
-        expected = ["N" if rows is None else str(rows), *(["k" if width is None else str(width)] if axes == 2 else [])]
-        raise ValueError(f"{where}{name} has shape {list(shape)}, but must have [{', '.join(expected)}]")
-    finite = np.isfinite(array).reshape(len(array), -1).all(axis=1)
-    if not finite.all():
-        row = int(np.argmin(finite))
-        raise ValueError(f"{where}{name}, row {row}: {array[row]} is not finite in float32 ({(~finite).sum()} such rows)")
+    shape, n = list(array.shape), "N" if rows is None else rows
+    if array.ndim == 1 and axes == 2 or shape[1:] == [1] and axes == 1:
+        array = array.reshape([-1, 1][:axes])
+    if array.ndim != axes or rows not in (None, len(array)) or width not in (None, array.shape[-1]):
+        expected = f"[{n}, {width or 'k'}]" if axes == 2 else f"[{n}]"
+        raise ValueError(f"{where}{name} has shape {shape}, but must have {expected}")
+    bad = np.argwhere(~np.isfinite(array))
+    if len(bad):
+        (row, *column), rows = bad[0], len(set(bad[:, 0]))
+        number = f"number {column[0]}" if column else "it"
+        value = array[tuple(bad[0])]
+        raise ValueError(f"{where}{name}, row {row}: {number} is {value}, but must be a finite float32 ({rows} such rows)")
     return array
 
 

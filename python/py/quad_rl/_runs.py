@@ -41,22 +41,17 @@ def runs(folders: str | PathLike[str] | Iterable[str | PathLike[str]] = "runs/*"
 
 def _rows(run: dict[str, Any]) -> list[dict[str, Any]]:
     of_run = {name: value for name, value in run.items() if name not in ("evaluations", "missing")}
-    settings = json.loads(_quad_rl.toml_to_json(Path(run["dir"], "config.toml").read_text()))
-    of_run |= _flat("", settings)
-    none = {"step": None, "episodes": None, "complete": None, "score": None, "score_std": None, "return": None, "length": None}
+    of_run |= _flat("", json.loads(_quad_rl.toml_to_json(Path(run["dir"], "config.toml").read_text())))
     evaluations = [
         {
-            "step": one["step"],
-            "episodes": one["episodes"],
-            "complete": one["complete"],
-            "score": one["score"]["mean"],
-            "score_std": one["score"]["std"],
-            "return": one["mean_return"],
-            "length": one["mean_length"],
+            **{name: one[name] for name in ("step", "episodes", "complete")},
+            **{"score": one["score"]["mean"], "score_std": one["score"]["std"]},
+            **{"return": one["mean_return"], "length": one["mean_length"]},
         }
         for one in run["evaluations"]
     ]
-    return [{**of_run, **evaluation} for evaluation in evaluations or [none]]
+    none = dict.fromkeys(("step", "episodes", "complete", "score", "score_std", "return", "length"))
+    return [of_run | evaluation for evaluation in evaluations or [none]]
 
 
 def _flat(prefix: str, table: dict[str, Any]) -> dict[str, Any]:
