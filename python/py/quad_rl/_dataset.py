@@ -58,7 +58,7 @@ class Dataset:
             counts, inside an episode. What followed the last step of a truncated episode is then not known, so that step
             is dropped, as D4RL does it; so is the last row if nothing ends there. After a terminal step nothing counts.
 
-        Raises ValueError for shapes that do not fit one another, and for NaN, with the row.
+        Raises ValueError for shapes that do not fit one another, for whole numbers as actions, and for NaN, with the row.
         """
         rows = _rows("", observations, actions, rewards, terminations, truncations, next_observations)
         return Dataset(rows if next_observations is not None else _followed(rows))
@@ -149,6 +149,8 @@ def _rows(
     truncations: ArrayLike,
     next_observations: ArrayLike | None,
 ) -> _Rows:
+    if np.asarray(actions).dtype.kind in "iub":
+        raise ValueError(f"{where}actions are whole numbers, as if they were discrete; only continuous ones can be learnt")
     r = _array(where, "rewards", rewards, None, 1)
     n = len(r)
     o = _array(where, "observations", observations, n, 2)
