@@ -67,6 +67,9 @@ def test_episodes_make_the_same_rows_as_their_arrays(tmp_path):
     known = Dataset.from_episodes({**e, "observations": o} for e, o in zip(episodes, last))
     found = written(known, tmp_path / "known.hdf5")
     assert len(known) == len(found["rewards"]) == 300
+    open_end = {**episodes[0], "observations": last[0], "terminations": False, "truncations": False}
+    cut = written(Dataset.from_episodes([open_end, open_end]), tmp_path / "open.hdf5")
+    assert np.flatnonzero(cut["timeouts"]).tolist() == [ends[0] - 1, 2 * ends[0] - 1] and not cut["terminals"].any()
     assert (found["next_observations"][ends - 1] == 9).all() and (found["terminals"] | found["timeouts"])[ends - 1].all()
 
 
