@@ -1,11 +1,25 @@
-//! The module `quad_rl._quad_rl`: QUAD for Python.
+//! The module `quad_rl._quad_rl`: QUAD for Python. The types of what its classes and functions take and give stand in
+//! `py/quad_rl/_quad_rl.pyi`, too.
 
+mod acting;
+mod arrays;
+mod choosing;
+mod dataset;
+mod episodes;
+mod error;
 mod evaluate;
+mod policy;
 
 use pyo3::prelude::*;
 
 #[pymodule]
 mod _quad_rl {
     #[pymodule_export]
+    use crate::dataset::{inspect_dataset, toml_to_json, write_dataset};
+    #[pymodule_export]
+    use crate::episodes::Episodes;
+    #[pymodule_export]
     use crate::evaluate::{serve_environment, simulated};
+    #[pymodule_export]
+    use crate::policy::PyPolicy;
 }

@@ -1,5 +1,8 @@
-"""QUAD from Python."""
+"""QUAD from Python: trained policies, evaluators for your own environments, data from arrays, results of runs."""
 
+from quad_rl._dataset import Dataset
 from quad_rl._evaluate import Evaluators, evaluate
+from quad_rl._quad_rl import Episodes, Policy
+from quad_rl._runs import runs
 
-__all__ = ["Evaluators", "evaluate"]
+__all__ = ["Dataset", "Episodes", "Evaluators", "Policy", "evaluate", "runs"]

@@ -1,0 +1,82 @@
+# The types of the compiled module; help() of each class has the rest.
+from collections.abc import Sequence
+from os import PathLike
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+class Policy:
+    @staticmethod
+    def load(path: str | PathLike[str], precision: str = "f32") -> Policy: ...
+    @staticmethod
+    def from_bytes(file: bytes, precision: str = "f32", name: str = "the file") -> Policy: ...
+    def act(
+        self,
+        observations: ArrayLike,
+        *,
+        candidates: int | None = None,
+        rule: str | None = None,
+        value: str | None = None,
+        seed: int | Sequence[int] | NDArray[np.integer[Any]] | None = None,
+    ) -> NDArray[np.float32]: ...
+    def predict(
+        self,
+        observations: ArrayLike,
+        *,
+        candidates: int | None = None,
+        rule: str | None = None,
+        value: str | None = None,
+        seed: int | Sequence[int] | NDArray[np.integer[Any]] | None = None,
+    ) -> NDArray[np.float32]: ...
+    def sample(
+        self,
+        observations: ArrayLike,
+        *,
+        candidates: int | None = None,
+        value: str | None = None,
+        seed: int | Sequence[int] | NDArray[np.integer[Any]] | None = None,
+    ) -> tuple[NDArray[np.float32], NDArray[np.float32]]: ...
+    def value(
+        self, observations: ArrayLike, actions: ArrayLike, *, value: str | None = None
+    ) -> NDArray[np.float32]: ...
+    def begin(
+        self,
+        seeds: int | Sequence[int] | NDArray[np.integer[Any]],
+        *,
+        candidates: int | None = None,
+        rule: str | None = None,
+        value: str | None = None,
+    ) -> Episodes: ...
+    @property
+    def observation_size(self) -> int: ...
+    @property
+    def action_size(self) -> int: ...
+    @property
+    def environment(self) -> str: ...
+    @property
+    def step(self) -> int: ...
+    @property
+    def kind(self) -> str: ...
+    @property
+    def precision(self) -> str: ...
+    @property
+    def choice(self) -> dict[str, Any] | None: ...
+
+class Episodes:
+    def act(
+        self, observations: ArrayLike, *, rows: Sequence[int] | NDArray[np.integer[Any]] | None = None
+    ) -> NDArray[np.float32]: ...
+    def __len__(self) -> int: ...
+
+def write_dataset(
+    path: str | PathLike[str],
+    observations: NDArray[np.float32],
+    actions: NDArray[np.float32],
+    rewards: NDArray[np.float32],
+    next_observations: NDArray[np.float32],
+    terminals: NDArray[np.bool_],
+    timeouts: NDArray[np.bool_],
+) -> None: ...
+def inspect_dataset(path: str | PathLike[str]) -> tuple[str, str]: ...
+def toml_to_json(text: str) -> str: ...

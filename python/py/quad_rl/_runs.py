@@ -1,0 +1,73 @@
+"""Results of runs."""
+
+from __future__ import annotations
+
+import glob
+import json
+import os
+import shutil
+import subprocess
+import sysconfig
+from collections.abc import Iterable
+from os import PathLike
+from pathlib import Path
+from typing import Any
+
+from quad_rl import _quad_rl
+
+
+def runs(folders: str | PathLike[str] | Iterable[str | PathLike[str]] = "runs/*") -> list[dict[str, Any]]:
+    """What runs have scored, as `pandas.DataFrame` takes it: a dictionary for each evaluation of each run.
+
+    folders: a run folder, a pattern such as "runs/*", or several of them. Folders that hold no run are left out.
+
+    Each dictionary has, from `learner report --json`: of its evaluation `step`, `episodes`, `complete`, `score` (mean over the
+    episodes), `score_std`, `return` and `length`; of its run `run`, `dir`, `task`, `algorithm`, `variant`, `agent`, `seed`,
+    `steps`, `normalised`, `scored_in`, `dataset_score`, `mean_last_3`, `mean_last_5` and `mean_last_50000_steps`, the same in
+    all its rows; and each setting of its `config.toml` under its name there, like `experiment.batch_size`. A run that has
+    no evaluation yet has one row, in which these are None.
+
+    A learner may be writing the folders. Raises RuntimeError with what `learner report` says, FileNotFoundError if the program
+    is neither beside Python nor on the PATH.
+    """
+    patterns = [folders] if isinstance(folders, (str, PathLike)) else folders
+    found = [path for pattern in patterns for path in sorted(glob.glob(os.path.expanduser(os.fspath(pattern))))]
+    found = [path for path in found if Path(path, "config.toml").is_file()]
+    if not found:
+        return []
+    report = json.loads(_learner("report", "--json", *found))
+    return [row for run in report["runs"] for row in _rows(run)]
+
+
+def _rows(run: dict[str, Any]) -> list[dict[str, Any]]:
+    of_run = {name: value for name, value in run.items() if name not in ("evaluations", "missing")}
+    of_run |= _flat("", json.loads(_quad_rl.toml_to_json(Path(run["dir"], "config.toml").read_text())))
+    evaluations = [
+        {
+            **{name: one[name] for name in ("step", "episodes", "complete")},
+            **{"score": one["score"]["mean"], "score_std": one["score"]["std"]},
+            **{"return": one["mean_return"], "length": one["mean_length"]},
+        }
+        for one in run["evaluations"]
+    ]
+    none = dict.fromkeys(("step", "episodes", "complete", "score", "score_std", "return", "length"))
+    return [of_run | evaluation for evaluation in evaluations or [none]]
+
+
+def _flat(prefix: str, table: dict[str, Any]) -> dict[str, Any]:
+    """Tables within tables as names with dots."""
+    flat: dict[str, Any] = {}
+    for name, value in table.items():
+        flat |= _flat(f"{prefix}{name}.", value) if isinstance(value, dict) else {prefix + name: value}
+    return flat
+
+
+def _learner(*arguments: str) -> str:
+    """What the learner prints: the program that came with this package, or else that on the PATH."""
+    program = shutil.which("learner", path=sysconfig.get_path("scripts")) or shutil.which("learner")
+    if program is None:
+        raise FileNotFoundError("there is no program `learner`, neither beside Python nor on the PATH")
+    done = subprocess.run([program, *arguments], capture_output=True, text=True)
+    if done.returncode:
+        raise RuntimeError(done.stderr.strip())
+    return done.stdout

@@ -1,0 +1,69 @@
+//! Acting in the rows of an array, and the seeds of rows.
+
+use numpy::PyArrayDyn;
+use pyo3::exceptions::PyValueError;
+use pyo3::prelude::*;
+use quad_policy::{EpisodeState, Policy};
+
+use crate::arrays::Rows;
+use crate::error::of_policy;
+
+/// Memory that one call of the policy may take, bytes; more rows are split. An action does not depend on the other rows.
+const MEMORY: u64 = 256 << 20;
+
+/// What comes out of a policy.
+pub type Array<'py> = Bound<'py, PyArrayDyn<f32>>;
+
+/// Acts in each row, without Python's lock.
+pub fn act<'py>(
+    py: Python<'py>,
+    policy: &dyn Policy,
+    rows: &Rows<'_>,
+    states: &mut [EpisodeState],
+) -> PyResult<Array<'py>> {
+    let width = policy.action_dim();
+    let mut actions = vec![0.0; rows.count * width];
+    let acted = py.detach(|| {
+        let mut left = actions.as_mut_slice();
+        for (observations, states) in parts(policy, &rows.values, states) {
+            let (now, later) = left.split_at_mut(states.len() * width);
+            policy.act(observations, states, now)?;
+            left = later;
+        }
+        Ok(())
+    });
+    acted.map_err(|error| of_policy(&error))?;
+    rows.array(py, actions, &[width])
+}
+
+/// Rows and their states, in parts of which each takes bounded memory.
+pub fn parts<'a>(
+    policy: &dyn Policy,
+    observations: &'a [f32],
+    states: &'a mut [EpisodeState],
+) -> impl Iterator<Item = (&'a [f32], &'a mut [EpisodeState])> {
+    let rows = (MEMORY / policy.memory(1).max(1)).max(1) as usize;
+    observations.chunks(rows * policy.observation_dim()).zip(states.chunks_mut(rows))
+}
+
+/// What the policy carries through the episodes of these seeds.
+pub fn begin(policy: &dyn Policy, seeds: &[u64]) -> Vec<EpisodeState> {
+    seeds.iter().map(|seed| policy.begin(*seed)).collect()
+}
+
+/// A seed for each of n rows: `seed + i`, or what a sequence says, or fresh ones.
+pub fn seeds(seed: Option<&Bound<'_, PyAny>>, n: usize) -> PyResult<Vec<u64>> {
+    let Some(seed) = seed else { return Ok((0..n).map(|_| rand::random()).collect()) };
+    if let Ok(seed) = seed.extract::<u64>() {
+        return Ok((0..n as u64).map(|i| seed.wrapping_add(i)).collect());
+    }
+    let expected = format!("a sequence of {n} of them, or None");
+    match seed.extract::<Vec<u64>>() {
+        Ok(seeds) if seeds.len() == n => Ok(seeds),
+        _ => Err(not_seeds(&expected)),
+    }
+}
+
+pub fn not_seeds(or: &str) -> PyErr {
+    PyValueError::new_err(format!("a seed must be an int from 0 to 2**64 - 1, or {or}"))
+}

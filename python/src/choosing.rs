@@ -1,0 +1,58 @@
+//! How a policy chooses among its candidates, as Python says it.
+
+use std::sync::Arc;
+
+use pyo3::exceptions::PyValueError;
+use pyo3::prelude::*;
+use pyo3::types::PyDict;
+use quad_policy::{Choice, Policy, Reduce, Rule};
+
+use crate::error::of_policy;
+
+/// How a call chooses among candidates where it differs from the file.
+#[derive(Default)]
+pub struct Changes {
+    pub candidates: Option<i64>,
+    pub rule: Option<String>,
+    pub value: Option<String>,
+}
+
+/// The policy, with these changes to how it chooses.
+pub fn choosing(policy: &Arc<dyn Policy>, changes: Changes) -> PyResult<Arc<dyn Policy>> {
+    if let Changes { candidates: None, rule: None, value: None } = changes {
+        return Ok(policy.clone());
+    }
+    let mut choice = policy.choice().unwrap_or(Choice::best_of(1));
+    if let Some(candidates) = changes.candidates {
+        let most = Choice::MOST_CANDIDATES;
+        let error = || PyValueError::new_err(format!("candidates is {candidates}, but must be from 1 to {most}"));
+        choice.candidates = u32::try_from(candidates).ok().filter(|n| (1..=most).contains(n)).ok_or_else(error)?;
+    }
+    if let Some(rule) = changes.rule {
+        let error = |expected| PyValueError::new_err(format!("rule is {rule:?}, not {expected}"));
+        choice.rule = rule.parse().map_err(error)?;
+    }
+    if let Some(value) = changes.value {
+        let error = |_| PyValueError::new_err(format!("value is {value:?}, not mean or min"));
+        choice.value = value.parse().map_err(error)?;
+    }
+    policy.with_choice(choice).map(Arc::from).map_err(|error| of_policy(&error))
+}
+
+/// A choice as the arguments that ask for it.
+pub fn as_dictionary(py: Python<'_>, choice: Choice) -> PyResult<Bound<'_, PyDict>> {
+    let rule = match choice.rule {
+        Rule::Best => "best".to_owned(),
+        Rule::Softmax { temperature } => format!("softmax:{temperature}"),
+        Rule::Nearest => "nearest".to_owned(),
+    };
+    let value = match choice.value {
+        Reduce::Mean => "mean",
+        Reduce::Min => "min",
+    };
+    let dictionary = PyDict::new(py);
+    dictionary.set_item("candidates", choice.candidates)?;
+    dictionary.set_item("rule", rule)?;
+    dictionary.set_item("value", value)?;
+    Ok(dictionary)
+}

@@ -1,0 +1,55 @@
+//! What `quad_rl.Dataset` takes from the crate that Rust's programs read and write data with.
+
+use std::path::PathBuf;
+
+use numpy::{PyReadonlyArray1, PyReadonlyArray2, PyUntypedArrayMethods};
+use pyo3::exceptions::PyRuntimeError;
+use pyo3::prelude::*;
+use quad_dataset::{Arrays, DatasetError, inspect, write_own};
+
+use crate::error::with_hint;
+
+fn refused(error: &DatasetError) -> PyErr {
+    with_hint(error, &error.hint())
+}
+
+/// Writes the layout for people's own data. All arrays are C-contiguous and have the same number of rows.
+#[pyfunction]
+#[expect(clippy::too_many_arguments, reason = "they are the file's arrays")]
+pub fn write_dataset(
+    py: Python<'_>,
+    path: PathBuf,
+    observations: PyReadonlyArray2<'_, f32>,
+    actions: PyReadonlyArray2<'_, f32>,
+    rewards: PyReadonlyArray1<'_, f32>,
+    next_observations: PyReadonlyArray2<'_, f32>,
+    terminals: PyReadonlyArray1<'_, bool>,
+    timeouts: PyReadonlyArray1<'_, bool>,
+) -> PyResult<()> {
+    let arrays = Arrays {
+        observation_dim: observations.shape()[1],
+        action_dim: actions.shape()[1],
+        observations: observations.as_slice()?.to_vec(),
+        actions: actions.as_slice()?.to_vec(),
+        rewards: rewards.as_slice()?.to_vec(),
+        next_observations: next_observations.as_slice()?.to_vec(),
+        terminals: terminals.as_slice()?.to_vec(),
+        timeouts: timeouts.as_slice()?.to_vec(),
+    };
+    py.detach(|| write_own(path, arrays)).map_err(|error| refused(&error))
+}
+
+/// What is in a dataset: as JSON, and as a page.
+#[pyfunction]
+pub fn inspect_dataset(py: Python<'_>, path: PathBuf) -> PyResult<(String, String)> {
+    let inspection = py.detach(|| inspect(path, None)).map_err(|error| refused(&error))?;
+    let json = serde_json::to_string(&inspection);
+    Ok((json.map_err(|error| PyRuntimeError::new_err(error.to_string()))?, inspection.to_string()))
+}
+
+/// A TOML file's text as JSON: Python reads TOML by itself only from 3.11.
+#[pyfunction]
+pub fn toml_to_json(text: &str) -> PyResult<String> {
+    let table = text.parse::<toml::Table>().map_err(|error| with_hint(&error, "it is what a learner writes"))?;
+    serde_json::to_string(&table).map_err(|error| PyRuntimeError::new_err(error.to_string()))
+}

@@ -1,0 +1,261 @@
+//! `quad_rl.Policy`: a trained policy, read from the file of a snapshot.
+
+use std::fs;
+use std::path::PathBuf;
+use std::sync::Arc;
+
+use pyo3::exceptions::{PyUserWarning, PyValueError};
+use pyo3::prelude::*;
+use pyo3::types::{PyBytes, PyDict, PyTuple};
+use quad_policy::{Header, Policy, PolicyConfig, PolicyError, Precision, load_policy};
+use quad_protocol::Origin;
+
+use crate::acting::{Array, act, begin, not_seeds, parts, seeds};
+use crate::arrays::{Like, Rows};
+use crate::choosing::{Changes, as_dictionary, choosing};
+use crate::episodes::Episodes;
+use crate::error::{of_policy, with_hint};
+
+const HINT: &str =
+    "a policy is a file like RUN/snapshots/step_000020000.safetensors, as `learner train` of this version writes them";
+/// A policy that `learner train` has saved: `Policy.load(path)`.
+///
+/// It takes and gives the units of the data that it has learnt from. All calls release Python's lock and share the processor's
+/// cores with rayon: the environment variable RAYON_NUM_THREADS says, before the first call, how many. A process that was
+/// forked after a call cannot make one; with multiprocessing use "spawn".
+#[pyclass(name = "Policy", module = "quad_rl", frozen)]
+pub struct PyPolicy {
+    policy: Arc<dyn Policy>,
+    config: PolicyConfig,
+    origin: Origin,
+    /// The file and the precision that was asked for, to make a copy of.
+    file: Vec<u8>,
+    asked: Precision,
+}
+
+#[pymethods]
+impl PyPolicy {
+    /// Reads the file of a snapshot, like "runs/mine/snapshots/step_000020000.safetensors".
+    ///
+    /// precision: "f32", or "bf16", which rounds and is faster on CPUs with AMX or AMD's AVX512-BF16; others warn and use f32.
+    ///
+    /// Raises OSError if the file cannot be read, ValueError if it is no policy.
+    #[staticmethod]
+    #[pyo3(signature = (path, precision = "f32"))]
+    fn load(py: Python<'_>, path: PathBuf, precision: &str) -> PyResult<Self> {
+        let read = py.detach(|| fs::read(&path));
+        let file = read.map_err(|error| {
+            let message = format!("cannot read {}: {error}\nhint: {HINT}", path.display());
+            std::io::Error::new(error.kind(), message)
+        })?;
+        Self::from_bytes(py, file, precision, &path.display().to_string())
+    }
+
+    /// As `load`, from the file's bytes; `name` is what errors call it.
+    #[staticmethod]
+    #[pyo3(signature = (file, precision = "f32", name = "the file"))]
+    fn from_bytes(py: Python<'_>, file: Vec<u8>, precision: &str, name: &str) -> PyResult<Self> {
+        let asked: Precision = precision
+            .parse()
+            .map_err(|_| PyValueError::new_err(format!("precision is {precision:?}, not f32 or bf16")))?;
+        if !asked.is_available() {
+            let message = std::ffi::CString::new(Precision::UNAVAILABLE)?;
+            PyErr::warn(py, &py.get_type::<PyUserWarning>(), &message, 2)?;
+        }
+        let read = py.detach(|| Ok((load_policy(&file, asked)?, Header::<Origin>::read(&file)?)));
+        let (policy, header) = read.map_err(|error: PolicyError| {
+            with_hint(&std::io::Error::other(format!("{name} is not a saved policy: {error}")), HINT)
+        })?;
+        Ok(Self { policy: policy.into(), config: header.policy, origin: header.origin, file, asked })
+    }
+
+    /// Acts in each of n states: observations [n, observation_size] -> actions [n, action_size], float32.
+    ///
+    /// An array of one axis is one state, and gives one action. float32 arrays whose numbers lie side by side are not copied;
+    /// anything else that NumPy takes is converted.
+    ///
+    /// candidates: how many actions are drawn in each state. rule: which of them is taken, "best", "softmax:TEMPERATURE" or
+    ///     "nearest". value: what the critics' values of an action count as, "mean" or "min". None: what the file says (`choice`).
+    /// seed: an int: row i draws from seed + i, so that one observation gives what an evaluator does in the first step of the
+    ///     episode of that seed. A sequence of n ints: a seed for each row. None: fresh random numbers.
+    ///
+    /// For whole episodes see `begin`.
+    ///
+    /// Raises ValueError for another shape, NaN or infinite numbers, or a choice that this policy cannot make; RuntimeError if its
+    /// networks give no number.
+    #[pyo3(signature = (observations, *, candidates = None, rule = None, value = None, seed = None))]
+    fn act<'py>(
+        &self,
+        py: Python<'py>,
+        observations: Like<'py>,
+        candidates: Option<i64>,
+        rule: Option<String>,
+        value: Option<String>,
+        seed: Option<&Bound<'py, PyAny>>,
+    ) -> PyResult<Array<'py>> {
+        let rows = self.rows(&observations)?;
+        let policy = choosing(&self.policy, Changes { candidates, rule, value })?;
+        let mut states = begin(&*policy, &seeds(seed, rows.count)?);
+        act(py, &*policy, &rows, &mut states)
+    }
+
+    /// `act`, by the name that d3rlpy has for it.
+    #[pyo3(signature = (observations, *, candidates = None, rule = None, value = None, seed = None))]
+    fn predict<'py>(
+        &self,
+        py: Python<'py>,
+        observations: Like<'py>,
+        candidates: Option<i64>,
+        rule: Option<String>,
+        value: Option<String>,
+        seed: Option<&Bound<'py, PyAny>>,
+    ) -> PyResult<Array<'py>> {
+        self.act(py, observations, candidates, rule, value, seed)
+    }
+
+    /// Draws what `act` chooses among: (actions [n, candidates, action_size], values [n, candidates]), float32.
+    ///
+    /// For one state, without the first axis. With the same seed `act` takes one of these. Raises as `act`, and ValueError if the
+    /// policy has no critics.
+    #[pyo3(signature = (observations, *, candidates = None, value = None, seed = None))]
+    fn sample<'py>(
+        &self,
+        py: Python<'py>,
+        observations: Like<'py>,
+        candidates: Option<i64>,
+        value: Option<String>,
+        seed: Option<&Bound<'py, PyAny>>,
+    ) -> PyResult<(Array<'py>, Array<'py>)> {
+        let rows = self.rows(&observations)?;
+        let policy = choosing(&self.policy, Changes { candidates, value, ..Changes::default() })?;
+        let mut states = begin(&*policy, &seeds(seed, rows.count)?);
+        let sampled = py.detach(|| {
+            let (mut actions, mut values) = (Vec::new(), Vec::new());
+            for (observations, states) in parts(&*policy, &rows.values, &mut states) {
+                let sampled = policy.sample(observations, states)?;
+                actions.extend(sampled.actions);
+                values.extend(sampled.values);
+            }
+            Ok((actions, values))
+        });
+        let (actions, values) = sampled.map_err(|error| of_policy(&error))?;
+        let candidates = policy.choice().map_or(1, |choice| choice.candidates as usize);
+        Ok((rows.array(py, actions, &[candidates, policy.action_dim()])?, rows.array(py, values, &[candidates])?))
+    }
+
+    /// What the critics say that actions are worth: observations [n, observation_size], actions [n, action_size] -> [n], float32,
+    /// the discounted return that they expect of the rewards that the learner saw. For one state and action an array without axes.
+    ///
+    /// value: "mean" of the critics or their "min". Raises as `act`, and ValueError if the policy has no critics.
+    #[pyo3(signature = (observations, actions, *, value = None))]
+    fn value<'py>(
+        &self,
+        py: Python<'py>,
+        observations: Like<'py>,
+        actions: Like<'py>,
+        value: Option<String>,
+    ) -> PyResult<Array<'py>> {
+        let rows = self.rows(&observations)?;
+        let taken = Rows::of("actions", &actions, self.policy.action_dim())?;
+        if (taken.count, taken.single) != (rows.count, rows.single) {
+            let error =
+                format!("{} rows of observations, but {} of actions: one action for each", rows.count, taken.count);
+            return Err(PyValueError::new_err(error));
+        }
+        let policy = choosing(&self.policy, Changes { value, ..Changes::default() })?;
+        let values = match rows.count {
+            0 => Vec::new(),
+            _ => py.detach(|| policy.value(&rows.values, &taken.values)).map_err(|error| of_policy(&error))?,
+        };
+        rows.array(py, values, &[])
+    }
+
+    /// Begins an episode for each seed (an int, or a sequence of them). In each, the policy draws as an evaluator does from
+    /// step to step: the same seed and observations give the same actions, bit for bit.
+    ///
+    ///     episodes = policy.begin([0, 1, 2])
+    ///     actions = episodes.act(observations)  # [3, observation_size] -> [3, action_size]
+    #[pyo3(signature = (seeds, *, candidates = None, rule = None, value = None))]
+    fn begin(
+        &self,
+        seeds: &Bound<'_, PyAny>,
+        candidates: Option<i64>,
+        rule: Option<String>,
+        value: Option<String>,
+    ) -> PyResult<Episodes> {
+        let policy = choosing(&self.policy, Changes { candidates, rule, value })?;
+        let seeds = match seeds.extract::<u64>() {
+            Ok(seed) => vec![seed],
+            Err(_) => seeds.extract().map_err(|_| not_seeds("a sequence of them"))?,
+        };
+        Ok(Episodes::new(policy, &seeds))
+    }
+
+    /// Numbers in an observation.
+    #[getter]
+    fn observation_size(&self) -> usize {
+        self.policy.observation_dim()
+    }
+
+    /// Numbers in an action.
+    #[getter]
+    fn action_size(&self) -> usize {
+        self.policy.action_dim()
+    }
+
+    /// The environment that it was trained for.
+    #[getter]
+    fn environment(&self) -> &str {
+        &self.origin.environment
+    }
+
+    /// The gradient step that it was saved after.
+    #[getter]
+    fn step(&self) -> u64 {
+        self.origin.step
+    }
+
+    /// "diffusion", which draws actions and chooses one, or "gaussian", which acts by its mean.
+    #[getter]
+    fn kind(&self) -> &'static str {
+        match self.config {
+            PolicyConfig::Diffusion { .. } => "diffusion",
+            PolicyConfig::Gaussian { .. } => "gaussian",
+        }
+    }
+
+    /// Arithmetic in effect, "f32" or "bf16".
+    #[getter]
+    fn precision(&self) -> &'static str {
+        self.policy.precision().name()
+    }
+
+    /// How it chooses: a dictionary of candidates, rule and value, as `act` takes them. None if it draws nothing.
+    #[getter]
+    fn choice<'py>(&self, py: Python<'py>) -> PyResult<Option<Bound<'py, PyDict>>> {
+        self.policy.choice().map(|choice| as_dictionary(py, choice)).transpose()
+    }
+
+    fn __repr__(&self) -> String {
+        let choice = self.policy.choice().map_or(String::new(), |choice| format!(", {choice}"));
+        let (o, a) = (self.policy.observation_dim(), self.policy.action_dim());
+        let Origin { environment, step, .. } = &self.origin;
+        format!(
+            "Policy({environment}, {} after step {step}, {o} -> {a} numbers{choice}, {})",
+            self.kind(),
+            self.precision()
+        )
+    }
+
+    fn __reduce__<'py>(slf: &Bound<'py, Self>) -> PyResult<Bound<'py, PyTuple>> {
+        let (py, this) = (slf.py(), slf.get());
+        let arguments = (PyBytes::new(py, &this.file), this.asked.name());
+        (slf.get_type().getattr("from_bytes")?, arguments).into_pyobject(py)
+    }
+}
+
+impl PyPolicy {
+    fn rows<'a>(&self, observations: &'a Like<'_>) -> PyResult<Rows<'a>> {
+        Rows::of("observations", observations, self.policy.observation_dim())
+    }
+}
