@@ -1,14 +1,20 @@
 //! Tells the binaries where libmujoco lies, so that no user has to set LD_LIBRARY_PATH.
 
+use std::env;
 use std::path::Path;
 
 fn main() {
     println!("cargo::rerun-if-changed=build.rs");
-    // In the clone it was built in, then for an image or a copied folder: beside the binary, in a sibling lib folder
-    // (/usr/local/bin → /usr/local/lib), in the clone's .deps when the binary lies in target/<profile>.
-    let workspace = Path::new(env!("CARGO_MANIFEST_DIR")).parent().unwrap_or(Path::new("/"));
-    println!("cargo::rustc-link-arg=-Wl,-rpath,{}", workspace.join(".deps/mujoco").display());
-    for folder in ["$ORIGIN", "$ORIGIN/../lib", "$ORIGIN/../../.deps/mujoco"] {
+    // For an image, an archive, a wheel or a copied folder: beside the binary, or in a sibling lib folder
+    // (/usr/local/bin → /usr/local/lib).
+    let mut folders = vec!["$ORIGIN".to_owned(), "$ORIGIN/../lib".to_owned()];
+    // The clone's .deps: where it is now, and beside target/<profile>. Not in a program that is made for other machines.
+    if env::var_os("CARGO_FEATURE_STATIC").is_none() {
+        let workspace = Path::new(env!("CARGO_MANIFEST_DIR")).parent().unwrap_or(Path::new("/"));
+        folders.insert(0, workspace.join(".deps/mujoco").display().to_string());
+        folders.push("$ORIGIN/../../.deps/mujoco".to_owned());
+    }
+    for folder in folders {
         println!("cargo::rustc-link-arg=-Wl,-rpath,{folder}");
     }
 }

@@ -1,0 +1,47 @@
+"""Prints the licences of all that is compiled into the programs and the Python module, each text once; to be run in the
+repository's folder. Where a package carries no text, it prints which licence its manifest names."""
+
+import json
+import pathlib
+import subprocess
+
+COMMAND = "metadata --format-version 1 --locked --offline --filter-platform x86_64-unknown-linux-gnu --features"
+FEATURES = "quad-learner/static,quad-evaluator/static,quad-python/static"
+PROGRAMS = {"quad-learner", "quad-evaluator", "quad-python"}
+# C that a crate compiles, with the licence of its own.
+WITHIN = {"hdf5-metno-src": ["ext/hdf5/LICENSE"], "libz-sys": ["src/zlib/LICENSE"]}
+
+
+def linked(metadata):
+    """The packages that the programs are linked with; not what only builds them."""
+    nodes = {node["id"]: node for node in metadata["resolve"]["nodes"]}
+    packages = {package["id"]: package for package in metadata["packages"]}
+    found, todo = set(), [key for key, package in packages.items() if package["name"] in PROGRAMS]
+    while todo:
+        key = todo.pop()
+        if key not in found:
+            found.add(key)
+            for dependency in nodes[key]["deps"]:
+                if any(kind["kind"] is None for kind in dependency["dep_kinds"]):
+                    todo.append(dependency["pkg"])
+    return sorted((packages[key] for key in found if packages[key]["source"]), key=lambda package: package["name"])
+
+
+def texts(package):
+    """The files of its folder that are licences by their names."""
+    folder = pathlib.Path(package["manifest_path"]).parent
+    files = {file for file in folder.iterdir() if file.name.upper().startswith(("LICEN", "COPYING", "NOTICE", "UNLICENSE"))}
+    files |= {folder / name for name in WITHIN.get(package["name"], [])}
+    return [file.read_text(errors="replace").strip() for file in sorted(files) if file.is_file()]
+
+
+metadata = json.loads(subprocess.run(["cargo", *COMMAND.split(), FEATURES], check=True, capture_output=True).stdout)
+owners = {}
+for package in linked(metadata):
+    name = f"{package['name']} {package['version']}"
+    said = f"{package['license']}, says its manifest, without a text. Authors: {', '.join(package['authors']) or 'not named'}"
+    for text in texts(package) or [said]:
+        owners.setdefault(text, []).append(name)
+print("What is compiled into the programs, and under which licences.\n")
+for text, names in owners.items():
+    print("=" * 80, ", ".join(names), "-" * 80, text, sep="\n", end="\n\n")

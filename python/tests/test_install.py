@@ -1,0 +1,37 @@
+"""What `pip install` puts in place: a module and programs that start, without anything else on the machine."""
+
+import importlib.metadata
+import pathlib
+import shutil
+import subprocess
+import sys
+
+import pytest
+
+import quad_rl
+
+BIN = pathlib.Path(sys.executable).parent
+
+
+@pytest.mark.parametrize("program", ["learner", "evaluator"])
+def test_programs_are_on_the_path_and_of_this_version(program):
+    assert pathlib.Path(shutil.which(program)).parent == BIN
+    said = subprocess.run([program, "--version"], check=True, capture_output=True, text=True, timeout=20).stdout
+    assert said.split() == [program, importlib.metadata.version("quad_rl")]
+
+
+def test_the_programs_need_no_library_but_the_systems_and_the_wheels():
+    for file in [BIN / "learner", BIN / "evaluator", pathlib.Path(quad_rl.__file__).parent / "_quad_rl.abi3.so"]:
+        for line in subprocess.run(["ldd", file], check=True, capture_output=True, text=True, timeout=20).stdout.splitlines():
+            name, _, where = line.strip().partition(" => ")
+            if "mujoco" in name:
+                assert pathlib.Path(where.split()[0]).resolve().is_relative_to(BIN.parent.resolve())
+            else:
+                assert name.split("/")[-1].startswith(("linux-vdso", "ld-linux", "libc.", "libm.", "libdl.", "libpthread.", "librt."))
+
+
+def test_the_licences_come_along():
+    files = {file.name: file for file in importlib.metadata.files("quad_rl") if "licenses" in file.parts}
+    assert {"LICENSE-MIT", "LICENSE-APACHE", "LICENSE-mujoco", "LICENSE-third-party"} <= set(files)
+    text = files["LICENSE-third-party"].read_text()
+    assert "HDF5 (Hierarchical Data Format 5) Software Library" in text and "Jean-loup Gailly" in text
