@@ -16,7 +16,8 @@ pub struct EpisodeScore {
     pub episode_return: f64,
     /// Its environment steps.
     pub length: u32,
-    /// D4RL's normalised score: 100 · (return − random) / (expert − random).
+    /// Its score: D4RL's normalised one, 100 · (return − random) / (expert − random), where the environment has such
+    /// references; else what the evaluator's user counts, by default the return.
     pub score: f64,
 }
 

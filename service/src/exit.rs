@@ -41,7 +41,13 @@ impl<T, E: Into<anyhow::Error>> Hint<T> for Result<T, E> {
 /// An error with advice, which is shown below it; one that has advice already keeps that.
 pub fn hinted(error: impl Into<anyhow::Error>, hint: impl fmt::Display) -> anyhow::Error {
     let error = error.into();
-    if error.is::<Hinted>() { error } else { Hinted { error, hint: hint.to_string() }.into() }
+    if error.is::<Hinted>() { error } else { Hinted { error, hint: hint.to_string(), unfinished: false }.into() }
+}
+
+/// An error with advice that is none of the program's: it did not finish, and the same command goes on. The exit code is then
+/// [`UNFINISHED`].
+pub fn unfinished(error: impl Into<anyhow::Error>, hint: impl fmt::Display) -> anyhow::Error {
+    Hinted { error: error.into(), hint: hint.to_string(), unfinished: true }.into()
 }
 
 /// An error with advice; everything else is the error's own.
@@ -49,6 +55,7 @@ pub fn hinted(error: impl Into<anyhow::Error>, hint: impl fmt::Display) -> anyho
 struct Hinted {
     error: anyhow::Error,
     hint: String,
+    unfinished: bool,
 }
 
 impl fmt::Display for Hinted {
@@ -63,17 +70,21 @@ impl std::error::Error for Hinted {
     }
 }
 
+/// The exit code of a program that has not finished, and goes on when the same command is given again: EX_TEMPFAIL of
+/// `sysexits.h`, so that a scheduler can tell it from a failure.
+const UNFINISHED: u8 = 75;
 /// How long the last words wait for stderr to be read.
 const LAST_WORDS: Duration = Duration::from_secs(1);
 
-/// Runs `main`, and ends the logging. An error is printed to stderr with its causes and hints; the exit code is then 1,
-/// otherwise 0.
+/// Runs `main`, and ends the logging. An error is printed to stderr with its causes and hints; the exit code is then 1, or 75
+/// if the error is one of [`unfinished`]; otherwise 0.
 ///
 /// (A wrong command line is 2, which clap sees to.)
 pub fn run_main(logging: Logging, main: impl FnOnce() -> anyhow::Result<()>) -> ExitCode {
     let result = main();
     drop(logging);
     let Err(error) = result else { return ExitCode::SUCCESS };
+    let unfinished = error.chain().filter_map(|cause| cause.downcast_ref::<Hinted>()).any(|hinted| hinted.unfinished);
     let (tell, told) = channel();
     thread::spawn(move || {
         // With stderr closed, the exit code is all that can be said.
@@ -81,7 +92,7 @@ pub fn run_main(logging: Logging, main: impl FnOnce() -> anyhow::Result<()>) -> 
         tell.send(()).ok();
     });
     told.recv_timeout(LAST_WORDS).ok();
-    ExitCode::FAILURE
+    if unfinished { UNFINISHED.into() } else { ExitCode::FAILURE }
 }
 
 fn print(error: &anyhow::Error, to: &mut impl Write) -> io::Result<()> {
@@ -135,5 +146,7 @@ mod tests {
     fn exit_codes() {
         assert_eq!(run_main(init_logging(), || Ok(())), ExitCode::SUCCESS);
         assert_eq!(run_main(init_logging(), || Err(anyhow!("an error that a test made"))), ExitCode::FAILURE);
+        let stopped = || Err(unfinished(anyhow!("a stop that a test made"), "go on").context("it did not end"));
+        assert_eq!(run_main(init_logging(), stopped), ExitCode::from(75));
     }
 }

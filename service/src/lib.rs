@@ -30,7 +30,7 @@ mod threads;
 pub use background::stay_in_background;
 pub use certificates::{Certificates, CertificatesError, Role};
 pub use endpoints::{Endpoints, SessionError, default_endpoint, parse_endpoint};
-pub use exit::{Hint, hinted, run_main};
+pub use exit::{Hint, hinted, run_main, unfinished};
 pub use health::{Beat, Health};
 pub use logging::{Logging, init_logging};
 pub use metrics_server::{BindError, MetricsServer, serve_metrics};

@@ -14,9 +14,8 @@ use crate::config::tables::{self, parse_assignment};
 
 pub(super) const EXAMPLES: &str = "\
 Examples:
-  # One box: the learner listens, an evaluator in another terminal connects.
-  learner train --task hopper-demo --dataset data/hopper-demo.hdf5 --listen tcp/127.0.0.1:7447
-  evaluator serve --connect tcp/127.0.0.1:7447
+  # One box, two evaluators beside the learner.
+  learner train --task hopper-demo --dataset data/hopper-demo.hdf5 --evaluators 2
 
   # Another algorithm on the same data.
   learner train --task hopper-demo --algorithm iql --dataset data/hopper-demo.hdf5
@@ -26,7 +25,7 @@ Examples:
 
   # Go on after a crash or Ctrl-C: the same command again.
 
-At Ctrl-C or SIGTERM the learner saves a checkpoint and ends with exit code 1; at a second one it ends at once. The same
+At Ctrl-C or SIGTERM the learner saves a checkpoint and ends with exit code 75; at a second one it ends at once. The same
 command goes on from the run folder's newest checkpoint. On the same machine a run that was interrupted ends with the same
 weights, bit for bit, as one that was not.";
 
@@ -61,12 +60,15 @@ pub struct TrainArgs {
     #[arg(long)]
     pub fresh: bool,
     /// Listen for evaluators here, e.g. tcp/127.0.0.1:7447, or tls/0.0.0.0:7447 for other machines
-    /// [default: tcp/127.0.0.1:7447, or tls/… with --certificates; any free port with --eval-interval 0]
+    /// [default: tcp/127.0.0.1:7447, or tls/… with --certificates; any free port if that is taken, or with --eval-interval 0]
     #[arg(long, value_name = "ENDPOINT", value_parser = parse_endpoint, conflicts_with = "connect")]
     pub listen: Option<String>,
     /// Join a Zenoh router instead, where evaluators are found, e.g. tcp/router:7447
     #[arg(long, value_name = "ENDPOINT", value_parser = parse_endpoint)]
     pub connect: Option<String>,
+    /// Start so many evaluators on this machine, which end with the learner; they log to DIR/evaluator-1.log and so on
+    #[arg(long, value_name = "N", default_value_t = 0, conflicts_with = "certificates")]
+    pub evaluators: usize,
     /// Folder with ca.pem, cert.pem and key.pem: evaluators must show a certificate of the same authority, and endpoints
     /// are tls/HOST:PORT (docs/security.md)
     #[arg(long, value_name = "DIR", env = "QUAD_CERTIFICATES")]

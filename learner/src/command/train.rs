@@ -1,5 +1,7 @@
 //! `learner train`, from the command line to the report.
 
+use std::io::ErrorKind;
+use std::net::{Ipv4Addr, TcpListener};
 use std::path::{Path, PathBuf};
 use std::time::{Duration, SystemTime, UNIX_EPOCH};
 
@@ -9,7 +11,7 @@ use quad_policy::Precision;
 use quad_protocol::Name;
 use quad_service::{
     Certificates, CertificatesError, Endpoints, Health, Hint, Role, SessionError, default_endpoint, hinted,
-    stay_in_background,
+    stay_in_background, unfinished,
 };
 use tokio::sync::mpsc;
 use tracing::{debug, info, warn};
@@ -19,7 +21,7 @@ use crate::config::{DatasetInfo, Experiment, Preset, RunConfig, RunInfo, hyperpa
 use crate::data::{LocalDataset, Source};
 use crate::report::{RunReport, learning_curves};
 use crate::run::{self, Begun, Log, Past, RunDir};
-use crate::service::{Display, Ending, Life, MainLoop, Metrics, Run, STUCK, Threads, open_network};
+use crate::service::{Display, Ending, Life, LocalEvaluators, MainLoop, Metrics, Run, STUCK, Threads, open_network};
 
 /// Where evaluators look by default.
 const DEFAULT_PORT: u16 = 7447;
@@ -42,6 +44,7 @@ pub fn train(args: &TrainArgs) -> anyhow::Result<()> {
     let name = run_name(&path)?;
     let begun = run::open(&path, args.fresh)?;
     let endpoints = endpoints(args, experiment.eval_interval)?;
+    let evaluators = LocalEvaluators::new(args.evaluators)?;
 
     args.device.check(experiment.precision)?;
     let dataset = source.obtain().hint(record_hint(&experiment))?;
@@ -72,7 +75,7 @@ pub fn train(args: &TrainArgs) -> anyhow::Result<()> {
     // Zenoh and the training thread have threads of their own; this runtime serves the metrics and the main loop.
     let mut runtime = tokio::runtime::Builder::new_multi_thread();
     let runtime = runtime.worker_threads(2).on_thread_start(stay_in_background).enable_all().build()?;
-    let ended = runtime.block_on(run_to_its_end(args, endpoints, &path, begun, name, &config, transitions));
+    let ended = runtime.block_on(run_to_its_end(args, endpoints, evaluators, &path, begun, name, &config, transitions));
     let concluded = ended.and_then(|(run_dir, ending)| conclude(&run_dir, &config, ending));
     // Without waiting for a thread that waits for a broken disk.
     runtime.shutdown_background();
@@ -102,6 +105,7 @@ fn check_batch(transitions: &Transitions, experiment: &Experiment) -> anyhow::Re
 async fn run_to_its_end(
     args: &TrainArgs,
     endpoints: Endpoints,
+    evaluators: LocalEvaluators,
     path: &Path,
     begun: Option<Begun>,
     name: Name,
@@ -134,6 +138,7 @@ async fn run_to_its_end(
         threads,
         beat: health.part("main", STUCK),
         health,
+        evaluators,
     };
     Ok((run_dir, main_loop.run(opening).await))
 }
@@ -157,7 +162,7 @@ fn now() -> anyhow::Result<u64> {
 fn endpoints(args: &TrainArgs, eval_interval: u64) -> anyhow::Result<Endpoints> {
     let certificates = args.certificates.as_deref().map(|folder| Certificates::read(folder, Role::Learner));
     let certificates = certificates.transpose().hint_of(CertificatesError::hint)?;
-    let port = if eval_interval == 0 { ANY_PORT } else { DEFAULT_PORT };
+    let port = if eval_interval == 0 { ANY_PORT } else { free_port() };
     let listen = match (&args.listen, &args.connect) {
         (None, None) => vec![default_endpoint(certificates.as_ref(), port)],
         (listen, _) => Vec::from_iter(listen.clone()),
@@ -171,6 +176,14 @@ fn endpoints(args: &TrainArgs, eval_interval: u64) -> anyhow::Result<Endpoints> 
         );
     }
     Ok(endpoints)
+}
+
+/// The usual port, or any if another program has that, as on a machine that several learners share.
+fn free_port() -> u16 {
+    match TcpListener::bind((Ipv4Addr::LOCALHOST, DEFAULT_PORT)) {
+        Err(error) if error.kind() == ErrorKind::AddrInUse => ANY_PORT,
+        _ => DEFAULT_PORT,
+    }
 }
 
 /// Writes the report, however the run ended; a run that did not complete is an error.
@@ -188,15 +201,21 @@ fn conclude(run_dir: &RunDir, config: &RunConfig, ending: Ending) -> anyhow::Res
         format!("everything up to the newest checkpoint is kept in {folder}; the same command goes on from there");
     let error = match ending {
         Ending::Complete => return all_scored(reported?),
-        Ending::Failed(error) => error,
+        Ending::Failed(error) => hinted(error, kept),
         Ending::Interrupted => {
-            anyhow!("interrupted before the end of {} steps and their evaluations", config.experiment.steps)
+            let steps = config.experiment.steps;
+            unfinished(anyhow!("interrupted before the end of {steps} steps and their evaluations"), kept)
         }
+        Ending::Unscored => unfinished(
+            anyhow!("training is complete, but no evaluator came that has the environment {}", config.experiment.environment),
+            "start one and give the same command again, which waits for the scores; or let the learner start some, by \
+             --evaluators N",
+        ),
     };
     if let Err(error) = reported {
         warn!("the run has no report: {error:#}");
     }
-    Err(hinted(error, kept))
+    Err(error)
 }
 
 /// That no episode was given up.

@@ -38,6 +38,7 @@ pub(crate) struct Coordinator {
     state: Arc<Mutex<State>>,
     plan: EvaluationPlan,
     incarnation: u64,
+    environment: String,
     metrics: Metrics,
     events: Events,
 }
@@ -61,14 +62,24 @@ impl Coordinator {
         metrics: Metrics,
         events: Events,
     ) -> Self {
-        let incarnation = rules.incarnation;
+        let (incarnation, environment) = (rules.incarnation, rules.task.environment.clone());
         let state = State {
             scoreboard: Scoreboard::new(rules, earlier),
             evaluators: Evaluators::new(metrics.evaluators.clone(), Instant::now()),
             failures_told: BTreeSet::new(),
             names_told: BTreeSet::new(),
         };
-        Self { state: Arc::new(Mutex::new(state)), plan, incarnation, metrics, events }
+        Self { state: Arc::new(Mutex::new(state)), plan, incarnation, environment, metrics, events }
+    }
+
+    /// The environment that policies are evaluated in.
+    pub fn environment(&self) -> &str {
+        &self.environment
+    }
+
+    /// Whether an evaluator is connected that has this environment.
+    pub fn any_fits(&self) -> bool {
+        self.lock().evaluators.any_fits()
     }
 
     // A thread that panicked here ends the run.
@@ -106,6 +117,9 @@ impl Coordinator {
         match request {
             JobRequest::Claim { evaluator, attempt, environments } => {
                 let present = state.evaluators.count();
+                if environments.contains(&self.environment) {
+                    state.evaluators.fits(evaluator);
+                }
                 let claim = Claim { evaluator, attempt: *attempt, environments, present };
                 let claimed = state.scoreboard.claim(claim, Instant::now());
                 self.claimed(&mut state, evaluator, claimed)

@@ -22,6 +22,8 @@ const PERIOD: Duration = Duration::from_secs(10);
 pub(super) struct Evaluators {
     metrics: EvaluatorMetrics,
     present: BTreeSet<Name>,
+    /// Those of them that have the run's environment.
+    fitting: BTreeSet<Name>,
     last_seen: BTreeMap<Name, Instant>,
     news: News,
 }
@@ -29,12 +31,24 @@ pub(super) struct Evaluators {
 impl Evaluators {
     pub fn new(metrics: EvaluatorMetrics, now: Instant) -> Self {
         let news = News { since: now, told: 0, joined: 0, left: 0, lines: Vec::new() };
-        Self { metrics, present: BTreeSet::new(), last_seen: BTreeMap::new(), news }
+        Self { metrics, present: BTreeSet::new(), fitting: BTreeSet::new(), last_seen: BTreeMap::new(), news }
     }
 
     /// How many are connected.
     pub fn count(&self) -> usize {
         self.present.len()
+    }
+
+    /// Whether one is connected that has the run's environment.
+    pub fn any_fits(&self) -> bool {
+        !self.fitting.is_empty()
+    }
+
+    /// One asked for a job, and has the run's environment.
+    pub fn fits(&mut self, evaluator: &Name) {
+        if self.present.contains(evaluator) && !self.fitting.contains(evaluator) {
+            self.fitting.insert(evaluator.clone());
+        }
     }
 
     /// One is connected.
@@ -55,6 +69,7 @@ impl Evaluators {
         if !self.present.remove(evaluator) {
             return;
         }
+        self.fitting.remove(evaluator);
         self.metrics.present.set(self.present.len() as i64);
         let line = match jobs {
             0 => format!("evaluator {evaluator} has left"),

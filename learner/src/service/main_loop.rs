@@ -2,6 +2,7 @@
 
 use std::time::{Duration, Instant};
 
+use quad_dataset::environment;
 use quad_service::{Beat, Endpoints, Health};
 use tokio::sync::mpsc::UnboundedReceiver;
 use tokio::task::JoinHandle;
@@ -11,16 +12,16 @@ use tracing::{error, warn};
 use super::display::{Display, evaluators};
 use super::duplicate::Life;
 use super::events::{Event, Saved};
+use super::local_evaluators::LocalEvaluators;
 use super::metrics::Metrics;
 use super::network::{Online, Opening, go_online};
+use super::patience::{Patience, Verdict};
 use super::threads::Threads;
 use super::wire::Wire;
 use crate::report::Spread;
 use crate::run::RunDir;
 use crate::train::Outcome;
 
-/// When no evaluator has been connected for this long after training, the user is told what to do.
-const EVALUATOR_PATIENCE: Duration = Duration::from_secs(10);
 /// Longest time to close the session in, should the network hang.
 const CLOSE_PATIENCE: Duration = Duration::from_secs(5);
 /// When a run has failed, what still waits for the disk is given up after this time: the disk may be in trouble, too.
@@ -33,6 +34,8 @@ pub(crate) enum Ending {
     Complete,
     /// The user asked to stop (SIGINT or SIGTERM).
     Interrupted,
+    /// Trained, but no evaluator came that has the run's environment.
+    Unscored,
     /// It could not go on.
     Failed(anyhow::Error),
 }
@@ -52,6 +55,8 @@ pub(crate) struct MainLoop {
     pub health: Health,
     /// Says that this loop is alive: it would not be if nothing took what it prints.
     pub beat: Beat,
+    /// Evaluators that it is to start.
+    pub evaluators: LocalEvaluators,
 }
 
 /// How far the run is, as far as the loop has heard.
@@ -64,7 +69,7 @@ struct Progress {
     reachable_at: Vec<String>,
     /// What hangs, as far as it was told.
     hangs: Vec<Saved>,
-    waiting: Waiting,
+    patience: Patience,
 }
 
 impl MainLoop {
@@ -90,6 +95,7 @@ impl MainLoop {
                 (event, _) => tell(event, &mut self.display),
             }
         }
+        self.evaluators.end().await;
         if let Some(wire) = progress.wire {
             // An evaluator that misses the goodbye notices the lost connection.
             timeout(CLOSE_PATIENCE, tokio::spawn(wire.close())).await.ok();
@@ -107,7 +113,11 @@ impl MainLoop {
                 result = &mut online, if !is_online => {
                     is_online = true;
                     match result.map_err(anyhow::Error::from).flatten() {
-                        Ok(online) => self.online(online, progress),
+                        Ok(online) => {
+                            if let Err(error) = self.online(online, progress) {
+                                return Ending::Failed(error);
+                            }
+                        }
                         Err(error) => return Ending::Failed(error),
                     }
                 }
@@ -123,7 +133,9 @@ impl MainLoop {
                     event => tell(event, &mut self.display),
                 },
                 _ = ticker.tick() => {
-                    self.tick(progress);
+                    if let Verdict::GiveUp = self.tick(progress) {
+                        return Ending::Unscored;
+                    }
                     if progress.trained && self.threads.services.coordinator.pending() == 0 {
                         return Ending::Complete;
                     }
@@ -140,11 +152,12 @@ impl MainLoop {
         }
     }
 
-    fn online(&self, online: Online, progress: &mut Progress) {
+    fn online(&mut self, online: Online, progress: &mut Progress) -> anyhow::Result<()> {
         let (zenoh, metrics) = (online.reachable_at.join(", "), &self.metrics_address);
         self.display.say(&format!("run {} is at {zenoh}, its metrics at http://{metrics}/metrics", self.life.run));
         progress.reachable_at = online.reachable_at;
         progress.wire = Some(online.wire);
+        self.evaluators.start(&progress.reachable_at, self.run_dir.path())
     }
 
     fn trained(&self) -> String {
@@ -157,17 +170,24 @@ impl MainLoop {
         }
     }
 
-    fn tick(&mut self, progress: &mut Progress) {
+    fn tick(&mut self, progress: &mut Progress) -> Verdict {
         self.beat.alive();
         for line in self.threads.services.coordinator.tick() {
             self.display.say(&line);
         }
         self.watch_disk(&mut progress.hangs);
         self.display.tick(Instant::now());
-        let present = self.metrics.evaluators.present.get() > 0;
-        if progress.trained && progress.waiting.is_too_long(present) {
+        for line in self.evaluators.news() {
+            self.display.say(&line);
+        }
+        if !progress.trained {
+            return Verdict::Wait;
+        }
+        let verdict = progress.patience.look(self.threads.services.coordinator.any_fits(), Instant::now());
+        if let Verdict::Advise = verdict {
             self.display.say(&self.advice(&progress.reachable_at));
         }
+        verdict
     }
 
     /// A thread that writes and says nothing for long waits for the disk.
@@ -193,8 +213,19 @@ impl MainLoop {
             [] => {
                 format!("no router has answered at {} yet; the scores wait for it", self.endpoints.connect.join(", "))
             }
-            [endpoint, ..] => format!("no evaluator is here; start one with: evaluator serve --connect {endpoint}"),
+            [endpoint, ..] => how_to_evaluate(self.threads.services.coordinator.environment(), endpoint),
         }
+    }
+}
+
+/// What to do when no evaluator is there that has the run's environment.
+fn how_to_evaluate(name: &str, endpoint: &str) -> String {
+    match environment::find(name) {
+        Ok(_) => format!("no evaluator is here; start one with: evaluator serve --connect {endpoint}"),
+        Err(_) => format!(
+            "no evaluator is here that has the environment {name}; from Python: \
+             quad_rl.evaluate(\"{name}\", YOUR_ENVIRONMENT, connect=\"{endpoint}\") (docs/python.md)"
+        ),
     }
 }
 
@@ -240,28 +271,5 @@ async fn end(threads: Threads, ending: &Ending) {
     error!("{error:#}; ending as soon as the disk has taken what waits for it, in {} s at most", LAST_WRITES.as_secs());
     if timeout(LAST_WRITES, ended).await.is_err() {
         warn!("the disk did not take what was to be saved last");
-    }
-}
-
-/// For how long no evaluator has been connected.
-#[derive(Default)]
-struct Waiting {
-    since: Option<Instant>,
-    said: bool,
-}
-
-impl Waiting {
-    /// True once, each time that it becomes too long.
-    fn is_too_long(&mut self, evaluator_present: bool) -> bool {
-        if evaluator_present {
-            *self = Self::default();
-            return false;
-        }
-        let since = *self.since.get_or_insert_with(Instant::now);
-        if self.said || since.elapsed() < EVALUATOR_PATIENCE {
-            return false;
-        }
-        self.said = true;
-        true
     }
 }

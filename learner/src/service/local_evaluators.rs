@@ -1,0 +1,121 @@
+//! Evaluators that the learner starts itself, and that end with it: `learner train --evaluators N`.
+
+use std::fs::File;
+use std::os::unix::process::CommandExt;
+use std::path::{Path, PathBuf};
+use std::process::{Child, Command, Stdio};
+use std::time::{Duration, Instant};
+
+use anyhow::Context;
+use quad_service::Hint;
+use rustix::process::{Pid, Signal, kill_process, set_parent_process_death_signal};
+
+/// The program.
+const EVALUATOR: &str = "evaluator";
+/// An evaluator delivers what it has and leaves within two seconds; one that takes this long is killed.
+const LEAVE: Duration = Duration::from_secs(4);
+const GLANCE: Duration = Duration::from_millis(20);
+
+/// What is to be started, and what was.
+#[derive(Default)]
+pub(crate) struct LocalEvaluators {
+    count: usize,
+    program: PathBuf,
+    started: Vec<Started>,
+}
+
+struct Started {
+    process: Child,
+    log: PathBuf,
+    /// It is known that it has ended.
+    ended: bool,
+}
+
+impl LocalEvaluators {
+    /// So many, which are not started yet.
+    ///
+    /// # Errors
+    /// There is no evaluator beside this program, nor on the PATH.
+    pub fn new(count: usize) -> anyhow::Result<Self> {
+        if count == 0 {
+            return Ok(Self::default());
+        }
+        let beside = std::env::current_exe().ok().map(|own| own.with_file_name(EVALUATOR)).filter(|path| path.exists());
+        let program = beside.unwrap_or_else(|| EVALUATOR.into());
+        let tried = Command::new(&program).arg("--version").stdout(Stdio::null()).stderr(Stdio::null()).status();
+        match tried {
+            Ok(status) if status.success() => {}
+            Ok(status) => anyhow::bail!("{} --version ended with {status}", program.display()),
+            Err(error) => {
+                let hint = "build it with `cargo build --release --package quad-evaluator`, or leave --evaluators out and start \
+                            some by hand";
+                return Err(error).context("there is no program `evaluator` beside the learner or on the PATH").hint(hint);
+            }
+        }
+        Ok(Self { count, program, started: Vec::new() })
+    }
+
+    /// Starts them. They connect to the first of these endpoints, and write their logs into the run's folder.
+    ///
+    /// To be called by a thread that lives as long as the learner: the system ends them when that thread ends.
+    ///
+    /// # Errors
+    /// A process or its log cannot be made.
+    pub fn start(&mut self, reachable_at: &[String], run_dir: &Path) -> anyhow::Result<()> {
+        for number in 1..=self.count {
+            let log = run_dir.join(format!("evaluator-{number}.log"));
+            let started = self.command(reachable_at, number).and_then(|mut command| {
+                let file = File::options().create(true).append(true).open(&log)?;
+                Ok(command.stdout(file.try_clone()?).stderr(file).spawn()?)
+            });
+            let process = started.with_context(|| format!("cannot start an evaluator that logs to {}", log.display()))?;
+            self.started.push(Started { process, log, ended: false });
+        }
+        Ok(())
+    }
+
+    fn command(&self, reachable_at: &[String], number: usize) -> anyhow::Result<Command> {
+        let mut command = Command::new(&self.program);
+        command.args(["serve", "--name", &format!("{EVALUATOR}-{number}"), "--connect"]).args(reachable_at.first());
+        if std::env::var_os("RAYON_NUM_THREADS").is_none() {
+            let cores = std::thread::available_parallelism()?.get();
+            command.env("RAYON_NUM_THREADS", cores.div_ceil(self.count).to_string());
+        }
+        // A terminal's Ctrl-C is for the learner, which lets them deliver what they have.
+        command.stdin(Stdio::null()).process_group(0);
+        // SAFETY: the new process makes one system call, which may be made between fork and exec.
+        #[allow(unsafe_code)]
+        unsafe {
+            command.pre_exec(|| Ok(set_parent_process_death_signal(Some(Signal::TERM))?));
+        }
+        Ok(command)
+    }
+
+    /// What people are to be told of those that have ended by themselves.
+    pub fn news(&mut self) -> Vec<String> {
+        let ended = |started: &mut Started| {
+            let status = started.process.try_wait().ok().flatten().filter(|_| !started.ended)?;
+            started.ended = true;
+            Some(format!("an evaluator has ended ({status}); its log is {}", started.log.display()))
+        };
+        self.started.iter_mut().filter_map(ended).collect()
+    }
+
+    /// Lets them leave, and waits for that.
+    pub async fn end(&mut self) {
+        let until = Instant::now() + LEAVE;
+        for started in self.started.iter_mut().filter(|started| !started.ended) {
+            kill_process(Pid::from_child(&started.process), Signal::TERM).ok();
+        }
+        for Started { process, .. } in &mut self.started {
+            while let Ok(None) = process.try_wait() {
+                if Instant::now() >= until {
+                    process.kill().ok();
+                    process.wait().ok();
+                    break;
+                }
+                tokio::time::sleep(GLANCE).await;
+            }
+        }
+    }
+}
