@@ -32,28 +32,8 @@ if [ -e "$RUN/complete" ] && [ $# -eq 0 ]; then
   exit
 fi
 
-learner=
-evaluators=() # process ids
-
-# Ends what still runs, also when this script is interrupted.
-stop() {
-  trap '' INT TERM
-  kill -TERM $learner "${evaluators[@]}" 2>/dev/null || true
-  wait
-}
-trap stop EXIT
-trap 'exit 130' INT
-trap 'exit 143' TERM
-
-start_learner "$RUN" --task $TASK --dataset $DATASET "$@"
-for ((i = 1; i <= EVALUATORS; i++)); do
-  $BIN/evaluator serve --name "evaluator-$i" --connect "$endpoint" --metrics 127.0.0.1:0 >"$RUN/evaluator-$i.log" 2>&1 &
-  evaluators+=($!)
-done
-say "evaluators write to $RUN/evaluator-*.log"
-
 status=0
-wait "$learner" || status=$?
+$BIN/learner train --task $TASK --dataset $DATASET --run-dir $RUN --evaluators $EVALUATORS "$@" || status=$?
 if [ "$status" -ne 0 ]; then
   say "the learner ended with status $status; run this again to go on where it was"
   exit "$status"

@@ -12,8 +12,10 @@ use tracing_subscriber::prelude::*;
 use tracing_subscriber::{EnvFilter, fmt, registry};
 
 /// Without RUST_LOG: our own progress and Zenoh's complaints. `zenoh` is the prefix of all of its crates. One of its warnings
-/// is left out: that scouting by gossip is off, which it is on purpose.
-const DEFAULT_FILTER: &str = "info,zenoh=warn,zenoh::net::routing::hat::peer=error";
+/// is left out: that scouting by gossip is off, which it is on purpose. So is what it says when it cannot listen or connect, which
+/// is told in our own words.
+const DEFAULT_FILTER: &str =
+    "info,zenoh=warn,zenoh::net::routing::hat::peer=error,zenoh::net::runtime::orchestrator=error";
 
 /// Most lines of Zenoh's in a minute. It writes one for each client that it refuses, so that a stranger could fill the disk.
 /// Our own lines are not counted: what strangers send is logged at the level `debug`, which only RUST_LOG shows.

@@ -1,7 +1,5 @@
 //! `learner train`, from the command line to the report.
 
-use std::io::ErrorKind;
-use std::net::{Ipv4Addr, TcpListener};
 use std::path::{Path, PathBuf};
 use std::time::{Duration, SystemTime, UNIX_EPOCH};
 
@@ -116,7 +114,14 @@ async fn run_to_its_end(
     let (metrics, registry) = Metrics::new(&name, steps, config.experiment.definition()?.metrics)?;
     let health = Health::default();
     let server = quad_service::serve_metrics(args.metrics, registry, health.clone()).await?;
-    let opening = open_network(&endpoints).await.hint_of(|error| {
+    let mut endpoints = endpoints;
+    let mut opening = open_network(&endpoints).await;
+    if opening.is_err() && args.listen.is_none() && args.connect.is_none() {
+        info!("another program, perhaps a learner, has port {DEFAULT_PORT}; taking a free one");
+        endpoints.listen = vec![default_endpoint(endpoints.certificates.as_ref(), ANY_PORT)];
+        opening = open_network(&endpoints).await;
+    }
+    let opening = opening.hint_of(|error| {
         error.downcast_ref().map_or("join a router with --connect, or listen with --listen", SessionError::hint)
     })?;
     // From here on nothing outside can be wrong any more, so a refused start leaves no folder behind.
@@ -162,7 +167,7 @@ fn now() -> anyhow::Result<u64> {
 fn endpoints(args: &TrainArgs, eval_interval: u64) -> anyhow::Result<Endpoints> {
     let certificates = args.certificates.as_deref().map(|folder| Certificates::read(folder, Role::Learner));
     let certificates = certificates.transpose().hint_of(CertificatesError::hint)?;
-    let port = if eval_interval == 0 { ANY_PORT } else { free_port() };
+    let port = if eval_interval == 0 { ANY_PORT } else { DEFAULT_PORT };
     let listen = match (&args.listen, &args.connect) {
         (None, None) => vec![default_endpoint(certificates.as_ref(), port)],
         (listen, _) => Vec::from_iter(listen.clone()),
@@ -176,14 +181,6 @@ fn endpoints(args: &TrainArgs, eval_interval: u64) -> anyhow::Result<Endpoints> 
         );
     }
     Ok(endpoints)
-}
-
-/// The usual port, or any if another program has that, as on a machine that several learners share.
-fn free_port() -> u16 {
-    match TcpListener::bind((Ipv4Addr::LOCALHOST, DEFAULT_PORT)) {
-        Err(error) if error.kind() == ErrorKind::AddrInUse => ANY_PORT,
-        _ => DEFAULT_PORT,
-    }
 }
 
 /// Writes the report, however the run ended; a run that did not complete is an error.
@@ -207,7 +204,10 @@ fn conclude(run_dir: &RunDir, config: &RunConfig, ending: Ending) -> anyhow::Res
             unfinished(anyhow!("interrupted before the end of {steps} steps and their evaluations"), kept)
         }
         Ending::Unscored => unfinished(
-            anyhow!("training is complete, but no evaluator came that has the environment {}", config.experiment.environment),
+            anyhow!(
+                "training is complete, but no evaluator came that has the environment {}",
+                config.experiment.environment
+            ),
             "start one and give the same command again, which waits for the scores; or let the learner start some, by \
              --evaluators N",
         ),

@@ -49,7 +49,9 @@ impl LocalEvaluators {
             Err(error) => {
                 let hint = "build it with `cargo build --release --package quad-evaluator`, or leave --evaluators out and start \
                             some by hand";
-                return Err(error).context("there is no program `evaluator` beside the learner or on the PATH").hint(hint);
+                return Err(error)
+                    .context("there is no program `evaluator` beside the learner or on the PATH")
+                    .hint(hint);
             }
         }
         Ok(Self { count, program, started: Vec::new() })
@@ -68,7 +70,8 @@ impl LocalEvaluators {
                 let file = File::options().create(true).append(true).open(&log)?;
                 Ok(command.stdout(file.try_clone()?).stderr(file).spawn()?)
             });
-            let process = started.with_context(|| format!("cannot start an evaluator that logs to {}", log.display()))?;
+            let process =
+                started.with_context(|| format!("cannot start an evaluator that logs to {}", log.display()))?;
             self.started.push(Started { process, log, ended: false });
         }
         Ok(())

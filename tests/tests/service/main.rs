@@ -6,6 +6,7 @@
 
 mod crowds;
 mod leaving;
+mod local_evaluators;
 mod names;
 mod pace;
 mod runs;

@@ -1,0 +1,85 @@
+//! `learner train --evaluators N`: one command that starts its own evaluators.
+
+use std::fs;
+
+use quad_tests::learner::Learner;
+use quad_tests::setting::{ENDLESS, SHORT, Setting};
+use quad_tests::system::Scratch;
+use quad_tests::{PATIENCE, eventually};
+
+fn learner(scratch: &Scratch, setting: Setting) -> Learner {
+    scratch.learner_with("run", setting, &["--listen", "tcp/127.0.0.1:0", "--evaluators", "2"])
+}
+
+/// The processes that a process has started.
+fn children(of: u32) -> Vec<u32> {
+    let list = fs::read_to_string(format!("/proc/{of}/task/{of}/children")).unwrap_or_default();
+    list.split_whitespace().map(|id| id.parse().unwrap()).collect()
+}
+
+/// Whether none of them runs; one that was killed and not yet waited for does not.
+fn are_gone(processes: &[u32]) -> Option<()> {
+    let runs = |id: &u32| {
+        let stat = fs::read_to_string(format!("/proc/{id}/stat")).unwrap_or_default();
+        stat.split(") ").nth(1).is_some_and(|state| !state.starts_with('Z'))
+    };
+    (!processes.iter().any(runs)).then_some(())
+}
+
+/// The two evaluators of a learner, once there are new scores.
+fn at_work(learner: &Learner) -> Vec<u32> {
+    learner.wait_for_scores(learner.scores().len());
+    let processes = children(learner.process.id());
+    assert_eq!(processes.len(), 2);
+    processes
+}
+
+#[test]
+fn one_command_trains_and_evaluates() {
+    let scratch = Scratch::new();
+    let mut learner = learner(&scratch, SHORT);
+    learner.assert_completes(&SHORT, PATIENCE);
+    for number in [1, 2] {
+        let log = fs::read_to_string(learner.run_dir.join(format!("evaluator-{number}.log"))).unwrap();
+        assert!(log.contains("ready to serve") && log.contains("leaving"), "{log}");
+    }
+}
+
+#[test]
+fn evaluators_end_with_their_learner_however_it_ends() {
+    let scratch = Scratch::new();
+    for signal in ["INT", "KILL"] {
+        let mut learner = learner(&scratch, ENDLESS);
+        let evaluators = at_work(&learner);
+        learner.process.signal(signal);
+        let status = learner.process.wait(PATIENCE);
+        assert_eq!(status.code(), (signal == "INT").then_some(75));
+        eventually("the evaluators are gone", PATIENCE, || are_gone(&evaluators));
+    }
+    let mut learner = learner(&scratch, ENDLESS);
+    learner.process.wait_for_log("goes on after step", PATIENCE);
+    learner.assert_scores_are_distinct();
+    learner.process.terminate(PATIENCE);
+}
+
+#[test]
+fn one_that_dies_is_told_with_its_log() {
+    let scratch = Scratch::new();
+    let learner = learner(&scratch, ENDLESS);
+    let evaluators = at_work(&learner);
+    std::process::Command::new("kill").args(["-KILL", &evaluators[0].to_string()]).status().unwrap();
+    let line = learner.process.wait_for_log("an evaluator has ended", PATIENCE);
+    assert!(line.contains("signal: 9") && line.contains("evaluator-"), "{line}");
+    let scored = learner.scores().len();
+    learner.wait_for_scores(scored + 20);
+}
+
+#[test]
+fn two_learners_share_a_machine_without_being_told_ports() {
+    let scratch = Scratch::new();
+    let start = |run| scratch.learner_with(run, SHORT, &["--evaluators", "1"]);
+    let mut learners = [start("one"), start("two")];
+    for learner in &mut learners {
+        learner.assert_completes(&SHORT, PATIENCE);
+    }
+}
