@@ -41,7 +41,7 @@ enum Command {
 #[derive(Debug, Args)]
 struct CollectArgs {
     /// Environment to act in: hopper, halfcheetah or walker2d
-    #[arg(long, value_name = "NAME", value_parser = environment::find)]
+    #[arg(long, value_name = "NAME", value_parser = collect::environment)]
     env: &'static EnvironmentSpec,
     /// The file to write. It appears when it is complete
     #[arg(long, value_name = "FILE")]

@@ -39,7 +39,7 @@ pub enum Command {
     Train(Box<TrainArgs>),
     /// List tasks and algorithms, or print every value that an algorithm has for a task
     Presets(PresetsArgs),
-    /// Datasets by name: list them, fetch one
+    /// Datasets: list the names, fetch one, inspect a file
     #[command(subcommand)]
     Datasets(DatasetsCommand),
     /// Print the scores of finished or running runs, their summary over seeds, and the paper's figures for the same tasks

@@ -1,6 +1,7 @@
 //! The learner's commands, from the command line to the exit. All of it runs on the main thread.
 
 mod doctor;
+mod outside;
 mod train;
 
 use std::fmt::Alignment::{Left, Right};

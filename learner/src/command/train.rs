@@ -7,27 +7,20 @@ use anyhow::{Context, anyhow};
 use quad_dataset::{DatasetError, ReadOptions, Transitions, environment};
 use quad_policy::Precision;
 use quad_protocol::Name;
-use quad_service::{
-    Certificates, CertificatesError, Endpoints, Health, Hint, Role, SessionError, default_endpoint, hinted,
-    stay_in_background, unfinished,
-};
+use quad_service::{Health, Hint, hinted, stay_in_background, unfinished};
 use tokio::sync::mpsc;
 use tracing::{debug, info, warn};
 
+use super::outside::Outside;
 use crate::cli::{TrainArgs, print};
 use crate::config::{DatasetInfo, Experiment, Preset, RunConfig, RunInfo, hyperparameters};
 use crate::data::{LocalDataset, Source};
 use crate::report::{RunReport, learning_curves};
 use crate::run::{self, Begun, Log, Past, RunDir};
-use crate::service::{Display, Ending, Life, LocalEvaluators, MainLoop, Metrics, Run, STUCK, Threads, open_network};
+use crate::service::{Display, Ending, Life, MainLoop, Metrics, Run, STUCK, Threads};
 
-/// Where evaluators look by default.
-const DEFAULT_PORT: u16 = 7447;
 /// How long a run that has failed may write its report.
 const REPORT_PATIENCE: Duration = Duration::from_secs(5);
-/// For a run without evaluations, which needs no known port: several of them may run at a time.
-const ANY_PORT: u16 = 0;
-
 /// Does it; an error is a run that did not come to its end.
 pub fn train(args: &TrainArgs) -> anyhow::Result<()> {
     let preset = Preset::read(args.preset())?;
@@ -41,8 +34,7 @@ pub fn train(args: &TrainArgs) -> anyhow::Result<()> {
     };
     let name = run_name(&path)?;
     let begun = run::open(&path, args.fresh)?;
-    let endpoints = endpoints(args, experiment.eval_interval)?;
-    let evaluators = LocalEvaluators::new(args.evaluators)?;
+    let outside = Outside::new(args, experiment.eval_interval)?;
 
     args.device.check(experiment.precision)?;
     let dataset = source.obtain().hint(record_hint(&experiment))?;
@@ -65,6 +57,12 @@ pub fn train(args: &TrainArgs) -> anyhow::Result<()> {
     {
         warn!("{warning}");
     }
+    let Experiment { environment: acts_in, eval_interval, .. } = &config.experiment;
+    if *eval_interval > 0 && environment::find(acts_in).is_err() {
+        info!(
+            "scores come from evaluators that have the environment {acts_in}, which only Python's can (docs/python.md)"
+        );
+    }
     if !config.experiment.precision.is_available() {
         warn!("{}", Precision::UNAVAILABLE);
     }
@@ -73,7 +71,7 @@ pub fn train(args: &TrainArgs) -> anyhow::Result<()> {
     // Zenoh and the training thread have threads of their own; this runtime serves the metrics and the main loop.
     let mut runtime = tokio::runtime::Builder::new_multi_thread();
     let runtime = runtime.worker_threads(2).on_thread_start(stay_in_background).enable_all().build()?;
-    let ended = runtime.block_on(run_to_its_end(args, endpoints, evaluators, &path, begun, name, &config, transitions));
+    let ended = runtime.block_on(run_to_its_end(args, outside, &path, begun, name, &config, transitions));
     let concluded = ended.and_then(|(run_dir, ending)| conclude(&run_dir, &config, ending));
     // Without waiting for a thread that waits for a broken disk.
     runtime.shutdown_background();
@@ -102,8 +100,7 @@ fn check_batch(transitions: &Transitions, experiment: &Experiment) -> anyhow::Re
 
 async fn run_to_its_end(
     args: &TrainArgs,
-    endpoints: Endpoints,
-    evaluators: LocalEvaluators,
+    mut outside: Outside,
     path: &Path,
     begun: Option<Begun>,
     name: Name,
@@ -114,16 +111,7 @@ async fn run_to_its_end(
     let (metrics, registry) = Metrics::new(&name, steps, config.experiment.definition()?.metrics)?;
     let health = Health::default();
     let server = quad_service::serve_metrics(args.metrics, registry, health.clone()).await?;
-    let mut endpoints = endpoints;
-    let mut opening = open_network(&endpoints).await;
-    if opening.is_err() && args.listen.is_none() && args.connect.is_none() {
-        info!("another program, perhaps a learner, has port {DEFAULT_PORT}; taking a free one");
-        endpoints.listen = vec![default_endpoint(endpoints.certificates.as_ref(), ANY_PORT)];
-        opening = open_network(&endpoints).await;
-    }
-    let opening = opening.hint_of(|error| {
-        error.downcast_ref().map_or("join a router with --connect, or listen with --listen", SessionError::hint)
-    })?;
+    let opening = outside.open().await?;
     // From here on nothing outside can be wrong any more, so a refused start leaves no folder behind.
     let (run_dir, scores, past) = take_up(path, begun, args.fresh, config)?;
     let (tell, events) = mpsc::unbounded_channel();
@@ -138,12 +126,12 @@ async fn run_to_its_end(
         display: Display::start(metrics.clone(), steps),
         metrics,
         metrics_address: server.address.to_string(),
-        endpoints,
+        endpoints: outside.endpoints,
         events,
         threads,
         beat: health.part("main", STUCK),
         health,
-        evaluators,
+        evaluators: outside.evaluators,
     };
     Ok((run_dir, main_loop.run(opening).await))
 }
@@ -162,25 +150,6 @@ fn take_up(path: &Path, begun: Option<Begun>, fresh: bool, config: &RunConfig) -
 /// Milliseconds since 1970.
 fn now() -> anyhow::Result<u64> {
     Ok(SystemTime::now().duration_since(UNIX_EPOCH)?.as_millis() as u64)
-}
-
-fn endpoints(args: &TrainArgs, eval_interval: u64) -> anyhow::Result<Endpoints> {
-    let certificates = args.certificates.as_deref().map(|folder| Certificates::read(folder, Role::Learner));
-    let certificates = certificates.transpose().hint_of(CertificatesError::hint)?;
-    let port = if eval_interval == 0 { ANY_PORT } else { DEFAULT_PORT };
-    let listen = match (&args.listen, &args.connect) {
-        (None, None) => vec![default_endpoint(certificates.as_ref(), port)],
-        (listen, _) => Vec::from_iter(listen.clone()),
-    };
-    let endpoints = Endpoints { listen, connect: Vec::from_iter(args.connect.clone()), certificates };
-    endpoints.check().hint_of(SessionError::hint)?;
-    if let Some(endpoint) = endpoints.open_to_all() {
-        warn!(
-            "every machine that reaches {endpoint} may read weights and send scores: in a network that you do not trust, use \
-             --certificates DIR (docs/security.md)"
-        );
-    }
-    Ok(endpoints)
 }
 
 /// Writes the report, however the run ended; a run that did not complete is an error.

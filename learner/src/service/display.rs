@@ -15,6 +15,8 @@ const REDRAW: Duration = Duration::from_millis(250);
 const LINE: Duration = Duration::from_secs(5);
 /// The rate is measured over so long.
 const RATE_WINDOW: Duration = Duration::from_secs(15);
+/// After so long it is told how long the whole training takes.
+const FORETELL: Duration = Duration::from_secs(3);
 /// How many of the newest evaluations are shown.
 const SCORES_SHOWN: usize = 3;
 
@@ -28,6 +30,8 @@ pub(crate) struct Display {
     /// Newest last: gradient step and mean score.
     scores: VecDeque<(u64, f64)>,
     last_line: Instant,
+    /// Whether the whole training's length was told.
+    foretold: bool,
 }
 
 impl Display {
@@ -41,7 +45,15 @@ impl Display {
             }
             bar
         });
-        Self { metrics, steps, bar, samples: VecDeque::new(), scores: VecDeque::new(), last_line: Instant::now() }
+        Self {
+            metrics,
+            steps,
+            bar,
+            samples: VecDeque::new(),
+            scores: VecDeque::new(),
+            last_line: Instant::now(),
+            foretold: false,
+        }
     }
 
     /// How often [`tick`](Self::tick) wants to be called.
@@ -73,6 +85,7 @@ impl Display {
         while self.samples.front().is_some_and(|(then, _)| now.duration_since(*then) > RATE_WINDOW) {
             self.samples.pop_front();
         }
+        self.foretell(step, now);
         match &self.bar {
             Some(bar) => {
                 bar.set_position(step);
@@ -85,6 +98,20 @@ impl Display {
                 info!("step {step}/{} ({percent:.0} %), {training}, {evaluation}", self.steps);
             }
             None => {}
+        }
+    }
+
+    /// Says once how long it takes, if that is longer than a minute: the user may have meant fewer steps.
+    fn foretell(&mut self, step: u64, now: Instant) {
+        let Some(&(begin, first)) = self.samples.front() else { return };
+        let rate = self.rate();
+        if self.foretold || now.duration_since(begin) < FORETELL || step == first || rate <= 0.0 {
+            return;
+        }
+        self.foretold = true;
+        let left = Duration::from_secs_f64((self.steps - step.min(self.steps)) as f64 / rate);
+        if left > Duration::from_secs(60) {
+            self.say(&format!("{rate:.1} steps/s: this takes about {}", HumanDuration(left)));
         }
     }
 

@@ -45,5 +45,5 @@ pub(crate) use duplicate::Life;
 pub(crate) use local_evaluators::LocalEvaluators;
 pub(crate) use main_loop::{Ending, MainLoop};
 pub(crate) use metrics::Metrics;
-pub(crate) use network::open_network;
+pub(crate) use network::{Opening, open_network};
 pub(crate) use threads::{Run, STUCK, Threads};

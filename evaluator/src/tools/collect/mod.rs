@@ -13,6 +13,7 @@ mod search;
 use std::path::Path;
 use std::time::Instant;
 
+use quad_dataset::environment::find;
 use quad_dataset::{D4rlWriter, EnvironmentSpec, Metadata};
 use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;
@@ -38,6 +39,15 @@ pub struct Summary {
     pub policies: usize,
     /// Wall-clock time of it all.
     pub seconds: f64,
+}
+
+/// The environment of that name, if it can be recorded in.
+///
+/// # Errors
+/// It cannot; the text says which can.
+pub fn environment(name: &str) -> Result<&'static EnvironmentSpec, String> {
+    let found = find(name).ok().filter(|spec| Recipe::of(spec).is_some());
+    found.ok_or_else(|| format!("what can be recorded is {}", Recipe::environments()))
 }
 
 /// Trains, then records at least `transitions` transitions, in whole episodes, to `path`.

@@ -15,7 +15,7 @@ use crate::sim;
 
 const ONE: &str = "what can be scored is a file like RUN/snapshots/step_000020000.safetensors, as `learner train` of this \
                    version writes them";
-const OTHER_ENVIRONMENT: &str = "--env NAME makes it act in another environment";
+const OTHER_ENVIRONMENT: &str = "in an environment of your own it acts from Python (docs/python.md)";
 const OTHER_CHOICE: &str = "score it without --candidates, --rule and --value";
 const RANGE: &str = "--episodes takes the place of what the file says";
 

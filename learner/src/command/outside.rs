@@ -1,0 +1,72 @@
+//! What a run has to do with the world outside: where it meets evaluators, and those that it starts itself.
+
+use quad_service::{Certificates, CertificatesError, Endpoints, Hint, Role, SessionError, default_endpoint};
+use tracing::{info, warn};
+
+use crate::cli::TrainArgs;
+use crate::service::{LocalEvaluators, Opening, open_network};
+
+/// Where evaluators look by default.
+const DEFAULT_PORT: u16 = 7447;
+/// For a run that needs no known port: several of them may run at a time.
+const ANY_PORT: u16 = 0;
+
+/// What was asked for.
+pub(super) struct Outside {
+    /// Where it listens or connects.
+    pub endpoints: Endpoints,
+    /// What it is to start.
+    pub evaluators: LocalEvaluators,
+    /// Whether the user has left it to the learner where to listen.
+    is_default: bool,
+}
+
+impl Outside {
+    /// As the command line says.
+    ///
+    /// # Errors
+    /// Endpoints or certificates that cannot be used, or no program to start.
+    pub fn new(args: &TrainArgs, eval_interval: u64) -> anyhow::Result<Self> {
+        Ok(Self {
+            endpoints: endpoints(args, eval_interval)?,
+            evaluators: LocalEvaluators::new(args.evaluators)?,
+            is_default: args.listen.is_none() && args.connect.is_none(),
+        })
+    }
+
+    /// Starts to open the session. Where the usual port is taken, as on a machine that several learners share, it takes another.
+    ///
+    /// # Errors
+    /// The learner cannot listen.
+    pub async fn open(&mut self) -> anyhow::Result<Opening> {
+        let mut opening = open_network(&self.endpoints).await;
+        if opening.is_err() && self.is_default {
+            info!("another program, perhaps a learner, has port {DEFAULT_PORT}; taking a free one");
+            self.endpoints.listen = vec![default_endpoint(self.endpoints.certificates.as_ref(), ANY_PORT)];
+            opening = open_network(&self.endpoints).await;
+        }
+        opening.hint_of(|error| {
+            error.downcast_ref().map_or("join a router with --connect, or listen with --listen", SessionError::hint)
+        })
+    }
+}
+
+/// Where the learner listens or connects, as the command line says.
+fn endpoints(args: &TrainArgs, eval_interval: u64) -> anyhow::Result<Endpoints> {
+    let certificates = args.certificates.as_deref().map(|folder| Certificates::read(folder, Role::Learner));
+    let certificates = certificates.transpose().hint_of(CertificatesError::hint)?;
+    let port = if eval_interval == 0 { ANY_PORT } else { DEFAULT_PORT };
+    let listen = match (&args.listen, &args.connect) {
+        (None, None) => vec![default_endpoint(certificates.as_ref(), port)],
+        (listen, _) => Vec::from_iter(listen.clone()),
+    };
+    let endpoints = Endpoints { listen, connect: Vec::from_iter(args.connect.clone()), certificates };
+    endpoints.check().hint_of(SessionError::hint)?;
+    if let Some(endpoint) = endpoints.open_to_all() {
+        warn!(
+            "every machine that reaches {endpoint} may read weights and send scores: in a network that you do not trust, use \
+             --certificates DIR (docs/security.md)"
+        );
+    }
+    Ok(endpoints)
+}
