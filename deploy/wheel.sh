@@ -10,7 +10,7 @@ cd "$(dirname "$0")/.."
 . deploy/portable.sh
 
 # What maturin packs beside the module; git ignores both.
-DATA=python/quad_rl.data
+DATA=python/quad_rl._quad_rl.data
 LICENSES=python/licenses
 
 build_portable

@@ -1,5 +1,7 @@
 """Evaluators for environments that Python moves."""
 
+from __future__ import annotations
+
 import json
 import os
 import subprocess
@@ -7,7 +9,12 @@ import sys
 import threading
 import time
 
-import cloudpickle
+from collections.abc import Callable, Sequence
+from os import PathLike
+from types import TracebackType
+from typing import Any
+
+import cloudpickle  # type: ignore[import-untyped]
 
 from quad_rl import _quad_rl
 
@@ -28,8 +35,17 @@ class Evaluators:
     Arguments are those of `quad_rl.evaluate`.
     """
 
-    def __init__(self, name, environment, *, connect="tcp/127.0.0.1:7447", certificates=None, workers=None,
-                 score="return", precision="f32"):
+    def __init__(
+        self,
+        name: str,
+        environment: str | Callable[[int], Any],
+        *,
+        connect: str | Sequence[str] = "tcp/127.0.0.1:7447",
+        certificates: str | PathLike[str] | None = None,
+        workers: int | None = None,
+        score: str | tuple[float, float] = "return",
+        precision: str = "f32",
+    ) -> None:
         if name in _quad_rl.simulated():
             raise ValueError(f'"{name}" is an environment that `evaluator serve` simulates; choose another name')
         if isinstance(environment, str):
@@ -44,23 +60,27 @@ class Evaluators:
         task = {"name": name, "make": environment, "score": _score(score), "seed": 0, "serve": serve}
         self._payload = [json.dumps(sys.path).encode(), cloudpickle.dumps(task)]
         self._stopping = threading.Event()
-        self._error = None
-        self._processes = [None] * workers
+        self._error: Exception | None = None
+        self._processes: list[subprocess.Popen[bytes]] = []
+        self._watcher = threading.Thread(target=self._watch, daemon=True)
         try:
-            self._processes = [self._start() for _ in range(workers)]
+            for _ in range(workers):
+                self._processes.append(self._start())
             for process in self._processes:
                 self._sizes(process)
         except BaseException:
             self.stop()
             raise
-        self._watcher = threading.Thread(target=self._watch, daemon=True)
         self._watcher.start()
 
-    def _start(self):
+    def _start(self) -> subprocess.Popen[bytes]:
         environment = {"RAYON_NUM_THREADS": "1", "OMP_NUM_THREADS": "1", **os.environ}
         # A session of its own: a terminal's Ctrl-C is this process's to pass on.
-        process = subprocess.Popen([sys.executable, "-m", "quad_rl._worker"], stdin=subprocess.PIPE,
-                                   stdout=subprocess.PIPE, env=environment, start_new_session=True)
+        command = [sys.executable, "-m", "quad_rl._worker"]
+        process = subprocess.Popen(
+            command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, env=environment, start_new_session=True
+        )
+        assert process.stdin
         try:
             for part in self._payload:
                 process.stdin.write(len(part).to_bytes(8, "little") + part)
@@ -69,28 +89,29 @@ class Evaluators:
             pass  # It has ended, which its answer tells.
         return process
 
-    def _sizes(self, process):
+    def _sizes(self, process: subprocess.Popen[bytes]) -> None:
+        assert process.stdout
         answer = process.stdout.readline()
         if not answer:
             raise RuntimeError("a worker ended before it had an environment; its standard error says why")
         self._check(answer)
 
-    def _check(self, line):
+    def _check(self, line: bytes) -> None:
         error = json.loads(line).get("error")
         if error is not None:
             raise RuntimeError(error)
 
-    def _watch(self):
+    def _watch(self) -> None:
         """Starts a worker again that was killed. One that cannot work ends them all."""
         while not self._stopping.wait(_AGAIN):
             for place, process in enumerate(self._processes):
                 if process.poll() is None:
                     continue
+                assert process.stdout
                 try:
                     for line in process.stdout:
                         self._check(line)
-                    process.stdin.close()
-                    process.stdout.close()
+                    _close(process)
                     print(f"quad_rl: a worker ended with {process.returncode}; it is started again", file=sys.stderr)
                     self._processes[place] = self._start()
                     self._sizes(self._processes[place])
@@ -99,7 +120,7 @@ class Evaluators:
                     self._stopping.set()
                     return
 
-    def wait(self):
+    def wait(self) -> None:
         """Waits until the workers are stopped: by Ctrl-C, after which they leave in order, or by `stop()` of another thread.
 
         Raises RuntimeError if they cannot work.
@@ -107,42 +128,42 @@ class Evaluators:
         try:
             while not self._stopping.wait(0.2):
                 pass
+        except KeyboardInterrupt:
+            pass
         finally:
             self.stop()
         if self._error is not None:
             raise self._error
 
-    def stop(self):
+    def stop(self) -> None:
         """Lets the workers deliver the scores that they have, hand back the jobs that they have begun, and end."""
         self._stopping.set()
-        watcher = getattr(self, "_watcher", None)
-        if watcher is not None and watcher is not threading.current_thread():
-            watcher.join()
-        there = [process for process in self._processes if process is not None]
-        for process in there:
-            try:
-                process.stdin.close()
-            except OSError:
-                pass
+        if self._watcher.is_alive():
+            self._watcher.join()
+        for process in self._processes:
+            _close(process)
         until = time.monotonic() + _LEAVE
-        for process in there:
+        for process in self._processes:
             try:
                 process.wait(max(0.0, until - time.monotonic()))
             except subprocess.TimeoutExpired:
                 process.kill()
                 process.wait()
-            process.stdout.close()
+            if process.stdout:
+                process.stdout.close()
 
-    def __enter__(self):
+    def __enter__(self) -> Evaluators:
         return self
 
-    def __exit__(self, *_):
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
         self.stop()
         if self._error is not None:
             raise self._error
 
 
-def evaluate(name, environment, **arguments):
+def evaluate(name: str, environment: str | Callable[[int], Any], **arguments: Any) -> None:
     """Evaluates learners' policies in an environment of yours until Ctrl-C: `evaluator serve` for any environment.
 
     name: what the learner's run calls the environment: `learner train --task own-data --set environment=NAME`.
@@ -162,20 +183,29 @@ def evaluate(name, environment, **arguments):
     Evaluators(name, environment, **arguments).wait()
 
 
+def _close(process: subprocess.Popen[bytes]) -> None:
+    """Tells a worker to end."""
+    try:
+        if process.stdin:
+            process.stdin.close()
+    except OSError:
+        pass  # It has ended.
+
+
 class _Gymnasium:
     """Makes environments by their id."""
 
-    def __init__(self, name):
+    def __init__(self, name: str) -> None:
         self.name = name
 
-    def __call__(self, _seed):
+    def __call__(self, _seed: int) -> Any:
         import gymnasium
 
         return gymnasium.make(self.name)
 
 
-def _score(score):
-    if score in ("return", "success"):
+def _score(score: str | tuple[float, float]) -> str | tuple[float, float]:
+    if isinstance(score, str) and score in ("return", "success"):
         return score
     try:
         low, high = (float(value) for value in score)

@@ -4,15 +4,20 @@
 answers with one line of JSON: the sizes of the environment, or an error.
 """
 
+from __future__ import annotations
+
 import json
 import os
 import signal
 import sys
 import threading
 import traceback
+from collections.abc import Callable
+from typing import IO, Any
 
-import cloudpickle
+import cloudpickle  # type: ignore[import-untyped]
 import numpy as np
+from numpy.typing import NDArray
 
 from quad_rl import _quad_rl
 
@@ -21,7 +26,7 @@ class EnvironmentFailed(RuntimeError):
     """What the user's code raised, in one line, as a learner is told."""
 
 
-def _call(function, *arguments, **keywords):
+def _call(function: Callable[..., Any], *arguments: Any, **keywords: Any) -> Any:
     """Calls the user's code. What it raises goes to this process's log as it is, and to the learner in one line."""
     try:
         return function(*arguments, **keywords)
@@ -35,10 +40,10 @@ def _call(function, *arguments, **keywords):
 class Made:
     """An environment of the user's, with observations and actions as plain rows of numbers."""
 
-    def __init__(self, environment, score):
+    def __init__(self, environment: Any, score: str | tuple[float, float]) -> None:
         self.environment = environment
         self.score_rule = score
-        self.info = {}
+        self.info: dict[str, Any] = {}
         self.broken = False
         self.space = getattr(environment, "observation_space", None)
         action_space = getattr(environment, "action_space", None)
@@ -47,7 +52,7 @@ class Made:
             raise EnvironmentFailed(f"actions must be a box of numbers (gymnasium.spaces.Box), not {action_space}")
         self.bounds = (action_space.low, action_space.high) if hasattr(action_space, "low") else None
 
-    def sizes(self):
+    def sizes(self) -> tuple[int, int] | None:
         """Numbers in an observation and in an action, if the environment says them."""
         if self.action_shape is None or self.space is None:
             return None
@@ -58,21 +63,21 @@ class Made:
             return int(flatdim(self.space)), int(np.prod(self.action_shape))
         return int(np.prod(shape)), int(np.prod(self.action_shape))
 
-    def _row(self, observation):
+    def _row(self, observation: Any) -> NDArray[np.float64]:
         if self.space is not None and getattr(self.space, "shape", None) is None:
             from gymnasium.spaces import flatten
 
             observation = flatten(self.space, observation)
         return np.ascontiguousarray(observation, dtype=np.float64).ravel()
 
-    def reset(self, seed):
+    def reset(self, seed: int) -> NDArray[np.float64]:
         # Many simulators take seeds of 32 bits at most.
         self.broken = True
         observation, _ = _call(self.environment.reset, seed=seed % 2**31)
         self.broken = False
         return self._row(observation)
 
-    def step(self, action):
+    def step(self, action: NDArray[np.float32]) -> tuple[NDArray[np.float64], float, bool, bool]:
         if self.action_shape is not None:
             action = action.reshape(self.action_shape)
         if self.bounds is not None:
@@ -82,7 +87,7 @@ class Made:
         self.broken = False
         return self._row(observation), float(reward), bool(terminated), bool(truncated)
 
-    def score(self, episode_return):
+    def score(self, episode_return: float) -> float:
         if self.score_rule == "return":
             return float(episode_return)
         if self.score_rule == "success":
@@ -90,37 +95,37 @@ class Made:
             if success is None:
                 raise EnvironmentFailed('the last info of an episode has neither "success" nor "is_success"')
             return 100.0 * bool(success)
-        low, high = self.score_rule
+        low, high = map(float, self.score_rule)
         return 100.0 * (episode_return - low) / (high - low)
 
 
 class Factory:
     """Makes environments, and keeps those that are free: making one may take seconds."""
 
-    def __init__(self, make, score):
+    def __init__(self, make: Callable[[int], Any], score: str | tuple[float, float]) -> None:
         self.make_environment = make
         self.score = score
-        self.seed = None
-        self.free = []
+        self.seed: int | None = None
+        self.free: list[Made] = []
 
-    def make(self, seed):
+    def make(self, seed: int) -> Made:
         if seed != self.seed:
             self.close()
             self.seed = seed
         return self.free.pop() if self.free else Made(_call(self.make_environment, seed), self.score)
 
-    def release(self, made):
+    def release(self, made: Made) -> None:
         if made.broken:
             _close(made)
         else:
             self.free.append(made)
 
-    def close(self):
+    def close(self) -> None:
         while self.free:
             _close(self.free.pop())
 
 
-def _close(made):
+def _close(made: Made) -> None:
     if hasattr(made.environment, "close"):
         try:
             _call(made.environment.close)
@@ -128,23 +133,23 @@ def _close(made):
             pass  # It is in the log, and the environment is not needed any more.
 
 
-def _read(stream):
+def _read(stream: IO[bytes]) -> bytes:
     length = int.from_bytes(stream.read(8), "little")
     return stream.read(length)
 
 
-def _end_with(stream):
+def _end_with(stream: IO[bytes]) -> None:
     """Ends this process in order when the process that started it closes the stream, or is gone."""
     stream.read()
     os.kill(os.getpid(), signal.SIGTERM)
 
 
-def main():
+def main() -> None:
     # What the user's code prints must not get into the answer.
     answer = os.fdopen(os.dup(1), "w")
     os.dup2(2, 1)
 
-    def tell(**what):
+    def tell(**what: Any) -> None:
         print(json.dumps(what), file=answer, flush=True)
 
     paths, task = _read(sys.stdin.buffer), _read(sys.stdin.buffer)

@@ -1,0 +1,196 @@
+"""Evaluators of environments that Python moves: real learners, real workers, real faults."""
+
+import json
+import os
+import pathlib
+import random
+import signal
+import subprocess
+import sys
+import time
+
+import numpy as np
+import pytest
+
+import quad_rl
+
+OBSERVATION, ACTION = 11, 3
+SMALL = ["--agent", "actor.hidden=[16]", "--agent", "critic.hidden=[16]", "--agent", "critics=2", "--set", "batch_size=16"]
+
+
+class Walk:
+    """Ten lines, no Gymnasium: walk to the origin."""
+
+    def reset(self, seed=None):
+        self.state, self.steps = np.random.default_rng(seed).normal(size=OBSERVATION), 0
+        return self.state, {}
+
+    def step(self, action):
+        self.steps += 1
+        self.state = self.state + 0.1 * np.resize(action, OBSERVATION)
+        info = {"success": bool(self.state[0] > 0)}
+        return self.state, -float(np.abs(self.state).sum()), False, self.steps >= 20, info
+
+
+class Learner:
+    """A learner at work, and the folder of its run."""
+
+    def __init__(self, folder, data, *arguments, environment="walk", steps=60, interval=20):
+        self.folder = folder
+        command = ["learner", "train", "--task", "own-data", "--set", f"environment={environment}", "--dataset", str(data)]
+        command += ["--run-dir", str(folder), "--listen", "tcp/127.0.0.1:0", *SMALL]
+        command += ["--steps", str(steps), "--eval-interval", str(interval), "--episodes", "8", *arguments]
+        self.process = subprocess.Popen(command, stderr=subprocess.PIPE, stdout=subprocess.DEVNULL, text=True)
+        endpoints = folder / "endpoints.json"
+        wait(lambda: endpoints.exists() or self.process.poll() is not None)
+        self.endpoint = json.loads(endpoints.read_text())["zenoh"][0]
+
+    def end(self, timeout=60):
+        """Its exit code and what it said."""
+        said = self.process.communicate(timeout=timeout)[1]
+        return self.process.returncode, said
+
+    def scores(self):
+        path = self.folder / "scores.jsonl"
+        return [json.loads(line) for line in path.read_text().splitlines()] if path.exists() else []
+
+    def snapshot(self, step):
+        return self.folder / f"snapshots/step_{step:09}.safetensors"
+
+
+def wait(condition, seconds=60):
+    until = time.monotonic() + seconds
+    while not condition():
+        assert time.monotonic() < until, "it took too long"
+        time.sleep(0.02)
+
+
+def verified(folder):
+    return subprocess.run(["learner", "verify", str(folder)], capture_output=True, timeout=60).returncode == 0
+
+
+def by_hand(policy, seed):
+    """The return of an episode, as an evaluator runs it."""
+    walk, episode = Walk(), policy.begin([seed])
+    observation, _ = walk.reset(seed=seed % 2**31)
+    total, truncated = 0.0, False
+    while not truncated:
+        observation, reward, _, truncated, _ = walk.step(episode.act(observation[None])[0])
+        total += reward
+    return total
+
+
+def test_a_class_of_ten_lines_is_scored_as_by_hand(tmp_path, data):
+    learner = Learner(tmp_path / "run", data)
+    with quad_rl.Evaluators("walk", lambda seed: Walk(), connect=learner.endpoint, workers=2):
+        code, said = learner.end()
+    assert code == 0, said
+    scores = learner.scores()
+    assert len(scores) == 3 * 8 and verified(learner.folder)
+    policy = quad_rl.Policy.load(learner.snapshot(60))
+    for score in scores:
+        assert score["score"] == score["return"] and score["length"] == 20
+        if score["step"] == 60:
+            assert score["return"] == by_hand(policy, score["seed"])
+
+
+def test_gymnasium_by_id_with_references(tmp_path, data):
+    learner = Learner(tmp_path / "run", data, environment="hopper-v5", steps=20)
+    with quad_rl.Evaluators("hopper-v5", "Hopper-v5", connect=learner.endpoint, workers=1, score=(0.0, 50.0)):
+        code, said = learner.end()
+    assert code == 0, said
+    for score in learner.scores():
+        assert score["score"] == pytest.approx(2.0 * score["return"], rel=1e-12) and score["return"] > 1.0
+
+
+def test_success_is_a_rate(tmp_path, data):
+    learner = Learner(tmp_path / "run", data, steps=20)
+    with quad_rl.Evaluators("walk", lambda seed: Walk(), connect=learner.endpoint, workers=1, score="success"):
+        assert learner.end()[0] == 0
+    scores = {score["score"] for score in learner.scores()}
+    assert scores == {0.0, 100.0}
+
+
+def test_what_the_environment_raises_is_told_and_costs_an_attempt(tmp_path, data):
+    marker = tmp_path / "broken"
+
+    class Breaks(Walk):
+        def step(self, action):
+            if self.steps == 5 and not marker.exists():
+                marker.touch()
+                raise ValueError("the cable is loose")
+            return super().step(action)
+
+    learner = Learner(tmp_path / "run", data, steps=20)
+    with quad_rl.Evaluators("walk", lambda seed: Breaks(), connect=learner.endpoint, workers=1):
+        code, said = learner.end()
+    assert code == 0 and len(learner.scores()) == 8, said
+    assert "ValueError: the cable is loose (test_evaluate.py:" in said and "in step" in said, said
+
+
+def test_workers_that_are_killed_cost_no_score_and_come_again(tmp_path, data):
+    # One pool for two runs: Python's workers have one environment, the programs' evaluators the other.
+    ours = Learner(tmp_path / "ours", data, steps=3000)
+    hopper = ["--task", "hopper-demo", "--set", "environment=hopper"]
+    theirs = Learner(tmp_path / "theirs", data, *hopper[2:], environment="hopper", steps=1000)
+    both = [ours.endpoint, theirs.endpoint]
+    command = ["evaluator", "serve", *[word for endpoint in both for word in ("--connect", endpoint)]]
+    programs = [subprocess.Popen(command, stderr=subprocess.DEVNULL) for _ in range(2)]
+    rng = random.Random(7)
+    with quad_rl.Evaluators("walk", lambda seed: Walk(), connect=both, workers=3) as evaluators:
+        for _ in range(20):
+            victims = [process.pid for process in evaluators._processes if process.poll() is None]
+            if victims:
+                os.kill(rng.choice(victims), signal.SIGKILL)
+            time.sleep(rng.uniform(0.0, 0.6))
+        for learner, scores in (ours, 150 * 8), (theirs, 50 * 8):
+            code, said = learner.end(120)
+            assert code == 0, said
+            assert len(learner.scores()) == scores and verified(learner.folder)
+    for program in programs:
+        program.terminate()
+        assert program.wait(20) == 0
+
+
+SCRIPT = """
+import quad_rl, test_evaluate
+quad_rl.evaluate("walk", lambda seed: test_evaluate.Walk(), connect="tcp/127.0.0.1:1", workers=2)
+"""
+
+
+def children(of):
+    return pathlib.Path(f"/proc/{of}/task/{of}/children").read_text().split()
+
+
+@pytest.mark.parametrize("by", [signal.SIGINT, signal.SIGKILL])
+def test_workers_end_with_the_process_that_started_them(by):
+    process = subprocess.Popen([sys.executable, "-c", SCRIPT], cwd=pathlib.Path(__file__).parent, stderr=subprocess.PIPE)
+    wait(lambda: len(children(process.pid)) == 2)
+    workers = [pathlib.Path("/proc") / worker / "stat" for worker in children(process.pid)]
+    for _ in range(2):  # Both are ready.
+        while b"ready to serve" not in process.stderr.readline():
+            assert process.poll() is None
+    process.send_signal(by)
+    assert process.wait(20) == (1 if by == signal.SIGKILL else 0) or process.returncode in (-by, 130, 1)
+    wait(lambda: all(not worker.exists() or ") Z" in worker.read_text() for worker in workers), 20)
+    process.stderr.close()
+
+
+def test_arguments_that_cannot_be_are_refused_at_once():
+    def refused(kind, words, *arguments, **keywords):
+        with pytest.raises(kind, match=words):
+            quad_rl.Evaluators(*arguments, **keywords)
+
+    refused(ValueError, "evaluator serve. simulates", "hopper", "Hopper-v5")
+    refused(ValueError, "a Gymnasium id, or a function", "walk", Walk())
+    refused(ValueError, "at least 1", "walk", lambda seed: Walk(), workers=0)
+    refused(ValueError, '"return", "success" or a pair', "walk", lambda seed: Walk(), score="best")
+    refused(ValueError, "not .3.0, 3.0.", "walk", lambda seed: Walk(), score=(3.0, 3.0))
+    refused(RuntimeError, "ZeroDivisionError", "walk", lambda seed: 1 // 0, workers=1)
+    refused(RuntimeError, "No module named|doesn't exist|NameNotFound", "walk", "NoSuch-v0", workers=1)
+    refused(RuntimeError, "Box", "walk", "CartPole-v1", workers=1)
+
+
+def test_workers_that_cannot_connect_say_why():
+    with pytest.raises(RuntimeError, match="udp"):
+        quad_rl.evaluate("walk", lambda seed: Walk(), connect="udp/127.0.0.1:1", workers=1)
