@@ -18,7 +18,7 @@ use crate::tools::verify::{self, Report, VerifyError};
 
 /// Runs policies in MuJoCo, and records datasets there.
 #[derive(Debug, Parser)]
-#[command(version, arg_required_else_help = true)]
+#[command(name = "evaluator", version, arg_required_else_help = true)]
 pub struct Cli {
     #[command(subcommand)]
     command: Command,

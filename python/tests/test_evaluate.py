@@ -4,6 +4,7 @@ import json
 import os
 import pathlib
 import random
+import re
 import signal
 import subprocess
 import sys
@@ -100,7 +101,7 @@ def test_gymnasium_by_id_with_references(tmp_path, data):
         code, said = learner.end()
     assert code == 0, said
     for score in learner.scores():
-        assert score["score"] == pytest.approx(2.0 * score["return"], rel=1e-12) and score["return"] > 1.0
+        assert score["score"] == pytest.approx(2.0 * score["return"], rel=1e-12) and score["return"] != 0.0
 
 
 def test_success_is_a_rate(tmp_path, data):
@@ -125,7 +126,7 @@ def test_what_the_environment_raises_is_told_and_costs_an_attempt(tmp_path, data
     with quad_rl.Evaluators("walk", lambda seed: Breaks(), connect=learner.endpoint, workers=1):
         code, said = learner.end()
     assert code == 0 and len(learner.scores()) == 8, said
-    assert "ValueError: the cable is loose (test_evaluate.py:" in said and "in step" in said, said
+    assert re.search(r'"walk" failed: ValueError: the cable is loose \(.*:\d+, in step\)', said), said
 
 
 def test_workers_that_are_killed_cost_no_score_and_come_again(tmp_path, data):

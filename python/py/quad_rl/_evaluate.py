@@ -114,7 +114,6 @@ class Evaluators:
                     _close(process)
                     print(f"quad_rl: a worker ended with {process.returncode}; it is started again", file=sys.stderr)
                     self._processes[place] = self._start()
-                    self._sizes(self._processes[place])
                 except (RuntimeError, OSError) as error:
                     self._error = error
                     self._stopping.set()

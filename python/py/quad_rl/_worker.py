@@ -50,7 +50,8 @@ class Made:
         self.action_shape = getattr(action_space, "shape", None)
         if action_space is not None and not self.action_shape:
             raise EnvironmentFailed(f"actions must be a box of numbers (gymnasium.spaces.Box), not {action_space}")
-        self.bounds = (action_space.low, action_space.high) if hasattr(action_space, "low") else None
+        low, high = getattr(action_space, "low", None), getattr(action_space, "high", None)
+        self.bounds = None if low is None or high is None else (low, high)
 
     def sizes(self) -> tuple[int, int] | None:
         """Numbers in an observation and in an action, if the environment says them."""
