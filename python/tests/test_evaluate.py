@@ -108,8 +108,11 @@ def test_success_is_a_rate(tmp_path, data):
     learner = Learner(tmp_path / "run", data, steps=20)
     with quad_rl.Evaluators("walk", lambda seed: Walk(), connect=learner.endpoint, workers=1, score="success"):
         assert learner.end()[0] == 0
-    scores = {score["score"] for score in learner.scores()}
-    assert scores == {0.0, 100.0}
+    scores = [score["score"] for score in learner.scores()]
+    assert set(scores) == {0.0, 100.0}
+    report = subprocess.run(["learner", "report", str(learner.folder)], capture_output=True, text=True, timeout=60).stdout
+    assert ["step", "episodes", "score", "return", "length"] in [line.split() for line in report.splitlines()]
+    assert f" {np.mean(scores):.2f} ± " in report and "dataset" not in report
 
 
 def test_what_the_environment_raises_is_told_and_costs_an_attempt(tmp_path, data):

@@ -40,6 +40,7 @@ fn draw(path: &Path, runs: &[RunReport]) -> Drawn {
     let (last_step, range) = limits(runs);
     let measure = match [true, false].map(|normalised| runs.iter().any(|run| run.normalised == normalised)) {
         [_, false] => "D4RL-normalised score",
+        [false, true] if runs.iter().any(|run| run.measure() == "score") => "score",
         [false, true] => "return",
         [true, true] => "D4RL-normalised score, or return",
     };

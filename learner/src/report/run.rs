@@ -78,6 +78,9 @@ pub struct RunReport {
     pub mean_last_5: Option<f64>,
     /// The same of those in the last 50,000 steps of the run; absent if it has no more steps than that.
     pub mean_last_50000_steps: Option<f64>,
+    /// Whether the evaluators' user decides what counts as a score, such as success, and it is not the return.
+    #[serde(skip)]
+    own_score: bool,
     #[serde(skip)]
     pub(super) precisions: BTreeSet<String>,
     #[serde(skip)]
@@ -121,6 +124,7 @@ impl RunReport {
         let last = |count: usize| mean(&complete[complete.len().checked_sub(count)?..]);
         let final_steps = experiment.steps.checked_sub(FINAL_STEPS).filter(|start| *start > 0);
         let in_final_steps = |start| mean(&complete[complete.partition_point(|(step, _)| *step <= start)..]);
+        let normalised = environment::find(&experiment.environment).is_ok();
         let precisions: BTreeSet<String> = lines.iter().map(precision).collect();
         Self {
             dir: path.to_owned(),
@@ -131,7 +135,8 @@ impl RunReport {
             agent,
             seed: experiment.seed,
             steps: experiment.steps,
-            normalised: environment::find(&experiment.environment).is_ok(),
+            normalised,
+            own_score: !normalised && lines.iter().any(|line| line.score != line.episode_return),
             scored_in: joined(&precisions),
             dataset_score: config.dataset.mean_score.unwrap_or(config.dataset.mean_return),
             mean_last_3: last(3),
@@ -175,23 +180,24 @@ impl RunReport {
         )
     }
 
-    /// What its scores are: normalised scores, or returns.
+    /// What its scores are: scores of a kind, or returns.
     pub fn measure(&self) -> &'static str {
-        if self.normalised { "score" } else { "return" }
+        if self.normalised || self.own_score { "score" } else { "return" }
     }
 
     /// The evaluations as a table for people.
     pub fn table(&self) -> String {
         let mut header = vec!["step", "episodes", self.measure(), "length"];
-        // Without reference returns the score is the return.
-        if self.normalised {
+        // Without reference returns the score is the return, unless the user counts something else.
+        let has_both = self.measure() == "score";
+        if has_both {
             header.insert(3, "return");
         }
         let mut table = Table::new(&Vec::from_iter(header.into_iter().map(|name| (name, Right))));
         for e in &self.evaluations {
             let episodes = e.episodes.to_string() + if e.complete { "" } else { " (part)" };
             let mut row = vec![e.step.to_string(), episodes, e.score.text(), format!("{:.1}", e.mean_length)];
-            if self.normalised {
+            if has_both {
                 row.insert(3, format!("{:.1}", e.mean_return));
             }
             table.push(row);
@@ -213,7 +219,7 @@ impl RunReport {
             ("last 3 evaluations:", self.mean_last_3),
             ("last 5 evaluations:", self.mean_last_5),
             ("last 50000 steps:", self.mean_last_50000_steps),
-            ("dataset:", Some(self.dataset_score)),
+            ("dataset:", (!self.own_score).then_some(self.dataset_score)),
         ] {
             if let Some(mean) = mean {
                 writeln!(text, "mean {} of the {name:19} {mean:.2}", self.measure()).ok();
