@@ -183,9 +183,15 @@ fn the_number_of_goals_stands_beside_the_score_where_a_run_has_one() {
 }
 
 #[test]
-fn scores_without_references_are_called_returns() {
+fn scores_without_references_are_called_returns_unless_they_are_something_else() {
     let mut run = small(0, 0.0).set(&[("experiment.environment", "my-robot".into())]);
     run.config["dataset"].as_table_mut().unwrap().remove("mean_score");
+    let Reported { text, .. } = report(std::slice::from_ref(&run));
+    assert!(text.contains("score  return") && text.contains("mean score of the last 5"), "{text}");
+    assert!(!text.contains("of the dataset"), "{text}");
+    for line in &mut run.scores {
+        line["return"] = line["score"].clone();
+    }
     let Reported { text, picture, .. } = report(&[run]);
     assert!(text.contains("mean return of the dataset") && !text.contains("score "), "{text}");
     assert!(!picture.contains("normalised"));
