@@ -14,7 +14,6 @@ import platform
 import statistics
 import subprocess
 import sys
-import time
 from pathlib import Path
 
 # Shapes, as in learner/benches/update.rs and evaluator/benches/rollout.rs.
@@ -80,14 +79,14 @@ def results(bench, names):
     """Runs those of a bench whose names match; yields what criterion calls each, and its median in seconds."""
     command = ["cargo", "bench", "--locked", "--workspace", "--quiet", "--bench", bench, "--", "--noplot", "--quiet"]
     quick = ["--warm-up-time", "0.3", "--measurement-time", "1", "--sample-size", "10", "--nresamples", "1000"]
-    began = time.time()
+    written = lambda: {path: path.stat().st_mtime_ns for path in Path("target/criterion").rglob("new/estimates.json")}
+    before = written()
     subprocess.run([*command, *quick, names], check=True, capture_output=True)
-    for folder in Path("target/criterion").rglob("new"):
-        estimates = folder / "estimates.json"
-        # What is older ran before, perhaps under a name that there is no more.
-        if estimates.stat().st_mtime >= began - 1:
+    for estimates, time in written().items():
+        # What has not changed ran before: another benchmark, or one of a name that there is no more.
+        if before.get(estimates) != time:
             median = json.loads(estimates.read_text())["median"]["point_estimate"] / 1e9
-            yield json.loads((folder / "benchmark.json").read_text()), median
+            yield json.loads(estimates.with_name("benchmark.json").read_text()), median
 
 
 def criterion(bench, names):
