@@ -13,6 +13,7 @@ use crate::doctor::{self, DoctorArgs};
 use crate::serve::{self, ServeArgs};
 use crate::sim::Simulations;
 use crate::tools::collect::{self, CollectError, Summary};
+use crate::tools::film::{self, FilmArgs};
 use crate::tools::score::{self, ScoreArgs};
 use crate::tools::verify::{self, Report, VerifyError};
 
@@ -28,6 +29,7 @@ pub struct Cli {
 enum Command {
     Serve(ServeArgs),
     Score(ScoreArgs),
+    Film(FilmArgs),
     Collect(CollectArgs),
     VerifyDataset(VerifyArgs),
     Doctor(DoctorArgs),
@@ -80,6 +82,10 @@ impl Cli {
             Command::Serve(args) => serve::serve(args, Arc::new(Simulations)),
             Command::Score(args) => {
                 print(&score::score(&args)?);
+                Ok(())
+            }
+            Command::Film(args) => {
+                print(&film::film(&args)?);
                 Ok(())
             }
             Command::Collect(args) => {

@@ -11,6 +11,7 @@ use quad_service::{Endpoints, Role, default_endpoint, parse_endpoint};
 use zenoh::Session;
 
 use crate::serve::DEFAULT_PORT;
+use crate::tools::film::{Gl, INSTALL};
 use crate::sim::{Environments, Rollout, Simulations};
 
 /// What is tried.
@@ -51,6 +52,7 @@ pub fn examine(args: &DoctorArgs) -> anyhow::Result<Findings> {
     };
     findings.ok("precision", format!("evaluates in f32; {bf16}"));
     simulator(&mut findings);
+    findings.ok("film", Gl::new().map_or_else(|_| format!("cannot be made: {INSTALL}"), |_| "can be made".to_owned()));
     let folder = args.certificates.as_deref();
     let certificates = folder.and_then(|folder| doctor::certificates(&mut findings, folder, Role::Evaluator));
     let endpoint = args.connect.clone().unwrap_or_else(|| default_endpoint(certificates.as_ref(), DEFAULT_PORT));

@@ -161,6 +161,10 @@ impl Simulation for AntMaze {
         Step { reward: f64::from(u8::from(reached)), terminated: reached, truncated }
     }
 
+    fn control_period(&self) -> f64 {
+        self.physics.dt()
+    }
+
     fn observation(&self) -> &[f64] {
         &self.observation
     }

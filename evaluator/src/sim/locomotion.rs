@@ -140,6 +140,10 @@ impl Simulation for Locomotion {
         Step { reward: velocity + self.robot.alive_bonus - cost, terminated, truncated }
     }
 
+    fn control_period(&self) -> f64 {
+        self.physics.dt()
+    }
+
     fn observation(&self) -> &[f64] {
         &self.observation
     }

@@ -29,6 +29,9 @@ pub trait Simulation: Send {
     /// Applies `action` (`action_dim` values, clipped to [-1, 1]) for one control period.
     fn step(&mut self, action: &[f32]) -> Step;
 
+    /// Simulated seconds of a step.
+    fn control_period(&self) -> f64;
+
     /// The current observation, `observation_dim` values.
     fn observation(&self) -> &[f64];
 

@@ -29,7 +29,7 @@ RAYON_NUM_THREADS sets how many processor cores are used; without it, all are.";
 ///
 /// A snapshot says which environment it is for and which episodes its run evaluates it on. Without other options the policy is
 /// scored on these, so its scores are those that the run has (if the arithmetic is the same).
-#[derive(Args, Debug)]
+#[derive(Args, Debug, Default)]
 #[command(after_help = AFTER_HELP)]
 pub struct ScoreArgs {
     /// Files that learners have saved, e.g. runs/mine/snapshots/step_000020000.safetensors

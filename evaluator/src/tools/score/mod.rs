@@ -6,16 +6,15 @@ mod args;
 mod results;
 mod subject;
 
-use anyhow::Context;
 use quad_policy::Precision;
 use quad_protocol::episode_seeds;
 use rayon::prelude::*;
 use tracing::{info, warn};
 
-use crate::sim::{Environments, EpisodeOutcome, Rollout, Simulations};
+use crate::sim::{Environments, Simulations};
 pub(crate) use args::ScoreArgs;
 use results::{Episode, Scored, Spread, table};
-use subject::Subject;
+pub(crate) use subject::Subject;
 
 /// Episodes in a batch. It bounds memory; a larger batch is hardly faster.
 const BATCH: usize = 16;
@@ -39,18 +38,7 @@ pub(crate) fn score(args: &ScoreArgs) -> anyhow::Result<String> {
 /// Runs a policy's episodes. What one comes to depends on neither the batch it is in nor the number of threads.
 fn measure(subject: &Subject) -> anyhow::Result<Scored> {
     let Subject { path, weights, spec, seed, step, episodes, policy } = subject;
-    let batch = |seeds: &[u64]| -> anyhow::Result<Vec<EpisodeOutcome>> {
-        let sizes = (policy.observation_dim(), policy.action_dim());
-        let make = || Simulations.make(&spec.name, *seed);
-        let mut rollout = Rollout::new(make, sizes, seeds, |seed| policy.begin(seed))?;
-        while !rollout.is_done() {
-            rollout.step(|observations, states, actions| {
-                let acted = policy.act(observations, states, actions);
-                acted.with_context(|| format!("{}: the policy cannot act", path.display()))
-            })?;
-        }
-        Ok(rollout.into_outcomes())
-    };
+    let batch = |seeds: &[u64]| subject.roll_out(|| Simulations.make(&spec.name, *seed), seeds);
     let seeds = episode_seeds(*seed, *step, *episodes);
     let batches = seeds.par_chunks(BATCH).with_max_len(1).map(batch).collect::<anyhow::Result<Vec<_>>>()?;
     let scored = Scored {

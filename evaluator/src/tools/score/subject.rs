@@ -11,7 +11,7 @@ use quad_protocol::{Hash, Origin};
 use quad_service::Hint;
 
 use super::args::{MOST_EPISODES, ScoreArgs};
-use crate::sim;
+use crate::sim::{self, Environment, EnvironmentError, EpisodeOutcome, Rollout};
 
 const ONE: &str = "what can be scored is a file like RUN/snapshots/step_000020000.safetensors, as `learner train` of this \
                    version writes them";
@@ -71,6 +71,28 @@ impl Subject {
             Ok(Self { path: path.clone(), weights, policy, spec, seed, step, episodes })
         };
         choices.into_iter().map(choosing).collect()
+    }
+
+    /// Plays the episodes of some seeds as one batch, in environments that `make` makes.
+    ///
+    /// # Errors
+    ///
+    /// The policy cannot act.
+    pub fn roll_out(
+        &self,
+        make: impl FnMut() -> Result<Box<dyn Environment>, EnvironmentError>,
+        seeds: &[u64],
+    ) -> anyhow::Result<Vec<EpisodeOutcome>> {
+        let Self { path, policy, .. } = self;
+        let sizes = (policy.observation_dim(), policy.action_dim());
+        let mut rollout = Rollout::new(make, sizes, seeds, |seed| policy.begin(seed))?;
+        while !rollout.is_done() {
+            rollout.step(|observations, states, actions| {
+                let acted = policy.act(observations, states, actions);
+                acted.with_context(|| format!("{}: the policy cannot act", path.display()))
+            })?;
+        }
+        Ok(rollout.into_outcomes())
     }
 
     fn check(&self) -> anyhow::Result<()> {

@@ -1,0 +1,45 @@
+//! What `evaluator film` is asked for.
+
+use std::path::PathBuf;
+
+use clap::Args;
+
+use super::output::{Output, output};
+
+const AFTER_HELP: &str = "\
+Examples:
+  # The first episode of a run's best evaluation, as an animation that any browser shows.
+  evaluator film runs/mine --out film.gif
+
+  # What was learned: an early snapshot's attempt beside it, from the same start, as eight pictures in a row.
+  evaluator film runs/mine --compare runs/mine/snapshots/step_000002000.safetensors --out film.png
+
+Needs no GPU and no screen, but Mesa's software driver: apt-get install --no-install-recommends libegl1 libegl-mesa0 \
+libgl1-mesa-dri";
+
+/// Film an episode of a saved policy: an animation, a video or a strip of pictures
+///
+/// The episode is one of those that the run evaluates the snapshot on, so its return is the one that the run has (if the
+/// arithmetic is the same). The caption says the gradient step, the environment step, the return so far, and how many candidates
+/// the policy chooses among.
+#[derive(Args, Debug)]
+#[command(after_help = AFTER_HELP)]
+pub struct FilmArgs {
+    /// A file that a learner has saved, or the folder of a run: then the snapshot with the best complete evaluation, or the
+    /// newest if there is none
+    #[arg(value_name = "SNAPSHOT|RUN")]
+    pub subject: PathBuf,
+    /// Of a run's folder, the snapshot of this gradient step
+    #[arg(long, value_name = "N")]
+    pub step: Option<u64>,
+    /// Another snapshot or run to show beside it, in an episode of the same seed
+    #[arg(long, value_name = "SNAPSHOT|RUN")]
+    pub compare: Option<PathBuf>,
+    /// Seed of the episode, as scores.jsonl and `evaluator score --json` say it [default: the first that the run evaluates the
+    /// snapshot on]
+    #[arg(long, value_name = "N")]
+    pub seed: Option<u64>,
+    /// The file to write: .gif (320 × 240), .mp4 (640 × 480, by ffmpeg) or .png (eight pictures in a row)
+    #[arg(long, value_name = "FILE", default_value = "film.gif", value_parser = output)]
+    pub out: Output,
+}

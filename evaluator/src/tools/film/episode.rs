@@ -1,0 +1,105 @@
+//! Plays an episode and keeps every pose of it, from which pictures are made afterwards.
+
+use std::sync::mpsc::{Sender, channel};
+
+use quad_dataset::EnvironmentSpec;
+use quad_protocol::episode_seeds;
+
+use crate::sim::{self, Environment, EnvironmentError, Simulation, Step};
+use crate::tools::score::Subject;
+
+/// What a picture shows.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Pose {
+    /// Generalised positions, as many as the model has.
+    pub qpos: Vec<f64>,
+    /// Where the goal is (x and y, metres), in a task that has one.
+    pub goal: Option<[f64; 2]>,
+    /// Undiscounted sum of the rewards so far.
+    pub episode_return: f64,
+}
+
+/// An episode of a policy.
+pub struct Episode {
+    /// Its seed.
+    pub seed: u64,
+    /// The pose at its beginning, then one after each step.
+    pub poses: Vec<Pose>,
+    /// Gradient step of the policy.
+    pub gradient_step: u64,
+    /// How the policy chooses, for people.
+    pub choice: String,
+}
+
+impl Episode {
+    /// Plays the episode of a seed or, without one, the first that the subject's run evaluates it on. What is drawn once for all
+    /// episodes follows from `environment_seed`.
+    ///
+    /// # Errors
+    /// The policy cannot act.
+    pub fn play(subject: &Subject, seed: Option<u64>, environment_seed: u64) -> anyhow::Result<Self> {
+        let seed = seed.unwrap_or_else(|| episode_seeds(subject.seed, subject.step, 1)[0]);
+        let (told, poses) = channel();
+        let watched = || -> Result<Box<dyn Environment>, EnvironmentError> {
+            let simulation = sim::make(subject.spec, environment_seed)?;
+            Ok(Box::new(Watched { simulation, spec: subject.spec, episode_return: 0.0, told: told.clone() }))
+        };
+        subject.roll_out(watched, &[seed])?;
+        let choice = subject.policy.choice().map_or_else(|| "no candidates".to_owned(), |choice| choice.to_string());
+        Ok(Self { seed, poses: poses.try_iter().collect(), gradient_step: subject.step, choice })
+    }
+
+    /// The labels and the values of the caption after so many steps, a line each; after the end, those of the end.
+    pub fn caption(&self, steps: usize) -> (String, String) {
+        let last = self.poses.len() - 1;
+        let end = if steps >= last { " (end)" } else { "" };
+        let episode_return = self.pose(steps).episode_return;
+        let values = format!("{}\n{}{end}\n{episode_return:.1}\n{}", self.gradient_step, steps.min(last), self.choice);
+        ("trained\nstep\nreturn\nchoice".to_owned(), values)
+    }
+
+    /// The pose after so many steps; after the end, the last.
+    pub fn pose(&self, steps: usize) -> &Pose {
+        &self.poses[steps.min(self.poses.len() - 1)]
+    }
+}
+
+/// A simulation that tells each of its poses.
+struct Watched {
+    simulation: Box<dyn Simulation>,
+    spec: &'static EnvironmentSpec,
+    episode_return: f64,
+    told: Sender<Pose>,
+}
+
+impl Watched {
+    fn tell(&self) {
+        let goal = self.simulation.goal().and_then(|goal| goal.try_into().ok());
+        let pose = Pose { qpos: self.simulation.qpos().to_vec(), goal, episode_return: self.episode_return };
+        // The receiver outlives the rollout.
+        let _ = self.told.send(pose);
+    }
+}
+
+impl Environment for Watched {
+    fn reset(&mut self, seed: u64) -> Result<(), EnvironmentError> {
+        self.simulation.reset(seed);
+        self.tell();
+        Ok(())
+    }
+
+    fn step(&mut self, action: &[f32]) -> Result<Step, EnvironmentError> {
+        let step = self.simulation.step(action);
+        self.episode_return += step.reward;
+        self.tell();
+        Ok(step)
+    }
+
+    fn observation(&self) -> &[f64] {
+        self.simulation.observation()
+    }
+
+    fn score(&mut self, episode_return: f64) -> Result<f64, EnvironmentError> {
+        Ok(self.spec.normalised_score(episode_return))
+    }
+}

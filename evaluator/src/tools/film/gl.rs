@@ -1,0 +1,42 @@
+//! OpenGL without a screen: EGL on Mesa's platform that has no surfaces, which needs no GPU.
+//!
+//! libEGL is looked for when a film is made, not when the program starts: evaluators run on machines without it.
+
+use anyhow::Context;
+use khronos_egl::{self as egl, DynamicInstance, EGL1_5};
+use quad_service::Hint;
+
+/// What to do where there is no OpenGL.
+pub const INSTALL: &str = "apt-get install --no-install-recommends libegl1 libegl-mesa0 libgl1-mesa-dri";
+/// `EGL_PLATFORM_SURFACELESS_MESA`, of the extension `EGL_MESA_platform_surfaceless`.
+const SURFACELESS: egl::Enum = 0x31DD;
+
+/// An OpenGL context, current on the thread that made it for as long as that runs.
+pub struct Gl {
+    /// The library: what it gave stays valid as long as it is loaded.
+    _egl: DynamicInstance<EGL1_5>,
+}
+
+impl Gl {
+    /// Makes a context.
+    ///
+    /// # Errors
+    /// EGL or Mesa is not installed.
+    pub fn new() -> anyhow::Result<Self> {
+        Self::open().context("pictures need EGL with Mesa's software driver").hint(INSTALL)
+    }
+
+    fn open() -> anyhow::Result<Self> {
+        // SAFETY: libEGL is the system's; loading it has no precondition.
+        let egl = unsafe { DynamicInstance::<EGL1_5>::load_required() }.map_err(|error| anyhow::anyhow!("{error}"))?;
+        // SAFETY: this platform takes no native display.
+        let display = unsafe { egl.get_platform_display(SURFACELESS, egl::DEFAULT_DISPLAY, &[egl::ATTRIB_NONE]) }?;
+        egl.initialize(display)?;
+        egl.bind_api(egl::OPENGL_API)?;
+        let wanted = [egl::SURFACE_TYPE, egl::PBUFFER_BIT, egl::RENDERABLE_TYPE, egl::OPENGL_BIT, egl::NONE];
+        let config = egl.choose_first_config(display, &wanted)?.context("it draws no OpenGL")?;
+        let context = egl.create_context(display, config, None, &[egl::NONE])?;
+        egl.make_current(display, None, None, Some(context))?;
+        Ok(Self { _egl: egl })
+    }
+}

@@ -1,0 +1,139 @@
+//! Draws poses: the model with colours, a floor and a light, seen by a camera.
+
+use mujoco_rs::wrappers::mj_data::MjData;
+use mujoco_rs::wrappers::mj_model::{MjModel, MjtGeom, MjtGeomBase, MjtObjBase};
+use mujoco_rs::wrappers::mj_rendering::{MjrContext, MjrRectangle, MjtFont, MjtGridPos};
+use mujoco_rs::wrappers::mj_visualization::{MjvCamera, MjvOption, MjvPerturb, MjvScene};
+use quad_dataset::EnvironmentSpec;
+
+use super::episode::{Episode, Pose};
+use super::gl::Gl;
+use super::output::Layout;
+use super::picture::Picture;
+use crate::sim::{self, EnvironmentError};
+
+/// What only a camera sees, which the simulation's model leaves out. The light follows the robot.
+const LOOKS: &str = r#"
+  <statistic extent="4"/>
+  <visual>
+    <global offwidth="{width}" offheight="{height}"/>
+    <headlight ambient="0.35 0.35 0.35" diffuse="0.35 0.35 0.35" specular="0 0 0"/>
+    <quality shadowsize="1024"/>
+    <rgba haze="0.9 0.93 0.96 1"/>
+  </visual>
+  <asset>
+    <texture type="skybox" builtin="gradient" rgb1="0.9 0.93 0.96" rgb2="0.62 0.73 0.85" width="64" height="384"/>
+    <texture name="floor" type="2d" builtin="checker" rgb1="0.75 0.78 0.8" rgb2="0.6 0.64 0.67" width="256" height="256"/>
+    <material name="floor" texture="floor" texrepeat="1 1" texuniform="true" specular="0" shininess="0"/>
+  </asset>
+  <worldbody>
+    <light directional="true" mode="trackcom" pos="0 -1 4" dir="0.2 0.3 -1" diffuse="0.5 0.5 0.5" specular="0 0 0"/>"#;
+/// A robot's first body has the first colour, its last the second, so that legs that cross can be told apart.
+const ROBOT: [[f32; 3]; 2] = [[0.93, 0.49, 0.15], [0.16, 0.38, 0.66]];
+const WALL: [f32; 4] = [0.8, 0.7, 0.55, 1.0];
+const GOAL: [f32; 4] = [0.85, 0.15, 0.2, 0.6];
+/// Radius of the ball at a goal, metres.
+const GOAL_RADIUS: f64 = 0.5;
+/// Geometries that a scene has room for, beyond the model's: the goal, and what MuJoCo adds.
+const MORE: usize = 100;
+/// The widest angle of a free camera, from top to bottom, is 45°: at this many times a thing's height it is seen whole.
+const WHOLE: f64 = 1.25;
+
+/// The place where films of one environment are made.
+pub struct Stage {
+    // Dropped in this order: MuJoCo frees what it has in OpenGL while that is still there.
+    context: MjrContext,
+    scene: MjvScene,
+    data: MjData<Box<MjModel>>,
+    camera: MjvCamera,
+    layout: Layout,
+    _gl: Gl,
+}
+
+impl Stage {
+    /// Builds the stage of an environment, for pictures that show so many episodes.
+    ///
+    /// # Errors
+    /// There is no OpenGL, or MuJoCo fails.
+    pub fn new(spec: &EnvironmentSpec, layout: Layout, episodes: usize) -> anyhow::Result<Self> {
+        let gl = Gl::new()?;
+        let (width, height) = layout.size(episodes);
+        let looks = LOOKS.replace("{width}", &width.to_string()).replace("{height}", &height.to_string());
+        let mjcf = sim::mjcf(spec)?.replacen("<worldbody>", &looks, 1);
+        let mjcf = mjcf.replacen(r#"<geom name="floor""#, r#"<geom name="floor" material="floor""#, 1);
+        let mut model = Box::new(MjModel::from_xml_string(&mjcf)?);
+        paint(&mut model);
+        let camera = camera(&model);
+        // SAFETY: the context of `gl` is current on this thread, and lives as long as what is made here.
+        let mut context = unsafe { MjrContext::new(&model) };
+        context.offscreen();
+        let scene = MjvScene::new(&model, model.geom_size().len() + MORE);
+        let data = MjData::try_new(model).map_err(|error| EnvironmentError::Allocation(error.to_string()))?;
+        Ok(Self { context, scene, data, camera, layout, _gl: gl })
+    }
+
+    /// The picture of all episodes after so many steps.
+    ///
+    /// # Errors
+    /// The pixels cannot be read.
+    pub fn draw(&mut self, episodes: &[Episode], steps: usize) -> anyhow::Result<Picture> {
+        for (place, episode) in episodes.iter().enumerate() {
+            let [left, bottom, width, height] = self.layout.view(place, episodes.len()).map(|pixels| pixels as i32);
+            let view = MjrRectangle::new(left, bottom, width, height);
+            self.pose(episode.pose(steps));
+            self.scene.render(&view, &self.context);
+            let (labels, values) = episode.caption(steps);
+            self.context.overlay(MjtFont::mjFONT_NORMAL, MjtGridPos::mjGRID_TOPLEFT, view, &labels, Some(&values));
+        }
+        let (width, height) = self.layout.size(episodes.len());
+        let mut rgb = vec![0; width * height * 3];
+        self.context.read_pixels(Some(&mut rgb), None, &MjrRectangle::new(0, 0, width as i32, height as i32))?;
+        Ok(Picture { width, rgb }.flipped())
+    }
+
+    fn pose(&mut self, pose: &Pose) {
+        self.data.qpos_mut().copy_from_slice(&pose.qpos);
+        self.data.forward();
+        self.scene.update(&mut self.data, &MjvOption::default(), &MjvPerturb::default(), &mut self.camera);
+        if let Some([x, y]) = pose.goal {
+            let (size, at) = ([GOAL_RADIUS; 3], [x, y, GOAL_RADIUS]);
+            // SAFETY: it has no material, texture or object, and there is room for it.
+            unsafe { self.scene.create_geom(MjtGeom::mjGEOM_SPHERE, Some(size), Some(at), None, Some(GOAL)) };
+        }
+    }
+}
+
+/// Colours robot and walls, and draws the floor without end: the simulation's has none either.
+fn paint(model: &mut MjModel) {
+    let bodies = model.geom_bodyid().to_vec();
+    let last = bodies.iter().copied().max().unwrap_or(1);
+    for (geom, body) in bodies.into_iter().enumerate() {
+        let share = (body - 1) as f32 / (last - 1).max(1) as f32;
+        let [red, green, blue] = [0, 1, 2].map(|i| ROBOT[0][i] + share * (ROBOT[1][i] - ROBOT[0][i]));
+        model.geom_rgba_mut()[geom] = if body == 0 { WALL } else { [red, green, blue, 1.0] };
+    }
+    if let Some(floor) = model.name_to_id(MjtObjBase::mjOBJ_GEOM, "floor") {
+        model.geom_size_mut()[floor] = [0.0, 0.0, 1.0];
+    }
+}
+
+/// Beside the robot, going along with it; in a maze, above all walls.
+fn camera(model: &MjModel) -> MjvCamera {
+    let walls: Vec<[f64; 3]> = (0..model.geom_size().len())
+        .filter(|&geom| model.geom_bodyid()[geom] == 0 && model.geom_type()[geom] == MjtGeomBase::mjGEOM_BOX)
+        .map(|geom| model.geom_pos()[geom])
+        .collect();
+    let torso = model.name_to_id(MjtObjBase::mjOBJ_BODY, "torso").unwrap_or(1);
+    let beside = MjvCamera { azimuth: 90.0, elevation: -10.0, distance: 3.5, ..MjvCamera::new_tracking(torso) };
+    let bounds = |axis: usize| {
+        let fold = |most: fn(f64, f64) -> f64| walls.iter().map(|wall| wall[axis]).reduce(most);
+        fold(f64::min).zip(fold(f64::max))
+    };
+    let (Some((west, east)), Some((south, north))) = (bounds(0), bounds(1)) else { return beside };
+    let centre = [(west + east) / 2.0, (south + north) / 2.0, 0.0];
+    let cell = 4.0;
+    let height = (north - south + cell).max((east - west + cell) * 0.75);
+    let mut above = MjvCamera { azimuth: 90.0, elevation: -80.0, distance: WHOLE * height, ..MjvCamera::default() };
+    above.lookat = centre;
+    above
+}
