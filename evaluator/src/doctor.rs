@@ -11,8 +11,8 @@ use quad_service::{Endpoints, Role, default_endpoint, parse_endpoint};
 use zenoh::Session;
 
 use crate::serve::DEFAULT_PORT;
-use crate::tools::film::{Gl, INSTALL};
 use crate::sim::{Environments, Rollout, Simulations};
+use crate::tools::film::{Gl, INSTALL};
 
 /// What is tried.
 const HOPPER: &str = "hopper";

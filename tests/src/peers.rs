@@ -3,6 +3,8 @@
 use std::path::{Path, PathBuf};
 use std::process::Command;
 
+use crate::process::binary;
+
 /// Whether a missing peer fails a test (`deploy/test.sh` says so) or skips it.
 fn missing(what: &str, remedy: &str) {
     let required = std::env::var_os("QUAD_REQUIRE_PEERS").is_some_and(|value| value == "1");
@@ -55,6 +57,16 @@ pub fn has_prometheus() -> bool {
         .all(|program| Command::new(program).arg("--version").output().is_ok_and(|output| output.status.success()));
     if !found {
         missing("Prometheus", "install it with: apt-get install --no-install-recommends prometheus");
+    }
+    found
+}
+
+/// Whether pictures can be drawn here, as `evaluator doctor` says; if not, the test is to be skipped.
+pub fn has_egl() -> bool {
+    let output = Command::new(binary("evaluator")).arg("doctor").output().expect("the evaluator starts");
+    let found = String::from_utf8_lossy(&output.stdout).lines().any(|line| line.contains("can be made"));
+    if !found {
+        missing("EGL with Mesa's software driver", "install it with: deploy/setup.sh --tests");
     }
     found
 }

@@ -7,6 +7,7 @@ mod command_line;
 mod dashboard;
 mod datasets;
 mod doctor;
+mod film;
 mod formats;
 mod own_data;
 mod score;

@@ -48,11 +48,7 @@ fn strip(path: &Path, pictures: impl Iterator<Item = anyhow::Result<Picture>>) -
 }
 
 /// The colours are those of the first picture: with colours of its own for each, the floor would flicker.
-fn animation(
-    path: &Path,
-    seconds: f64,
-    pictures: impl Iterator<Item = anyhow::Result<Picture>>,
-) -> anyhow::Result<()> {
+fn animation(path: &Path, seconds: f64, pictures: impl Iterator<Item = anyhow::Result<Picture>>) -> anyhow::Result<()> {
     let mut pictures = pictures.peekable();
     let Some(Ok(first)) = pictures.peek() else { return pictures.try_for_each(|picture| picture.map(drop)) };
     let (width, height) = (first.width as u16, first.height() as u16);

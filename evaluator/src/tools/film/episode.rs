@@ -49,18 +49,22 @@ impl Episode {
         Ok(Self { seed, poses: poses.try_iter().collect(), gradient_step: subject.step, choice })
     }
 
-    /// The labels and the values of the caption after so many steps, a line each; after the end, those of the end.
-    pub fn caption(&self, steps: usize) -> (String, String) {
-        let last = self.poses.len() - 1;
-        let end = if steps >= last { " (end)" } else { "" };
+    /// The caption after so many steps; after the end, that of the end.
+    pub fn caption(&self, steps: usize) -> String {
+        let Self { gradient_step, choice, .. } = self;
+        let step = if steps < self.length() { steps.to_string() } else { format!("{}, end", self.length()) };
         let episode_return = self.pose(steps).episode_return;
-        let values = format!("{}\n{}{end}\n{episode_return:.1}\n{}", self.gradient_step, steps.min(last), self.choice);
-        ("trained\nstep\nreturn\nchoice".to_owned(), values)
+        format!("trained {gradient_step}\nstep {step}\nreturn {episode_return:.1}\n{choice}")
     }
 
     /// The pose after so many steps; after the end, the last.
     pub fn pose(&self, steps: usize) -> &Pose {
-        &self.poses[steps.min(self.poses.len() - 1)]
+        &self.poses[steps.min(self.length())]
+    }
+
+    /// Its number of steps.
+    pub fn length(&self) -> usize {
+        self.poses.len() - 1
     }
 }
 
@@ -101,5 +105,20 @@ impl Environment for Watched {
 
     fn score(&mut self, episode_return: f64) -> Result<f64, EnvironmentError> {
         Ok(self.spec.normalised_score(episode_return))
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_caption_says_the_steps_the_return_and_the_candidates_and_stays_at_the_end() {
+        let pose = |episode_return| Pose { qpos: Vec::new(), goal: None, episode_return };
+        let poses = vec![pose(0.0), pose(1.25), pose(3.0)];
+        let episode = Episode { seed: 1, poses, gradient_step: 200, choice: "10 candidates".to_owned() };
+        assert_eq!(episode.caption(1), "trained 200\nstep 1\nreturn 1.2\n10 candidates");
+        assert_eq!(episode.caption(2), "trained 200\nstep 2, end\nreturn 3.0\n10 candidates");
+        assert_eq!(episode.caption(9), episode.caption(2));
     }
 }

@@ -53,7 +53,7 @@ pub(crate) fn film(args: &FilmArgs) -> anyhow::Result<String> {
         episodes.push(Episode::play(subject, seed, environment_seed)?);
     }
     let control_period = sim::make(spec, environment_seed)?.control_period();
-    let last = episodes.iter().map(|episode| episode.poses.len() - 1).max().unwrap_or(0);
+    let last = episodes.iter().map(Episode::length).max().unwrap_or(0);
     let steps = steps(format, last, control_period);
     info!("drawing {} pictures", steps.len());
     let pictures = steps.iter().map(|&step| stage.draw(&episodes, step));
@@ -70,7 +70,7 @@ fn subject(path: &Path, step: Option<u64>) -> anyhow::Result<Subject> {
 /// A line for each episode, then the file.
 fn summary(args: &FilmArgs, subjects: &[Subject], episodes: &[Episode]) -> String {
     let line = |(subject, episode): (&Subject, &Episode)| {
-        let (seed, steps) = (episode.seed, episode.poses.len() - 1);
+        let (seed, steps) = (episode.seed, episode.length());
         let episode_return = episode.pose(steps).episode_return;
         let (path, choice) = (subject.path.display(), &episode.choice);
         format!("{path}: seed {seed}, {steps} steps, return {episode_return:.2}, {choice}\n")

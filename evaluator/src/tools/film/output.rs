@@ -1,6 +1,6 @@
 //! The file of a film: which kind it is, and how its pictures are arranged.
 
-use std::path::{Path, PathBuf};
+use std::path::PathBuf;
 
 /// Pictures of a strip.
 pub const STRIP: usize = 8;
@@ -37,13 +37,6 @@ pub fn output(name: &str) -> Result<Output, String> {
     Ok(Output { path, format })
 }
 
-impl Output {
-    /// The file.
-    pub fn path(&self) -> &Path {
-        &self.path
-    }
-}
-
 /// How a picture of several episodes is divided among them.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Layout {
@@ -64,6 +57,11 @@ impl Layout {
             Format::Png => (240, 240),
         };
         Self { width, height, stacked: format == Format::Png }
+    }
+
+    /// Width over height of one episode's part.
+    pub fn aspect(self) -> f64 {
+        self.width as f64 / self.height as f64
     }
 
     /// Width and height of the picture of so many episodes, pixels.

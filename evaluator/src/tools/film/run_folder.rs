@@ -8,7 +8,8 @@ use anyhow::{Context, anyhow};
 use quad_service::Hint;
 use serde::Deserialize;
 
-const RUN: &str = "name a file like RUN/snapshots/step_000020000.safetensors, or the folder RUN that `learner train` made";
+const RUN: &str =
+    "name a file like RUN/snapshots/step_000020000.safetensors, or the folder RUN that `learner train` made";
 
 /// What counts here of a line of `scores.jsonl`.
 #[derive(Deserialize)]
@@ -25,7 +26,9 @@ pub fn snapshot(path: &Path, step: Option<u64>) -> anyhow::Result<PathBuf> {
     if !path.is_dir() {
         return match step {
             None => Ok(path.to_owned()),
-            Some(_) => Err(anyhow!("{} is not the folder of a run", path.display())).hint("--step is for a run's folder"),
+            Some(_) => {
+                Err(anyhow!("{} is not the folder of a run", path.display())).hint("--step is for a run's folder")
+            }
         };
     }
     let snapshots = snapshots(path)?;
@@ -48,7 +51,8 @@ fn snapshots(run: &Path) -> anyhow::Result<BTreeMap<u64, PathBuf>> {
     let folder = run.join("snapshots");
     let entries = fs::read_dir(&folder).with_context(|| format!("cannot read {}", folder.display())).hint(RUN)?;
     let paths = entries.filter_map(|entry| Some(entry.ok()?.path()));
-    let step = |path: &Path| path.file_name()?.to_str()?.strip_prefix("step_")?.strip_suffix(".safetensors")?.parse().ok();
+    let step =
+        |path: &Path| path.file_name()?.to_str()?.strip_prefix("step_")?.strip_suffix(".safetensors")?.parse().ok();
     Ok(paths.filter_map(|path| Some((step(&path)?, path))).collect())
 }
 

@@ -34,6 +34,8 @@ const WALL: [f32; 4] = [0.8, 0.7, 0.55, 1.0];
 const GOAL: [f32; 4] = [0.85, 0.15, 0.2, 0.6];
 /// Radius of the ball at a goal, metres.
 const GOAL_RADIUS: f64 = 0.5;
+/// Side of a wall, metres.
+const CELL: f64 = 4.0;
 /// Geometries that a scene has room for, beyond the model's: the goal, and what MuJoCo adds.
 const MORE: usize = 100;
 /// The widest angle of a free camera, from top to bottom, is 45°: at this many times a thing's height it is seen whole.
@@ -57,13 +59,8 @@ impl Stage {
     /// There is no OpenGL, or MuJoCo fails.
     pub fn new(spec: &EnvironmentSpec, layout: Layout, episodes: usize) -> anyhow::Result<Self> {
         let gl = Gl::new()?;
-        let (width, height) = layout.size(episodes);
-        let looks = LOOKS.replace("{width}", &width.to_string()).replace("{height}", &height.to_string());
-        let mjcf = sim::mjcf(spec)?.replacen("<worldbody>", &looks, 1);
-        let mjcf = mjcf.replacen(r#"<geom name="floor""#, r#"<geom name="floor" material="floor""#, 1);
-        let mut model = Box::new(MjModel::from_xml_string(&mjcf)?);
-        paint(&mut model);
-        let camera = camera(&model);
+        let model = Box::new(model(spec, layout.size(episodes))?);
+        let camera = camera(&model, layout.aspect());
         // SAFETY: the context of `gl` is current on this thread, and lives as long as what is made here.
         let mut context = unsafe { MjrContext::new(&model) };
         context.offscreen();
@@ -82,8 +79,8 @@ impl Stage {
             let view = MjrRectangle::new(left, bottom, width, height);
             self.pose(episode.pose(steps));
             self.scene.render(&view, &self.context);
-            let (labels, values) = episode.caption(steps);
-            self.context.overlay(MjtFont::mjFONT_NORMAL, MjtGridPos::mjGRID_TOPLEFT, view, &labels, Some(&values));
+            let (font, corner) = (MjtFont::mjFONT_NORMAL, MjtGridPos::mjGRID_TOPLEFT);
+            self.context.overlay(font, corner, view, &episode.caption(steps), None);
         }
         let (width, height) = self.layout.size(episodes.len());
         let mut rgb = vec![0; width * height * 3];
@@ -103,6 +100,16 @@ impl Stage {
     }
 }
 
+/// The model of an environment with what only a camera sees, for pictures of a size (width, height).
+fn model(spec: &EnvironmentSpec, (width, height): (usize, usize)) -> anyhow::Result<MjModel> {
+    let looks = LOOKS.replace("{width}", &width.to_string()).replace("{height}", &height.to_string());
+    let mjcf = sim::mjcf(spec)?.replacen("<worldbody>", &looks, 1);
+    let mjcf = mjcf.replacen(r#"<geom name="floor""#, r#"<geom name="floor" material="floor""#, 1);
+    let mut model = MjModel::from_xml_string(&mjcf)?;
+    paint(&mut model);
+    Ok(model)
+}
+
 /// Colours robot and walls, and draws the floor without end: the simulation's has none either.
 fn paint(model: &mut MjModel) {
     let bodies = model.geom_bodyid().to_vec();
@@ -114,26 +121,43 @@ fn paint(model: &mut MjModel) {
     }
     if let Some(floor) = model.name_to_id(MjtObjBase::mjOBJ_GEOM, "floor") {
         model.geom_size_mut()[floor] = [0.0, 0.0, 1.0];
+        model.geom_rgba_mut()[floor] = [1.0; 4];
     }
 }
 
-/// Beside the robot, going along with it; in a maze, above all walls.
-fn camera(model: &MjModel) -> MjvCamera {
+/// Beside the robot, going along with it; in a maze, above all walls. `aspect` is a view's width over its height.
+fn camera(model: &MjModel, aspect: f64) -> MjvCamera {
     let walls: Vec<[f64; 3]> = (0..model.geom_size().len())
         .filter(|&geom| model.geom_bodyid()[geom] == 0 && model.geom_type()[geom] == MjtGeomBase::mjGEOM_BOX)
         .map(|geom| model.geom_pos()[geom])
         .collect();
     let torso = model.name_to_id(MjtObjBase::mjOBJ_BODY, "torso").unwrap_or(1);
-    let beside = MjvCamera { azimuth: 90.0, elevation: -10.0, distance: 3.5, ..MjvCamera::new_tracking(torso) };
+    let beside = MjvCamera { azimuth: 90.0, elevation: -10.0, distance: 4.0, ..MjvCamera::new_tracking(torso) };
     let bounds = |axis: usize| {
         let fold = |most: fn(f64, f64) -> f64| walls.iter().map(|wall| wall[axis]).reduce(most);
         fold(f64::min).zip(fold(f64::max))
     };
     let (Some((west, east)), Some((south, north))) = (bounds(0), bounds(1)) else { return beside };
     let centre = [(west + east) / 2.0, (south + north) / 2.0, 0.0];
-    let cell = 4.0;
-    let height = (north - south + cell).max((east - west + cell) * 0.75);
-    let mut above = MjvCamera { azimuth: 90.0, elevation: -80.0, distance: WHOLE * height, ..MjvCamera::default() };
-    above.lookat = centre;
-    above
+    let [width, height] = [east - west, north - south].map(|between| between + CELL);
+    let distance = WHOLE * height.max(width / aspect);
+    MjvCamera { lookat: centre, azimuth: 90.0, elevation: -80.0, distance, ..MjvCamera::default() }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn every_robot_has_a_stage_and_a_maze_is_seen_from_above() {
+        for spec in sim::simulated() {
+            let model = model(spec, (320, 240)).unwrap();
+            assert_eq!(model.nq() as usize, spec.qpos_dim, "{}: poses fit the model", spec.name);
+            let floor = model.name_to_id(MjtObjBase::mjOBJ_GEOM, "floor").unwrap();
+            assert_eq!(model.geom_matid()[floor], 0, "{}: the floor is a checkerboard", spec.name);
+            let camera = camera(&model, 4.0 / 3.0);
+            let (above, maze) = (camera.elevation < -45.0, spec.name.starts_with("antmaze"));
+            assert_eq!((above, camera.trackbodyid == 1), (maze, !maze), "{}", spec.name);
+        }
+    }
 }

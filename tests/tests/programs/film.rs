@@ -1,0 +1,107 @@
+//! `evaluator film` shows the episode that is scored, in files that others read.
+
+use std::fs::{self, File};
+use std::io::BufReader;
+use std::path::Path;
+use std::process::{Command, Output};
+
+use quad_tests::PATIENCE;
+use quad_tests::learner::Learner;
+use quad_tests::peers::has_egl;
+use quad_tests::process::{assert_refused, binary};
+use quad_tests::setting::Setting;
+use quad_tests::system::Scratch;
+
+const SETTING: Setting = Setting { steps: 40, eval_interval: 20, episodes: 2, candidates: 3, hidden: 16, seed: 5 };
+
+fn film(folder: &Path, arguments: &[&str]) -> Command {
+    let mut command = Command::new(binary("evaluator"));
+    command.current_dir(folder).arg("film").args(arguments);
+    command
+}
+
+fn said(output: &Output) -> String {
+    assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
+    String::from_utf8(output.stdout.clone()).unwrap()
+}
+
+/// A finished run with scores.
+fn run(scratch: &Scratch) -> Learner {
+    let mut learner = scratch.learner("run", SETTING);
+    let _evaluator = scratch.evaluator("evaluator", &learner.endpoint());
+    learner.process.assert_succeeds(PATIENCE);
+    learner
+}
+
+/// The colours of each frame of an animation: width × height × 4 bytes.
+fn frames(path: &Path) -> ((u16, u16), Vec<Vec<u8>>) {
+    let mut options = gif::DecodeOptions::new();
+    options.set_color_output(gif::ColorOutput::RGBA);
+    let mut decoder = options.read_info(BufReader::new(File::open(path).unwrap())).unwrap();
+    let size = (decoder.width(), decoder.height());
+    let next = std::iter::from_fn(|| decoder.read_next_frame().unwrap().map(|frame| frame.buffer.to_vec()));
+    (size, next.collect())
+}
+
+#[test]
+fn a_film_shows_the_episode_that_is_scored() {
+    if !has_egl() {
+        return;
+    }
+    let scratch = Scratch::new();
+    let learner = run(&scratch);
+    let folder = scratch.path();
+    let (first, last) = (learner.snapshot(20), learner.snapshot(40));
+    let [first, last] = [&first, &last].map(|path| path.to_str().unwrap());
+    let score = learner.scores().into_iter().find(|score| score.key().0 == 40).unwrap();
+    let seed = score.key().1.to_string();
+
+    let told = said(&film(folder, &[last, "--seed", &seed]).output().unwrap());
+    let (length, episode_return) = (score.integer("length"), score.number("return"));
+    let words = format!("seed {seed}, {length} steps, return {episode_return:.2}, {} candidates", SETTING.candidates);
+    assert!(told.contains(&words), "{words:?} is not in {told:?}");
+    let (size, frames) = frames(&folder.join("film.gif"));
+    assert_eq!(size, (320, 240));
+    assert_eq!(frames.len() as u64, length.div_ceil(5) + 1, "25 a second, of steps of 0.008 s, and the last");
+    let colours = |frame: &[u8]| frame.chunks(4).map(<[u8]>::to_vec).collect::<std::collections::BTreeSet<_>>().len();
+    assert!(frames.iter().all(|frame| colours(frame) > 10), "each shows something");
+    assert_ne!(frames.first(), frames.last());
+
+    let run = first.split_once("/snapshots").unwrap().0;
+    let told = said(&film(folder, &[run, "--step", "20", "--compare", last, "--out", "two.png"]).output().unwrap());
+    let seeds: Vec<&str> = told.lines().filter_map(|line| line.split_once("seed ")?.1.split(',').next()).collect();
+    assert!(seeds.len() == 2 && seeds[0] == seeds[1], "two episodes of one seed: {told}");
+    let mut picture =
+        png::Decoder::new(BufReader::new(File::open(folder.join("two.png")).unwrap())).read_info().unwrap();
+    let mut pixels = vec![0; picture.output_buffer_size().unwrap()];
+    let info = picture.next_frame(&mut pixels).unwrap();
+    assert_eq!((info.width, info.height), (8 * 240, 2 * 240));
+    let part = |column: usize, row: usize| -> Vec<u8> {
+        let rows = pixels.chunks(3 * 8 * 240).skip(240 * row).take(240);
+        rows.flat_map(|line| &line[3 * 240 * column..3 * 240 * (column + 1)]).copied().collect()
+    };
+    assert!(part(0, 0) != part(7, 0) && part(0, 1) != part(7, 1), "they move");
+    assert!(part(7, 0) != part(7, 1), "the two do not do the same");
+}
+
+#[test]
+fn what_cannot_be_filmed_is_said_in_a_sentence() {
+    let scratch = Scratch::new();
+    let learner = run(&scratch);
+    let (folder, snapshot) = (scratch.path(), learner.snapshot(40));
+    let snapshot = snapshot.to_str().unwrap();
+    let refused = |arguments: &[&str], sentence: &str, hint: &str| {
+        assert_refused(&film(folder, arguments).output().unwrap(), sentence, hint);
+    };
+    refused(&["run"], "cannot read run/snapshots", "RUN/snapshots/step_");
+    refused(&[snapshot, "--step", "20"], "is not the folder of a run", "--step");
+    let moon = folder.join("moon.safetensors");
+    let bytes = fs::read(snapshot).unwrap();
+    let at = bytes.windows(6).position(|window| window == b"hopper").unwrap();
+    fs::write(&moon, [&bytes[..at], b"onmoon", &bytes[at + 6..]].concat()).unwrap();
+    refused(&[moon.to_str().unwrap()], "is a policy for another environment", "docs/python.md");
+    if has_egl() {
+        let output = film(folder, &[snapshot, "--out", "film.mp4"]).env("PATH", folder).output().unwrap();
+        assert_refused(&output, "ffmpeg cannot be started", "--out film.gif");
+    }
+}
