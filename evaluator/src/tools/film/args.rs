@@ -39,7 +39,7 @@ pub struct FilmArgs {
     /// snapshot on]
     #[arg(long, value_name = "N")]
     pub seed: Option<u64>,
-    /// The file to write: .gif (320 × 240), .mp4 (640 × 480, by ffmpeg) or .png (eight pictures in a row)
+    /// The file to write: .gif (320 × 240), .mp4 (480 × 360, by ffmpeg) or .png (eight pictures in a row)
     #[arg(long, value_name = "FILE", default_value = "film.gif", value_parser = output)]
     pub out: Output,
 }

@@ -49,12 +49,12 @@ impl Episode {
         Ok(Self { seed, poses: poses.try_iter().collect(), gradient_step: subject.step, choice })
     }
 
-    /// The caption after so many steps; after the end, that of the end.
-    pub fn caption(&self, steps: usize) -> String {
+    /// Both columns of the caption after so many steps; after the end, those of the end.
+    pub fn caption(&self, steps: usize) -> [String; 2] {
         let Self { gradient_step, choice, .. } = self;
         let step = if steps < self.length() { steps.to_string() } else { format!("{}, end", self.length()) };
         let episode_return = self.pose(steps).episode_return;
-        format!("trained {gradient_step}\nstep {step}\nreturn {episode_return:.1}\n{choice}")
+        [format!("trained {gradient_step}\nstep {step}"), format!("return {episode_return:.1}\n{choice}")]
     }
 
     /// The pose after so many steps; after the end, the last.
@@ -117,8 +117,8 @@ mod tests {
         let pose = |episode_return| Pose { qpos: Vec::new(), goal: None, episode_return };
         let poses = vec![pose(0.0), pose(1.25), pose(3.0)];
         let episode = Episode { seed: 1, poses, gradient_step: 200, choice: "10 candidates".to_owned() };
-        assert_eq!(episode.caption(1), "trained 200\nstep 1\nreturn 1.2\n10 candidates");
-        assert_eq!(episode.caption(2), "trained 200\nstep 2, end\nreturn 3.0\n10 candidates");
+        assert_eq!(episode.caption(1), ["trained 200\nstep 1", "return 1.2\n10 candidates"]);
+        assert_eq!(episode.caption(2), ["trained 200\nstep 2, end", "return 3.0\n10 candidates"]);
         assert_eq!(episode.caption(9), episode.caption(2));
     }
 }

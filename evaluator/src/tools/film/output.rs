@@ -53,7 +53,7 @@ impl Layout {
     pub fn of(format: Format) -> Self {
         let (width, height) = match format {
             Format::Gif => (320, 240),
-            Format::Mp4 => (640, 480),
+            Format::Mp4 => (480, 360),
             Format::Png => (240, 240),
         };
         Self { width, height, stacked: format == Format::Png }

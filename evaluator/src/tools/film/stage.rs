@@ -3,7 +3,7 @@
 use mujoco_rs::wrappers::mj_data::MjData;
 use mujoco_rs::wrappers::mj_model::{MjModel, MjtGeom, MjtGeomBase, MjtObjBase};
 use mujoco_rs::wrappers::mj_rendering::{MjrContext, MjrRectangle, MjtFont, MjtGridPos};
-use mujoco_rs::wrappers::mj_visualization::{MjvCamera, MjvOption, MjvPerturb, MjvScene};
+use mujoco_rs::wrappers::mj_visualization::{MjtRndFlag, MjvCamera, MjvOption, MjvPerturb, MjvScene};
 use quad_dataset::EnvironmentSpec;
 
 use super::episode::{Episode, Pose};
@@ -40,6 +40,8 @@ const CELL: f64 = 4.0;
 const MORE: usize = 100;
 /// The widest angle of a free camera, from top to bottom, is 45°: at this many times a thing's height it is seen whole.
 const WHOLE: f64 = 1.25;
+/// The share of a view's height that the caption takes.
+const CAPTION: f64 = 0.2;
 
 /// The place where films of one environment are made.
 pub struct Stage {
@@ -64,7 +66,9 @@ impl Stage {
         // SAFETY: the context of `gl` is current on this thread, and lives as long as what is made here.
         let mut context = unsafe { MjrContext::new(&model) };
         context.offscreen();
-        let scene = MjvScene::new(&model, model.geom_size().len() + MORE);
+        let mut scene = MjvScene::new(&model, model.geom_size().len() + MORE);
+        // MuJoCo draws the shadows around one robot; those of a whole maze would be in pieces.
+        scene.flags_mut()[MjtRndFlag::mjRND_SHADOW as usize] = u8::from(camera.trackbodyid >= 0);
         let data = MjData::try_new(model).map_err(|error| EnvironmentError::Allocation(error.to_string()))?;
         Ok(Self { context, scene, data, camera, layout, _gl: gl })
     }
@@ -80,7 +84,8 @@ impl Stage {
             self.pose(episode.pose(steps));
             self.scene.render(&view, &self.context);
             let (font, corner) = (MjtFont::mjFONT_NORMAL, MjtGridPos::mjGRID_TOPLEFT);
-            self.context.overlay(font, corner, view, &episode.caption(steps), None);
+            let [left, right] = episode.caption(steps);
+            self.context.overlay(font, corner, view, &left, Some(&right));
         }
         let (width, height) = self.layout.size(episodes.len());
         let mut rgb = vec![0; width * height * 3];
@@ -138,10 +143,11 @@ fn camera(model: &MjModel, aspect: f64) -> MjvCamera {
         fold(f64::min).zip(fold(f64::max))
     };
     let (Some((west, east)), Some((south, north))) = (bounds(0), bounds(1)) else { return beside };
-    let centre = [(west + east) / 2.0, (south + north) / 2.0, 0.0];
+    let centre = [(west + east) / 2.0, (south + north) / 2.0];
     let [width, height] = [east - west, north - south].map(|between| between + CELL);
-    let distance = WHOLE * height.max(width / aspect);
-    MjvCamera { lookat: centre, azimuth: 90.0, elevation: -80.0, distance, ..MjvCamera::default() }
+    let seen = (height / (1.0 - CAPTION)).max(width / aspect);
+    let lookat = [centre[0], centre[1] + seen * CAPTION / 2.0, 0.0];
+    MjvCamera { lookat, azimuth: 90.0, elevation: -80.0, distance: WHOLE * seen, ..MjvCamera::default() }
 }
 
 #[cfg(test)]
