@@ -1,8 +1,8 @@
 #!/usr/bin/env bash
 # The demonstration: from a file of mediocre Hopper data to a policy that hops, by a learner and two evaluators over Zenoh.
 #
-# Sets up what is missing, builds, records the dataset if it is not there, trains, and ends with the run's table and
-# learning curve. Run again, it skips what is done: a run that was interrupted goes on where it was. Ctrl-C stops everything.
+# Sets up what is missing, builds, records the dataset if it is not there, trains, and ends with the run's table, its learning
+# curve and, where OpenGL is installed, a film of its best snapshot. Run again, it skips what is done: a run that was interrupted goes on where it was. Ctrl-C stops everything.
 #
 #   deploy/demo.sh [--fresh]        --fresh: begin another run; the one that is there is kept under another name
 set -euo pipefail
@@ -39,3 +39,5 @@ if [ "$status" -ne 0 ]; then
   exit "$status"
 fi
 touch "$RUN/complete"
+# Where this machine draws no pictures, the evaluator says what to install.
+$BIN/evaluator film "$RUN" --out "$RUN/film.gif" || say "the run is complete, but there is no film of it"
