@@ -42,8 +42,10 @@ pub fn snapshot(path: &Path, step: Option<u64>) -> anyhow::Result<PathBuf> {
         }
     };
     let found = snapshots.get(&step).cloned();
-    let steps = snapshots.keys().map(u64::to_string).collect::<Vec<_>>().join(", ");
-    found.with_context(|| format!("{} has no snapshot of step {step}", path.display())).hint(format!("it has {steps}"))
+    let steps: Vec<&u64> = snapshots.keys().collect();
+    found
+        .with_context(|| format!("{} has no snapshot of step {step}", path.display()))
+        .hint(format!("it has {steps:?}"))
 }
 
 /// The snapshots of a run by their steps.
