@@ -88,7 +88,7 @@ impl Cost {
     pub fn text(&self, jobs: usize) -> String {
         let left = HumanDuration(Duration::from_secs_f64(self.seconds / jobs as f64));
         format!(
-            "training takes about {left}, {jobs} runs at a time (by a second's measurement of {} configurations, each alone on one \
+            "training takes about {left}, {jobs} at a time (by a second's measurement of {} configurations, each alone on one \
              thread); these runs take {} of disk",
             self.measured,
             HumanBytes(self.bytes)

@@ -1,6 +1,6 @@
 //! A study's file: what its runs share, the axes, and rules; and the runs that follow from it, all of them checked.
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 use std::path::Path;
 
 use anyhow::{Context, anyhow, ensure};
@@ -39,6 +39,19 @@ struct File {
     only: Vec<Table>,
     #[serde(default)]
     except: Vec<Table>,
+}
+
+/// All that is wrong with a file.
+struct Wrong {
+    what: Vec<String>,
+    /// What to do about it.
+    advice: BTreeSet<String>,
+}
+
+impl From<Vec<String>> for Wrong {
+    fn from(what: Vec<String>) -> Self {
+        Self { what, advice: BTreeSet::new() }
+    }
 }
 
 /// A study.
@@ -80,22 +93,27 @@ impl Study {
         let cannot = || format!("{} cannot be used", path.display());
         let file: File = toml::from_str(&text).with_context(cannot).hint(HELP)?;
         let name = path.file_stem().map(|stem| stem.to_string_lossy().into_owned()).unwrap_or_default();
-        let runs = file.runs().map_err(|wrong| hinted(anyhow!("{}:\n  {}", cannot(), wrong.join("\n  ")), HELP))?;
+        let refuse = |Wrong { what, advice }: Wrong| {
+            let advice = advice.iter().map(String::as_str).chain([HELP]).collect::<Vec<_>>().join("; ");
+            hinted(anyhow!("{}:\n  {}", cannot(), what.join("\n  ")), advice)
+        };
+        let runs = file.runs().map_err(refuse)?;
         Ok(Self { name, about: file.about, runs })
     }
 }
 
 impl File {
-    fn runs(&self) -> Result<Vec<PlannedRun>, Vec<String>> {
+    fn runs(&self) -> Result<Vec<PlannedRun>, Wrong> {
         let axes = axes(&self.axes)?;
         let all = combinations(&axes);
         let rules = Rules { only: &self.only, except: &self.except };
         let wrong = rules.wrong(&all);
         if !wrong.is_empty() {
-            return Err(wrong);
+            return Err(wrong.into());
         }
         let allowed: Vec<_> = all.into_iter().filter(|combination| rules.allow(combination)).collect();
         let (mut runs, mut wrong) = (Vec::<PlannedRun>::new(), BTreeMap::<String, Vec<String>>::new());
+        let mut advice = BTreeSet::new();
         for (index, combination) in allowed.iter().enumerate() {
             let name = names::name(combination);
             match self.run(index, name.clone(), combination) {
@@ -103,14 +121,17 @@ impl File {
                     wrong.entry("two runs have this name".to_owned()).or_default().push(name);
                 }
                 Ok(run) => runs.push(run),
-                Err(error) => wrong.entry(sentence(&error)).or_default().push(name),
+                Err(error) => {
+                    advice.extend(hints(&error).map(str::to_owned));
+                    wrong.entry(sentence(&error)).or_default().push(name);
+                }
             }
         }
-        match wrong.is_empty() {
-            true if runs.is_empty() => Err(vec!["the rules leave no run".to_owned()]),
-            true => Ok(runs),
-            false => Err(wrong.into_iter().map(|(what, names)| format!("{}: {what}", some_of(&names))).collect()),
+        if runs.is_empty() && wrong.is_empty() {
+            return Err(vec!["the rules leave no run".to_owned()].into());
         }
+        let what: Vec<_> = wrong.into_iter().map(|(what, names)| format!("{}: {what}", some_of(&names))).collect();
+        if what.is_empty() { Ok(runs) } else { Err(Wrong { what, advice }) }
     }
 
     fn run(&self, index: usize, name: String, combination: &Combination<'_>) -> anyhow::Result<PlannedRun> {
@@ -159,10 +180,16 @@ fn set(table: &mut Table, key: &str, value: &Value) {
     }
 }
 
-/// An error with its causes and its advice in one line.
+/// An error with its causes, of which some quote theirs, in one line.
 fn sentence(error: &anyhow::Error) -> String {
-    let advice: String = hints(error).map(|hint| format!(" ({hint})")).collect();
-    format!("{error:#}{advice}").replace('\n', " ")
+    let mut sentence = String::new();
+    for cause in error.chain() {
+        let text = cause.to_string().trim().replace('\n', " ");
+        if !sentence.contains(&text) {
+            sentence = if sentence.is_empty() { text } else { sentence + ": " + &text };
+        }
+    }
+    sentence
 }
 
 fn some_of(names: &[String]) -> String {
