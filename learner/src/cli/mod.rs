@@ -1,5 +1,6 @@
 //! The command line: what the user typed, with every word that scripts rely on.
 
+mod sweep;
 mod train;
 
 use std::io::{ErrorKind, Write};
@@ -12,6 +13,7 @@ use quad_service::parse_endpoint;
 use crate::config::{hyperparameters, presets, tasks};
 use crate::report::Select;
 
+pub use sweep::{Shard, SweepArgs};
 pub use train::TrainArgs;
 
 const FETCH_NOTE: &str = "\
@@ -37,6 +39,9 @@ pub enum Command {
     /// Train on a dataset, publish snapshots, hand out evaluations, keep the run in a folder
     #[command(after_help = train::EXAMPLES)]
     Train(Box<TrainArgs>),
+    /// Do all runs of a study: many methods, tasks and seeds, several at a time, resumed by the same command
+    #[command(after_help = sweep::EXAMPLES)]
+    Sweep(SweepArgs),
     /// List tasks and algorithms, or print every value that an algorithm has for a task
     Presets(PresetsArgs),
     /// Datasets: list the names, fetch one, inspect a file

@@ -2,6 +2,7 @@
 
 mod doctor;
 mod outside;
+mod sweep;
 mod train;
 
 use std::fmt::Alignment::{Left, Right};
@@ -25,6 +26,7 @@ use crate::run::{RunDir, RunDirError, verify};
 pub fn run(cli: &Cli) -> anyhow::Result<()> {
     let done = match &cli.command {
         Command::Train(args) => train::train(args),
+        Command::Sweep(args) => sweep::sweep(args),
         Command::Presets(args) => list_presets(args),
         Command::Datasets(command) => datasets(command),
         Command::Report(args) => report(args),
