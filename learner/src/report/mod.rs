@@ -9,10 +9,12 @@
 //! asks for it, and the report says so.
 //!
 //! In reading order: `run` reads a run; `seeds` puts runs together that differ in their seed alone; `published` are the
-//! paper's figures, `departures` is how a run differs from what the paper ran; `summary` is the whole report; `plot` draws.
+//! paper's figures, `departures` is how a run differs from what the paper ran; `lambda` is what QUAD's λ was in
+//! a run; `summary` is the whole report; `plot` draws.
 //! `selection`, `spread` and `table` are small parts of these.
 
 mod departures;
+mod lambda;
 mod plot;
 mod published;
 mod run;
