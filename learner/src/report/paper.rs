@@ -26,7 +26,8 @@ pub fn table(number: u8, groups: &[GroupReport], select: Select) -> Vec<Part> {
     let tasks = once_each(groups.iter().map(|group| &*group.task));
     let ours = once_each(groups.iter().map(|group| &*group.method));
     let of_task = |task: &&str| groups.iter().find(|group| group.task == *task).map(|group| (group, &group.published));
-    let figures = tasks.iter().filter_map(of_task).flat_map(|(group, all)| all.iter().map(|figure| (&*group.task, figure)));
+    let figures =
+        tasks.iter().filter_map(of_task).flat_map(|(group, all)| all.iter().map(|figure| (&*group.task, figure)));
     let figures: Vec<Figure> = figures.filter(|(_, figure)| figure.tables.contains(&number)).collect();
     let theirs = once_each(figures.iter().map(|(_, figure)| figure.method));
     let mut notes = Notes::of(&figures);
@@ -123,14 +124,17 @@ impl Notes {
             let on: Vec<(&Figure, Remark)> = figures.iter().filter_map(|one| Some((one, remark(one.1)?))).collect();
             let methods = once_each(on.iter().map(|((_, figure), _)| figure.method)).join(", ");
             let selected = if on.iter().any(|(_, remark)| remark.selected) { "selected by test returns: " } else { "" };
-            let instead = on.iter().filter_map(|((task, _), remark)| Some(format!(" {:.1} in {task}", remark.instead?)));
+            let instead =
+                on.iter().filter_map(|((task, _), remark)| Some(format!(" {:.1} in {task}", remark.instead?)));
             let instead = Vec::from_iter(instead).join(",");
             text += &format!("- {letter} ({methods}): {selected}{reason}{instead}\n");
         }
         if select == Select::Best {
             let selected = figures.iter().filter(|(_, figure)| figure.remarks.iter().any(|remark| remark.selected));
             let selected = once_each(selected.map(|(_, figure)| figure.method)).join(", ");
-            text += &format!("- Of the paper's figures, such selection stands behind those of {selected}, as far as is known.\n");
+            text += &format!(
+                "- Of the paper's figures, such selection stands behind those of {selected}, as far as is known.\n"
+            );
         }
         text
     }

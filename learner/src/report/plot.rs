@@ -95,7 +95,9 @@ impl Picture {
             .x_label_area_size(44 * by)
             .y_label_area_size(56 * by)
             .build_cartesian_2d(x, y)?;
-        let tick = |x: &f64| if self.is_power { format!("{}", (10f64.powf(*x) * 100.0).round() / 100.0) } else { format!("{x}") };
+        let tick = |x: &f64| {
+            if self.is_power { format!("{}", (10f64.powf(*x) * 100.0).round() / 100.0) } else { format!("{x}") }
+        };
         chart
             .configure_mesh()
             .x_desc(self.x)

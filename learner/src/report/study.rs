@@ -86,9 +86,8 @@ pub fn study(groups: &[GroupReport]) -> (Vec<MethodReport>, Vec<Comparison>) {
         }
     }
     let methods = scopes.iter().flatten().map(|method| of_method(method)).collect();
-    let against_first = |scope: &Vec<Method>| {
-        scope[1..].iter().filter_map(|method| compare(method, &scope[0])).collect::<Vec<_>>()
-    };
+    let against_first =
+        |scope: &Vec<Method>| scope[1..].iter().filter_map(|method| compare(method, &scope[0])).collect::<Vec<_>>();
     let mut comparisons: Vec<Comparison> = scopes.iter().flat_map(against_first).collect();
     let p_values: Vec<f64> = comparisons.iter().filter_map(|comparison| comparison.p).collect();
     let tested = comparisons.iter_mut().filter(|comparison| comparison.p.is_some());
@@ -99,7 +98,8 @@ pub fn study(groups: &[GroupReport]) -> (Vec<MethodReport>, Vec<Comparison>) {
 fn of_method(method: &Method) -> MethodReport {
     let first = method[0];
     let runs: Runs = method.iter().map(|group| group.scores.clone()).collect();
-    let thresholds: Vec<f64> = if first.normalised { (0..=120).step_by(2).map(f64::from).collect() } else { Vec::new() };
+    let thresholds: Vec<f64> =
+        if first.normalised { (0..=120).step_by(2).map(f64::from).collect() } else { Vec::new() };
     let statistics = |drawn: &[Runs]| {
         use statistics::{interquartile_mean, mean_of_means, median_of_means, optimality_gap, share_above};
         let aggregates = [interquartile_mean, mean_of_means, median_of_means, optimality_gap].map(|of| of(&drawn[0]));
@@ -174,11 +174,13 @@ pub fn tables(methods: &[MethodReport], comparisons: &[Comparison]) -> Vec<Part>
     }
     let mut parts = vec![Part::Words(notes), Part::Table(table)];
     if !comparisons.is_empty() {
-        let names = ["pairs", "mean difference", "p", "p (Holm)", "probability of improvement"].map(|name| (name, Right));
+        let names =
+            ["pairs", "mean difference", "p", "p (Holm)", "probability of improvement"].map(|name| (name, Right));
         let names = [("method", Left), ("against", Left), ("tasks", Right)].into_iter().chain(names);
         let mut table = Table::new(&Vec::from_iter(names));
         for c in comparisons {
-            let number = |value: Option<f64>, digits: usize| value.map_or_else(|| "-".to_owned(), |v| format!("{v:.digits$}"));
+            let number =
+                |value: Option<f64>, digits: usize| value.map_or_else(|| "-".to_owned(), |v| format!("{v:.digits$}"));
             let [tasks, pairs] = [c.tasks.len(), c.pairs].map(|count| count.to_string());
             let [difference, p, p_holm] = [number(c.mean_difference, 2), number(c.p, 4), number(c.p_holm, 4)];
             let improvement = c.probability_of_improvement.text(2);

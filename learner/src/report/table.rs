@@ -60,12 +60,17 @@ impl Table {
                 lines.concat()
             }
             Style::Latex => {
-                let line = |row: &Vec<String>| format!("{} \\\\\n", row.iter().map(|cell| latex(cell)).collect::<Vec<_>>().join(" & "));
+                let line = |row: &Vec<String>| {
+                    format!("{} \\\\\n", row.iter().map(|cell| latex(cell)).collect::<Vec<_>>().join(" & "))
+                };
                 let mut lines: Vec<String> = self.rows.iter().map(line).collect();
                 lines.insert(1, "\\midrule\n".to_owned());
                 let columns = self.columns.iter().map(|alignment| if *alignment == Right { 'r' } else { 'l' });
                 let columns = String::from_iter(columns);
-                format!("\\begin{{tabular}}{{{columns}}}\n\\toprule\n{}\\bottomrule\n\\end{{tabular}}\n", lines.concat())
+                format!(
+                    "\\begin{{tabular}}{{{columns}}}\n\\toprule\n{}\\bottomrule\n\\end{{tabular}}\n",
+                    lines.concat()
+                )
             }
             Style::Csv => {
                 let line = |row: &Vec<String>| row.iter().map(|cell| csv(cell)).collect::<Vec<_>>().join(",") + "\n";
