@@ -9,11 +9,12 @@ use super::plot::{Line, Picture};
 use super::run::RunReport;
 use super::seeds::GroupReport;
 use super::statistics::{self, Estimate, Runs};
+use super::study::MethodReport;
 use super::summary::Report;
 use crate::config::settings::{self, Settings};
 
 const TAU: &str = "agent.tau";
-const BAND: &str = "band: 95 % interval of the mean over seeds";
+const BAND: &str = "mean over seeds, with its 95 % interval";
 
 /// Draws all pictures of a report into a folder, each as SVG and as PNG: of each task the learning curves, and the scores over
 /// τ where runs differ in it; of all tasks the performance profiles. The folder is made if it is not there.
@@ -62,7 +63,7 @@ fn curves(task: &str, groups: &[&GroupReport]) -> Picture {
     references.sort_by(|(_, one), (_, other)| one.total_cmp(other));
     references.dedup();
     Picture {
-        title: format!("{task}: mean over seeds; {BAND}"),
+        title: format!("{task}: {BAND}"),
         x: "gradient steps",
         y: groups[0].measure().to_owned(),
         references,
@@ -92,14 +93,15 @@ fn curve(group: &GroupReport) -> Line {
 
 fn profiles(report: &Report) -> Picture {
     let with_profile = report.study.iter().filter(|method| !method.profile.is_empty());
-    let line = |method: &super::study::MethodReport| Line {
+    let line = |method: &MethodReport| Line {
         label: method.method.clone(),
         points: method.profile.iter().map(|point| (point.threshold, point.share)).collect(),
     };
     Picture {
-        title: "Performance profile; band: 95 % interval".to_owned(),
+        title: "Performance profile, with its 95 % interval".to_owned(),
         x: "D4RL-normalised score",
         y: "share of runs that score more".to_owned(),
+        is_falling: true,
         lines: with_profile.map(line).collect(),
         ..Picture::default()
     }
@@ -126,7 +128,7 @@ fn over_tau(task: &str, groups: &[&GroupReport]) -> Picture {
         }
     };
     Picture {
-        title: format!("{task}: score over τ; {BAND}"),
+        title: format!("{task} over τ: {BAND}"),
         x: "τ",
         is_power: true,
         y: groups[0].measure().to_owned(),

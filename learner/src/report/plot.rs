@@ -15,6 +15,8 @@ use super::statistics::Estimate;
 const SIZE: (u32, u32) = (900, 540);
 /// Pixels of a PNG for each of an SVG.
 const FINER: u32 = 2;
+/// Points of a line that are shown as such.
+const MOST_POINTS: usize = 40;
 const REFERENCE: RGBColor = RGBColor(110, 110, 110);
 /// Colours that stay apart for most colour-blind readers (Okabe and Ito).
 const COLOURS: [RGBColor; 7] = [
@@ -37,6 +39,8 @@ pub struct Picture {
     pub is_power: bool,
     /// What y is.
     pub y: String,
+    /// Whether the lines fall from the top, so that the legend stands below them.
+    pub is_falling: bool,
     /// Dashed lines at some y, each with its name.
     pub references: Vec<(String, f64)>,
     pub lines: Vec<Line>,
@@ -92,11 +96,15 @@ impl Picture {
         let mut chart = ChartBuilder::on(&root)
             .caption(&self.title, font(18))
             .margin(16 * by)
+            .margin_right(36 * by)
             .x_label_area_size(44 * by)
             .y_label_area_size(56 * by)
-            .build_cartesian_2d(x, y)?;
-        let tick = |x: &f64| {
-            if self.is_power { format!("{}", (10f64.powf(*x) * 100.0).round() / 100.0) } else { format!("{x}") }
+            .build_cartesian_2d(x.clone(), y)?;
+        // Of powers, the whole ones.
+        let tick = |x: &f64| match self.is_power {
+            true if x.fract().abs() > 1e-9 => String::new(),
+            true => format!("{}", 10f64.powf(*x)),
+            false => format!("{x}"),
         };
         chart
             .configure_mesh()
@@ -108,8 +116,8 @@ impl Picture {
             .light_line_style(WHITE)
             .draw()?;
         for (name, y) in &self.references {
-            let ends = self.lines.iter().flat_map(|line| &line.points).map(|(x, _)| (*x, *y));
-            let line = DashedLineSeries::new(ends, 6 * by, 4 * by, REFERENCE.stroke_width(2 * by));
+            let line =
+                DashedLineSeries::new([(x.start, *y), (x.end, *y)], 6 * by, 4 * by, REFERENCE.stroke_width(2 * by));
             chart.draw_series(line)?.label(name).legend(legend(REFERENCE, by));
         }
         for (line, colour) in self.lines.iter().zip(COLOURS.iter().cycle()) {
@@ -117,7 +125,7 @@ impl Picture {
         }
         chart
             .configure_series_labels()
-            .position(SeriesLabelPosition::UpperLeft)
+            .position(if self.is_falling { SeriesLabelPosition::LowerLeft } else { SeriesLabelPosition::UpperLeft })
             .legend_area_size(26 * by)
             .label_font(font(13))
             .background_style(WHITE.mix(0.8))
@@ -137,7 +145,8 @@ impl Picture {
         let x = range(points().map(|(x, _)| *x).collect(), if self.is_power { first } else { 0.0 }, first + 1e-9);
         let of_points = points().flat_map(|(_, y)| [Some(y.value), y.low, y.high]).flatten();
         let y = range(of_points.chain(self.references.iter().map(|(_, y)| *y)).collect(), 0.0, 0.01);
-        let room = 1.1 + 0.05 * (self.lines.len() + self.references.len()) as f64;
+        let labels = if self.is_falling { 0 } else { self.lines.len() + self.references.len() };
+        let room = 1.05 + 0.05 * labels as f64;
         [x, y.start..y.start + (y.end - y.start) * room]
     }
 }
@@ -154,6 +163,7 @@ where
     let points: Vec<_> = line.points.iter().map(|(x, y)| (*x, y.value)).collect();
     let series = LineSeries::new(points.clone(), colour.stroke_width(2 * by));
     chart.draw_series(series)?.label(&line.label).legend(legend(colour, by));
+    let points = if points.len() > MOST_POINTS { Vec::new() } else { points };
     chart.draw_series(points.into_iter().map(|point| Circle::new(point, 3 * by, colour.filled())))?;
     Ok(())
 }

@@ -5,7 +5,7 @@ use std::collections::BTreeSet;
 use quad_dataset::{Goal, environment};
 use serde::Serialize;
 
-use super::departures::departures;
+use super::departures::{as_given, departures};
 use super::published::{self, Published};
 use super::run::{RunReport, joined};
 use super::selection::Select;
@@ -23,7 +23,8 @@ pub struct GroupReport {
     pub algorithm: String,
     /// The variant of the algorithm: `quad`, `dac` or `none` for QUAD's kinds of guidance, or another algorithm's name.
     pub variant: String,
-    /// The variant, and the settings in which other runs of it on the task differ: what tables and figures call these runs.
+    /// What tables and figures call these runs: the variant and, of the settings in which other runs of it on the task differ, those
+    /// that are not the task's own.
     pub method: String,
     /// The hyper-parameters that matter most.
     pub agent: String,
@@ -113,20 +114,22 @@ pub fn groups(runs: &[RunReport], select: Select) -> Vec<GroupReport> {
             None => groups.push((settings, vec![run])),
         }
     }
-    // The settings in which a group differs from others.
+    // The keys in which a group differs from others of its task.
     let differs = |index: usize, is_other: &dyn Fn(&RunReport) -> bool| {
         let (own, members) = &groups[index];
         let others = groups.iter().filter(|(_, others)| others[0].task == members[0].task && is_other(others[0]));
-        let keys: BTreeSet<&String> = others.flat_map(|(other, _)| differences(own, other)).collect();
-        let value = |key: &String| own.get(key).map_or_else(|| format!("no {key}"), |value| format!("{key} = {value}"));
-        keys.into_iter().map(value).collect::<Vec<_>>()
+        others.flat_map(|(other, _)| differences(own, other)).collect::<BTreeSet<&String>>()
     };
-    let all = groups.iter().enumerate().map(|(index, (_, runs))| {
+    let all = groups.iter().enumerate().map(|(index, (own, runs))| {
+        let value = |key: &String| own.get(key).map_or_else(|| format!("no {key}"), |value| format!("{key} = {value}"));
         let RunReport { algorithm, variant, .. } = runs[0];
         let of_variant = differs(index, &|other| (&other.algorithm, &other.variant) == (algorithm, variant));
-        let method = std::iter::once(named(algorithm, variant)).chain(of_variant);
-        let method = Vec::from_iter(method).join(", ");
-        group(runs, method, differs(index, &|other| other.algorithm == *algorithm), select)
+        // The task's own values need no name: of several τ, that of the paper is just QUAD on each task.
+        let given = as_given(runs[0], true).map(|given| settings::of_experiment(&given)).unwrap_or_default();
+        let changed = of_variant.into_iter().filter(|key| given.get(*key) != own.get(*key)).map(value);
+        let method = Vec::from_iter(std::iter::once(named(algorithm, variant)).chain(changed)).join(", ");
+        let differs = differs(index, &|other| other.algorithm == *algorithm).into_iter().map(value).collect();
+        group(runs, method, differs, select)
     });
     all.collect()
 }

@@ -39,7 +39,12 @@ impl Report {
     /// # Errors
     /// There is no run in any of them, or one has a file that no learner writes.
     pub fn read(paths: &[PathBuf], select: Select) -> anyhow::Result<Self> {
-        let found: Vec<PathBuf> = paths.iter().flat_map(|path| runs_in(path)).collect();
+        let mut found: Vec<PathBuf> = Vec::new();
+        for path in paths.iter().flat_map(|path| runs_in(path)) {
+            if !found.contains(&path) {
+                found.push(path);
+            }
+        }
         // Where there is none, the first path's error says so.
         let dirs = if found.is_empty() { &paths[..1] } else { &found };
         let runs: Vec<_> = dirs.iter().map(|path| RunReport::read(path)).collect::<anyhow::Result<_>>()?;
