@@ -175,13 +175,19 @@ impl RunReport {
         self.config.experiment.schedule().evaluated_steps().count()
     }
 
-    /// How far it has come, in words.
+    /// The step of the last complete evaluation of a run that is not complete.
+    pub fn reached(&self) -> Option<u64> {
+        let last = self.evaluations.iter().rfind(|evaluation| evaluation.complete);
+        (!self.is_complete()).then_some(last.map_or(0, |evaluation| evaluation.step))
+    }
+
+    /// How far a run has come that is not complete, in words.
     pub fn how_complete(&self) -> String {
-        let last = self.evaluations.iter().rfind(|evaluation| evaluation.complete).map_or(0, |e| e.step);
         format!(
-            "{} of {} evaluations are complete, the last of them after {last} of {} steps",
+            "{} of {} evaluations are complete, the last of them after {} of {} steps",
             self.evaluations_complete(),
             self.evaluations_planned(),
+            self.reached().unwrap_or(self.steps),
             self.steps
         )
     }
