@@ -147,9 +147,9 @@ impl Quad {
             self.target_actor.weights_mut().ema_update(self.actor.network.weights(), ema_rate)?;
         }
 
-        let mean = targets.mean_all()?;
+        let (mean, zero) = (targets.mean_all()?, self.eta.zeros_like()?);
         let mut measured = vec![&mean, &critic_loss, &bc_loss, &actor_loss, &self.eta];
-        measured.extend([&critic_gradient_norm, &actor_gradient_norm]);
+        measured.extend([self.nu_squared.as_ref().unwrap_or(&zero), &critic_gradient_norm, &actor_gradient_norm]);
         let own = measured.len();
         measured.extend(guide.iter().flat_map(|guide| lambda::needed(guide, &error)));
         let mut metrics = numbers(&measured)?;

@@ -7,14 +7,14 @@ use candle_core::Tensor;
 const FIFTHS: usize = 5;
 
 /// How many numbers [`measure`] gives.
-const COUNT: usize = 14;
+const COUNT: usize = 13;
 
 /// What [`measure`] has to know of a batch: ν̂² and δ's share, `[]`; λ and σ², `[B]`; ḡ and the error ε_θ − ε, `[B, a]`.
 pub(super) fn needed<'a>(guide: &'a Guide, error: &'a Tensor) -> [&'a Tensor; 6] {
     [&guide.nu_squared, &guide.delta_share, &guide.lambda, &guide.sigma_squared, &guide.gradient, error]
 }
 
-/// The metrics from `nu_squared` on, of the numbers of [`needed`], one tensor after the other; without guidance there are none,
+/// The metrics from `delta_share` on, of the numbers of [`needed`], one tensor after the other; without guidance there are none,
 /// and the metrics are 0. `t` is each sample's, of `steps` T.
 pub(super) fn measure(numbers: &[f32], t: &[u32], steps: usize, delta: f32) -> [f32; COUNT] {
     let [nu_squared, delta_share, rows @ ..] = numbers else { return [0.0; COUNT] };
@@ -27,7 +27,6 @@ pub(super) fn measure(numbers: &[f32], t: &[u32], steps: usize, delta: f32) -> [
     let width = gradient.len() / t.len();
     let cosines = gradient.chunks(width).zip(error.chunks(width)).map(|(one, other)| cosine(one, other));
     [
-        *nu_squared,
         *delta_share,
         lambda_mean,
         low,

@@ -29,18 +29,18 @@ pub(super) const METRICS: &[Metric] = &[
         label: "η",
         help: "Strength η of behaviour cloning (Eq. 19). With a threshold b it rises while the BC loss is above b and falls while it is below; without one, or without guidance, it is constant.",
     },
+    Metric {
+        name: "nu_squared",
+        label: "",
+        help: "ν̂²: moving average of the variance over the batch of the critics' mean alignment (Eq. 21–23). 0 without guidance.",
+    },
     Metric { name: "critic_gradient_norm", label: "", help: "Global norm of the critics' gradient before clipping." },
     Metric { name: "actor_gradient_norm", label: "", help: "Global norm of the actor's gradient before clipping." },
     Metric { name: "learning_rate", label: "", help: "The actor's learning rate; falls to 0 along a cosine." },
     Metric {
-        name: "nu_squared",
-        label: "",
-        help: "ν̂²: moving average of the variance over the batch of the critics' mean alignment (Eq. 21–23). 0 without guidance, like all that follow.",
-    },
-    Metric {
         name: "delta_share",
         label: "",
-        help: "Share of the batch, 0 to 1, in which δ is more than a hundredth of the denominator of λ (Eq. 24), so that it decides λ and not the critics. 0 with guidance dac and constant.",
+        help: "Share of the batch, 0 to 1, in which δ is more than a hundredth of the denominator of λ (Eq. 24), so that it decides λ and not the critics. 0 with guidance dac and constant, and, like all that follow, without guidance.",
     },
     Metric {
         name: "lambda_mean",
