@@ -105,9 +105,12 @@ fn work(args: &SweepArgs, folder: &Path, left: Runs) -> anyhow::Result<Ended> {
     let mut runtime = tokio::runtime::Builder::new_multi_thread();
     let runtime = runtime.worker_threads(2).on_thread_start(stay_in_background).enable_all().build()?;
     let ended = runtime.block_on(async {
-        let own = if args.connect.is_none() { Some(open_router().await.hint_of(SessionError::hint)?) } else { None };
-        let endpoint =
-            own.iter().map(|(_, endpoint)| endpoint).chain(&args.connect).cloned().next().unwrap_or_default();
+        let (_router, endpoint) = match args.connect.clone() {
+            Some(endpoint) => (None, endpoint),
+            None => {
+                open_router().await.map(|(router, endpoint)| (Some(router), endpoint)).hint_of(SessionError::hint)?
+            }
+        };
         evaluators.start(std::slice::from_ref(&endpoint), &logs)?;
         info!(
             "{jobs} at a time; learners and evaluators meet at {endpoint}; logs are {}/RUN/learner.log",

@@ -98,3 +98,14 @@ fn all_that_is_wrong_is_told_at_once() {
     refused(&format!("[axes]\n{task}\n[[except]]\ntask = '*'\n"), &["the rules leave no run"]);
     refused(&format!("axes = {{ {task}, agent.nu_ema_rate = [0.5, '0.5'] }}"), &["hopper-demo-nu_ema_rate-0.5"]);
 }
+
+#[test]
+fn the_example_of_the_documentation_is_a_study() {
+    let page = include_str!("../../../../studies/README.md");
+    let (_, example) = page.split_once("```toml\n").unwrap();
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("example.toml");
+    std::fs::write(&path, example.split_once("```").unwrap().0).unwrap();
+    // Of 3 tasks, 2 methods, 2 values of τ and 3 seeds, without dac in the maze, and with one τ for dac.
+    assert_eq!(Study::read(&path).unwrap().runs.len(), (2 * (1 + 2) + 2) * 3);
+}

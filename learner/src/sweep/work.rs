@@ -101,7 +101,7 @@ impl Sweep {
         for line in self.evaluators.news() {
             floor.display.say(&line);
         }
-        if floor.display.is_due(Instant::now()) {
+        if floor.display.is_due() {
             floor.display.show(&self.lines(floor));
         }
     }
