@@ -134,5 +134,5 @@ fn conclude(folder: &Path, count: usize, ended: Ended) -> anyhow::Result<()> {
         let kept = "what they have reached is kept, and the same command goes on from there";
         return Err(unfinished(anyhow!("{stopped} of {count} runs are not complete"), kept));
     }
-    print(&format!("all {count} runs are complete: learner report {}/*/", folder.display()))
+    print(&format!("all {count} runs are complete: learner report {}", folder.display()))
 }

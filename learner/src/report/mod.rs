@@ -10,8 +10,9 @@
 //!
 //! In reading order: `run` reads a run; `seeds` puts runs together that differ in their seed alone; `statistics` are
 //! definitions, which `study` applies to methods over tasks and seeds; `published` are the paper's figures, `departures` is how
-//! a run differs from what the paper ran, `lambda` what QUAD's λ was in a run, `paper` has the paper's tables with ours beside them; `summary` is the whole report;
-//! `figures` are its pictures, which `plot` draws. `selection`, `spread` and `table` are small parts of these.
+//! a run differs from what the paper ran, `lambda` what QUAD's λ was in a run; `paper` has the paper's tables with ours beside
+//! them; `summary` is the whole report; `figures` are its pictures, which `plot` draws. `selection`, `spread` and `table` are
+//! small parts of these.
 
 mod departures;
 mod figures;
