@@ -102,8 +102,8 @@ impl Picture {
             .build_cartesian_2d(x.clone(), y)?;
         // Of powers, the whole ones.
         let tick = |x: &f64| match self.is_power {
-            true if x.fract().abs() > 1e-9 => String::new(),
-            true => format!("{}", 10f64.powf(*x)),
+            true if (x - x.round()).abs() > 1e-6 => String::new(),
+            true => format!("{}", 10f64.powf(x.round())),
             false => format!("{x}"),
         };
         chart

@@ -132,5 +132,10 @@ fn figures_and_tables_come_in_the_formats_of_papers() {
         assert!(svg.contains("quad"), "{name}: {svg}");
         let label = if name.starts_with("tau") { "τ" } else { "iql" };
         assert!(svg.contains(label), "{name}: {svg}");
+        // The axis of τ names whole powers of ten.
+        assert!(
+            !name.starts_with("tau") || ["0.1", "1", "10"].iter().all(|tau| svg.contains(&format!("\n{tau}\n"))),
+            "{svg}"
+        );
     }
 }
