@@ -1,7 +1,7 @@
 """Writes statistics.json: scores that are made up, and what rliable and SciPy say of them. The tests of report/statistics.rs
 compare with it.
 
-    python3 -m venv /tmp/rliable && /tmp/rliable/bin/pip install rliable==1.2.0
+    python3 -m venv /tmp/rliable && /tmp/rliable/bin/pip install rliable==1.2.0 "pandas<3"
     /tmp/rliable/bin/python learner/tests/unit/report/statistics.py
 """
 
