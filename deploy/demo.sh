@@ -2,7 +2,8 @@
 # The demonstration: from a file of mediocre Hopper data to a policy that hops, by a learner and two evaluators over Zenoh.
 #
 # Sets up what is missing, builds, records the dataset if it is not there, trains, and ends with the run's table, its learning
-# curve and, where OpenGL is installed, a film of its best snapshot. Run again, it skips what is done: a run that was interrupted goes on where it was. Ctrl-C stops everything.
+# curve and, where OpenGL is installed, a film of its best snapshot. Run again, it skips what is done: a run that was interrupted
+# goes on where it was. Ctrl-C stops everything.
 #
 #   deploy/demo.sh [--fresh]        --fresh: begin another run; the one that is there is kept under another name
 set -euo pipefail

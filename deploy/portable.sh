@@ -60,7 +60,7 @@ build_portable() {
   install --strip "$CARGO_TARGET_DIR/release/learner" "$CARGO_TARGET_DIR/release/evaluator" "$STAGE/bin"
   install --mode=644 "$DEPS"/mujoco/libmujoco.so.?* "$STAGE/lib"
   check_glibc "$STAGE"/bin/* "$STAGE"/lib/*
-  cp LICENSE-MIT LICENSE-APACHE "$STAGE/licenses"
+  cp LICENSE-MIT LICENSE-APACHE learner/assets/LICENSE-DejaVu "$STAGE/licenses"
   cp "$DEPS/mujoco/LICENSE" "$STAGE/licenses/LICENSE-mujoco"
   cp "$DEPS/mujoco/LICENSES_THIRD_PARTY.md" "$STAGE/licenses/LICENSE-mujoco-third-party.md"
   "$TOOLS/bin/python" deploy/licences.py >"$STAGE/licenses/LICENSE-third-party"

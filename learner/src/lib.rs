@@ -4,6 +4,7 @@
 //! In reading order, each room over those below it:
 //!
 //! - `cli` is the command line, [`command`] goes from there to the exit.
+//! - `sweep` does many runs, each as a process.
 //! - `service` is a run at work: threads, main loop, Zenoh.
 //! - `report` summarises scores as tables and as a picture.
 //! - [`train`] makes gradient steps.
@@ -23,4 +24,5 @@ mod evaluation;
 mod report;
 mod run;
 mod service;
+mod sweep;
 pub mod train;

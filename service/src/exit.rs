@@ -50,6 +50,11 @@ pub fn unfinished(error: impl Into<anyhow::Error>, hint: impl fmt::Display) -> a
     Hinted { error: error.into(), hint: hint.to_string(), unfinished: true }.into()
 }
 
+/// The advice that an error has.
+pub fn hints(error: &anyhow::Error) -> impl Iterator<Item = &str> {
+    error.chain().filter_map(|cause| cause.downcast_ref::<Hinted>()).map(|hinted| &*hinted.hint)
+}
+
 /// An error with advice; everything else is the error's own.
 #[derive(Debug)]
 struct Hinted {
@@ -107,8 +112,8 @@ fn print(error: &anyhow::Error, to: &mut impl Write) -> io::Result<()> {
         }
         last = text;
     }
-    for hinted in error.chain().filter_map(|cause| cause.downcast_ref::<Hinted>()) {
-        writeln!(to, "hint: {}", hinted.hint)?;
+    for hint in hints(error) {
+        writeln!(to, "hint: {hint}")?;
     }
     Ok(())
 }

@@ -6,7 +6,8 @@
 //!
 //! - `logging`: which log lines are written, and where to.
 //! - `endpoints`: where learner and evaluators meet; `certificates`: how they show what they are; `access`: what each role may
-//!   do; `session`: the connection between them, over Zenoh.
+//!   do; `session`: the connection between them, over Zenoh;
+//!   `router`: a meeting point of many learners on one machine.
 //! - `threads`, `background`: how little of the processor the network takes.
 //! - `health`: whether the parts of a process still do their work.
 //! - `metrics_server`: `/metrics` and `/healthz`.
@@ -23,6 +24,7 @@ mod exit;
 mod health;
 mod logging;
 mod metrics_server;
+mod router;
 mod session;
 mod shutdown;
 mod threads;
@@ -30,10 +32,11 @@ mod threads;
 pub use background::stay_in_background;
 pub use certificates::{Certificates, CertificatesError, Role};
 pub use endpoints::{Endpoints, SessionError, default_endpoint, parse_endpoint};
-pub use exit::{Hint, hinted, run_main, unfinished};
+pub use exit::{Hint, hinted, hints, run_main, unfinished};
 pub use health::{Beat, Health};
 pub use logging::{Logging, init_logging};
 pub use metrics_server::{BindError, MetricsServer, serve_metrics};
+pub use router::open_router;
 pub use session::{open_session, reachable_at};
 pub use shutdown::shutdown_signal;
 pub use threads::choose_threads;

@@ -120,7 +120,7 @@ fn config(endpoints: &Endpoints) -> zenoh::Result<Config> {
 }
 
 /// Zenoh's message without the places in its source code (`at /…/tcp.rs:61.`) that it adds.
-fn for_people(error: zenoh::Error) -> String {
+pub(crate) fn for_people(error: zenoh::Error) -> String {
     let text = error.to_string();
     let mut words = text.split(' ').peekable();
     let mut plain = String::new();
@@ -143,7 +143,7 @@ pub async fn reachable_at(session: &Session, endpoints: &Endpoints) -> Result<Ve
     if !endpoints.listen.iter().any(|endpoint| leaves_port_open(endpoint)) {
         return Ok(endpoints.listen.clone());
     }
-    let about_itself = format!("@/{}/peer", session.zid());
+    let about_itself = format!("@/{}/*", session.zid());
     let replies = session.get(about_itself).timeout(SELF_QUERY_TIMEOUT).await.map_err(|_| SessionError::Unknown)?;
     let reply = replies.recv_async().await.map_err(|_| SessionError::Unknown)?;
     let sample = reply.result().map_err(|_| SessionError::Unknown)?;

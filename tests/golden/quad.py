@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+import guidance
 from diffusion import denoise, fast_noise, predict_noise, random_predictor, sample, schedule
 from networks import (
     ADAM,
@@ -68,6 +69,9 @@ VARIANTS = {
     "none": Variant(0, {"guidance": "none", "actor_ema_start": 0}),
     "one-sample": Variant(1005, {"samples": 1}),
     "ten-critics": Variant(1234, {"critics": 10, "samples": 4}),
+    "constant": Variant(1236, {"guidance": "constant", "lambda": 0.3}),
+    "mean": Variant(1237, {"guidance": "mean", "diffusion_steps": 7}),
+    "shuffled": Variant(1238, {"guidance": "shuffled", "diffusion_steps": 3}),
 }
 
 
@@ -99,8 +103,8 @@ def actor_loss(actor, states, noisy_actions, t, epsilon, eta, weight, gradient, 
     """Eq. 19, given weight λ·w(t) [B, 1] and the normalised gradient ḡ [B, a]; also its two terms."""
     predicted = predict_noise(actor, states, noisy_actions, t, activation)
     bc = jnp.mean((epsilon - predicted) ** 2)
-    guidance = jnp.mean(weight * predicted * gradient)
-    return eta * bc + guidance, (bc, guidance)
+    pull = jnp.mean(weight * predicted * gradient)
+    return eta * bc + pull, (bc, pull)
 
 
 @compiled
@@ -149,13 +153,11 @@ def guide(config, state, inputs, noisy, target_critic):
     sigma_squared = alignment.var(0)
     nu_squared, batch_nu, rate = state["nu_squared"][0], alignment.mean(0).var(), agent["nu_ema_rate"]
     nu_squared = batch_nu if nu_squared < 0 else (1 - rate) * nu_squared + rate * batch_nu
-    weights, share_of_delta = np.ones(len(s)), np.zeros(len(s))
-    if agent["guidance"] == "quad":
-        denominator = nu_squared + sigma_squared / agent["tau"] + agent["delta"]
-        weights, share_of_delta = nu_squared / denominator, agent["delta"] / denominator
+    weights, share_of_delta, means = guidance.weigh(agent, state, inputs, nu_squared, sigma_squared)
     out = {"critic_action_gradients": gradients, "q_scale": q_scale, "u": u, "sigma_squared": sigma_squared}
-    out |= {"nu_squared": nu_squared, "lambda": weights, "lambda_mean": weights.mean()}
-    return weights, g.mean(0), out | {"delta_share": np.mean(share_of_delta > 0.01)}, share_of_delta
+    out |= {"nu_squared": nu_squared, "lambda": weights, "delta_share": np.mean(share_of_delta > 0.01)} | means
+    rows = inputs["t"], weights, nu_squared, sigma_squared, g.mean(0), predicted - inputs["epsilon"]
+    return weights, g.mean(0), out | guidance.measure(agent, *rows), share_of_delta
 
 
 def update(config, state, inputs):
@@ -184,10 +186,10 @@ def update(config, state, inputs):
     # Actor, Eq. 19.
     arguments = (s, noisy, t, epsilon, state["eta"][0], weights[:, None] * noise_level, mean_gradient)
     arguments += (agent["actor"]["activation"],)
-    (loss, (bc, guidance)), gradients = actor_gradient(state["actor"], *arguments)
+    (loss, (bc, pull)), gradients = actor_gradient(state["actor"], *arguments)
     gradients, norm = clip_by_norm(gradients, agent["gradient_clip"])
     out |= adam_step(state, "actor", gradients, decayed(agent["actor_learning_rate"], config), step)
-    out |= {"actor_loss": loss, "bc_loss": bc, "guidance_loss": guidance, "actor_gradient_norm": norm}
+    out |= {"actor_loss": loss, "bc_loss": bc, "guidance_loss": pull, "actor_gradient_norm": norm}
 
     # Dual ascent on η, with the actor that has just moved.
     (_, (bc, _)), _ = actor_gradient(out["actor"], *arguments)
@@ -239,7 +241,7 @@ def random_state(config, rng):
         state |= random_moments(rng, name, state[name])
     state["eta"] = single([agent["eta"]["initial"]])
     state["nu_squared"] = single([-1.0 if agent["target_reduce"] == "max" else 0.5])
-    return state
+    return state | guidance.random_state(agent, rng)
 
 
 def random_inputs(config, rng, size, state):
@@ -252,6 +254,7 @@ def random_inputs(config, rng, size, state):
         "denoise_actions": single(rng.normal(size=(steps, b, a))),
         "select_observations": single(rng.normal(size=(n, o))),
     }
+    inputs |= guidance.random_inputs(agent, inputs["t"], rng)
     # A choice between candidates of nearly equal value would depend on rounding: draw such states' noise again.
     noise = np.zeros((steps, n, agent["candidates"], a))
     close = np.full(n, True)

@@ -118,10 +118,11 @@ pub(super) fn largest(values: &Tensor, dimension: usize) -> Result<Tensor> {
     values.max(dimension)? + (values.sum(dimension)? * 0.0)?
 }
 
-/// Tensors `[]` as numbers; from a GPU in one copy, because each copy waits for the GPU.
+/// The numbers of some tensors, one tensor after the other; from a GPU in one copy, because each copy waits for the GPU.
 pub(super) fn numbers(x: &[&Tensor]) -> Result<Vec<f32>> {
+    let flat: Vec<_> = x.iter().map(|x| x.flatten_all()).collect::<Result<_>>()?;
     match x.iter().all(|x| x.device().is_cpu()) {
-        true => x.iter().map(|x| x.to_scalar()).collect(),
-        false => Tensor::stack(x, 0)?.to_vec1(),
+        true => flat.iter().map(Tensor::to_vec1).collect::<Result<Vec<_>>>().map(|numbers| numbers.concat()),
+        false => Tensor::cat(&flat, 0)?.to_vec1(),
     }
 }

@@ -9,9 +9,9 @@ use super::trained::{Network, Trained};
 enum Part<'a> {
     Weights(&'a mut Weights),
     Adam(&'a mut Adam, Layout),
-    /// A tensor `[]`.
+    /// A tensor `[]` or `[n]`.
     Number(&'a mut Tensor),
-    /// The same, which may not be there yet.
+    /// A tensor `[]` that may not be there yet.
     Maybe(&'a mut Option<Tensor>),
 }
 
@@ -33,7 +33,7 @@ impl<'a> Parts<'a> {
         self.weights(name, network.weights_mut())
     }
 
-    /// A tensor `[]`.
+    /// A tensor `[]` or `[n]`.
     pub(super) fn number(mut self, name: &'static str, number: &'a mut Tensor) -> Self {
         self.0.push((name, Part::Number(number)));
         self
@@ -56,7 +56,7 @@ impl<'a> Parts<'a> {
                 Part::Weights(weights) => tensors.extend(weights.tensors(&format!("{name}."))?),
                 Part::Adam(adam, layout) => tensors.extend(adam.tensors(&layout, &format!("{name}."))?),
                 Part::Number(number) | Part::Maybe(Some(number)) => {
-                    tensors.insert(name.to_owned(), number.reshape(1)?);
+                    tensors.insert(name.to_owned(), number.flatten_all()?);
                 }
                 Part::Maybe(None) => {}
             }
@@ -81,7 +81,8 @@ impl<'a> Parts<'a> {
                 Part::Weights(weights) => weights.load(tensors, &format!("{name}."))?,
                 Part::Adam(adam, layout) => adam.load(&layout, tensors, &format!("{name}."))?,
                 Part::Number(number) => {
-                    *number = take(tensors, name.to_owned(), &[1])?.reshape(())?.to_device(number.device())?;
+                    let saved = take(tensors, name.to_owned(), &[number.elem_count()])?;
+                    *number = saved.reshape(number.shape())?.to_device(number.device())?;
                 }
                 Part::Maybe(number) if tensors.contains_key(name) => {
                     *number = Some(take(tensors, name.to_owned(), &[1])?.reshape(())?);

@@ -5,6 +5,8 @@ mod config;
 #[cfg(test)]
 #[allow(clippy::unwrap_used)]
 mod golden;
+mod guidance;
+mod lambda;
 mod metrics;
 
 use super::algorithm::{Algorithm, AlgorithmError, Definition, largest, numbers};
@@ -13,7 +15,7 @@ use super::diffusion::{Denoising, chain_noise, noise_predictor};
 use super::parts::Parts;
 use super::random::{Purpose, stream};
 use super::trained::{Trained, ensemble};
-use candle_core::{DType, Result, Tensor};
+use candle_core::{Result, Tensor};
 use candle_nn::loss::mse;
 use config::{Eta, Guidance, Quad as Config, TargetReduce};
 use metrics::METRICS;
@@ -21,6 +23,8 @@ use quad_policy::{
     AdamStep, Choice, DiffusionPolicy, DiffusionShape, Ensemble, Gradients, NoisePredictor, PolicyConfig, Reverse,
     Tensors, cosine_decay, mean_and_variance,
 };
+use rand::Rng;
+use rand::seq::SliceRandom;
 
 /// What the learner has to know of it.
 pub(super) const DEFINITION: Definition = Definition {
@@ -47,6 +51,8 @@ pub(super) struct Quad {
     eta: Tensor,
     /// ν̂² (Eq. 23), `[]`; none before the first guided update.
     nu_squared: Option<Tensor>,
+    /// With guidance `mean`: the moving average of λ at each t, `[T]`; below 0 where there was none yet.
+    lambda_means: Option<Tensor>,
 }
 
 /// The random numbers of one update.
@@ -55,18 +61,8 @@ struct Noise {
     next: Tensor,
     /// t and ε of Eq. 5.
     denoising: Denoising,
-}
-
-/// What the critics say about noisy actions, and how far they are trusted.
-struct Guide {
-    /// ḡ: the mean over critics of ∇_a Q̂_k(s, a^t), over the mean of |Q̂_k(s, a)| (Eq. 10), `[B, a]`.
-    gradient: Tensor,
-    /// ν̂² after this batch (Eq. 23), `[]`.
-    nu_squared: Tensor,
-    /// λ (Eq. 24), `[B]`.
-    lambda: Tensor,
-    /// Share of the batch in which δ decides λ, `[]`.
-    delta_share: Tensor,
+    /// With guidance `shuffled`: the sample whose λ each takes, one of its own t, `[B]`.
+    permutation: Option<Tensor>,
 }
 
 impl Quad {
@@ -83,6 +79,7 @@ impl Quad {
         };
         let (actor, target_actor) = noise_predictor(shape.actor(), 0.0, &context, 0)?;
         let critics = ensemble(shape.critics(), &context, 1)?;
+        let unset = || Tensor::full(-1f32, shape.diffusion_steps, &context.device);
         Ok(Self {
             actor,
             target_actor,
@@ -90,6 +87,7 @@ impl Quad {
             critics,
             eta: Tensor::new(*config.eta.initial, &context.device)?,
             nu_squared: None,
+            lambda_means: (config.guidance == Guidance::Mean).then(unset).transpose()?,
             shape,
             config,
             context,
@@ -99,10 +97,12 @@ impl Quad {
     fn noise(&self, step: u64) -> Result<Noise> {
         let mut generator = stream(self.context.seed, Purpose::Noise, step);
         let (actor, b, device) = (self.actor.network.shape(), self.context.batch_size, &self.context.device);
-        Ok(Noise {
-            next: chain_noise(actor, b * *self.config.samples, &mut generator, device)?,
-            denoising: Denoising::draw(actor, b, &mut generator, device)?,
-        })
+        let next = chain_noise(actor, b * *self.config.samples, &mut generator, device)?;
+        let denoising = Denoising::draw(actor, b, &mut generator, device)?;
+        let permutation = (self.config.guidance == Guidance::Shuffled)
+            .then(|| Tensor::from_vec(shuffled(&denoising.t, &mut generator), b, device))
+            .transpose()?;
+        Ok(Noise { next, denoising, permutation })
     }
 
     /// One pass through Algorithm 1's loop; `step` counts from 0.
@@ -121,16 +121,17 @@ impl Quad {
         let epsilon = &noise.denoising.epsilon;
         let noisy = noise.denoising.noisy(self.actor.network.schedule(), &batch.actions)?;
         let predicted = self.actor.network.predict(&batch.observations, &noisy.actions, &noisy.t)?;
-        let bc_loss = mse(&predicted, epsilon)?;
+        let error = (&predicted - epsilon)?;
+        let bc_loss = error.sqr()?.mean_all()?;
         let mut actor_loss = (&bc_loss * &self.eta)?;
-        let zero = self.eta.zeros_like()?;
-        let (mut lambda_mean, mut delta_share) = (zero.clone(), zero.clone());
-        if self.config.guidance != Guidance::None {
-            let guide = self.guide(batch, &noisy.actions, &predicted.detach())?;
-            let pull = (guide.gradient * &noisy.deviation)?.broadcast_mul(&guide.lambda.unsqueeze(1)?)?;
+        let guide = (self.config.guidance != Guidance::None)
+            .then(|| self.guide(batch, &noisy, &predicted.detach(), noise.permutation.as_ref()))
+            .transpose()?;
+        if let Some(guide) = &guide {
+            let pull = (&guide.gradient * &noisy.deviation)?.broadcast_mul(&guide.lambda.unsqueeze(1)?)?;
             actor_loss = (actor_loss + (&predicted * pull)?.mean_all()?)?;
-            (lambda_mean, delta_share) = (guide.lambda.mean_all()?, guide.delta_share);
-            self.nu_squared = Some(guide.nu_squared);
+            self.nu_squared = Some(guide.nu_squared.clone());
+            self.lambda_means.clone_from(&guide.lambda_means);
         }
         let rate = *self.config.actor_learning_rate * decay;
         let actor_gradient_norm = self.actor.descend(&Gradients::of(&actor_loss)?, AdamStep { rate, clip, count })?;
@@ -146,20 +147,15 @@ impl Quad {
             self.target_actor.weights_mut().ema_update(self.actor.network.weights(), ema_rate)?;
         }
 
-        let nu_squared = self.nu_squared.as_ref().unwrap_or(&zero);
-        let mut metrics = numbers(&[
-            &targets.mean_all()?,
-            &critic_loss,
-            &bc_loss,
-            &actor_loss,
-            &self.eta,
-            &lambda_mean,
-            &delta_share,
-            nu_squared,
-            &critic_gradient_norm,
-            &actor_gradient_norm,
-        ])?;
+        let (mean, zero) = (targets.mean_all()?, self.eta.zeros_like()?);
+        let mut measured = vec![&mean, &critic_loss, &bc_loss, &actor_loss, &self.eta];
+        measured.extend([self.nu_squared.as_ref().unwrap_or(&zero), &critic_gradient_norm, &actor_gradient_norm]);
+        let own = measured.len();
+        measured.extend(guide.iter().flat_map(|guide| lambda::needed(guide, &error)));
+        let mut metrics = numbers(&measured)?;
+        let (of_guidance, t) = (metrics.split_off(own), &noise.denoising.t);
         metrics.push(rate);
+        metrics.extend(lambda::measure(&of_guidance, t, self.shape.diffusion_steps, *self.config.delta));
         Ok(metrics)
     }
 
@@ -184,32 +180,20 @@ impl Quad {
         let bound = (mean - (variance.sqrt()? * f64::from(*self.config.rho))?)?;
         batch.target(*self.config.gamma, &bound)
     }
+}
 
-    /// The target critics' gradients at noisy actions, and λ for each (Eq. 10 and 21–24); all of it constants.
-    fn guide(&self, batch: &Minibatch, noisy: &Tensor, predicted: &Tensor) -> Result<Guide> {
-        let (tau, delta) = (f64::from(self.config.tau), f64::from(*self.config.delta));
-        let scale = (self.target_critics.values(&batch.observations, &batch.actions)?.abs()?.mean_all()? + 1e-6)?;
-        let gradients = self.target_critics.action_gradients(&batch.observations, noisy)?.broadcast_div(&scale)?;
-
-        let size = (predicted.sqr()?.sum_keepdim(1)?.sqrt()? + 1e-8)?;
-        let direction = predicted.broadcast_div(&size)?; // u, Eq. 21
-        let alignment = gradients.broadcast_mul(&direction)?.sum(2)?; // l_k = u·g_k, [K, B]
-        let (mean, variance) = mean_and_variance(&alignment)?; // l̄, and σ² of Eq. 22
-        let spread = mean.broadcast_sub(&mean.mean_all()?)?.sqr()?.mean_all()?;
-        let nu_squared = match &self.nu_squared {
-            Some(before) => (before + ((spread - before)? * f64::from(*self.config.nu_ema_rate))?)?,
-            None => spread,
-        };
-        let (lambda, delta_share) = match self.config.guidance {
-            Guidance::Quad => {
-                let denominator = variance.affine(1.0 / tau, delta)?.broadcast_add(&nu_squared)?;
-                let decided = denominator.lt(100.0 * delta)?.to_dtype(DType::F32)?.mean_all()?;
-                (denominator.recip()?.broadcast_mul(&nu_squared)?, decided)
-            }
-            Guidance::Dac | Guidance::None => (variance.ones_like()?, nu_squared.zeros_like()?),
-        };
-        Ok(Guide { gradient: mean_and_variance(&gradients)?.0, nu_squared, lambda, delta_share })
-    }
+/// A permutation that leaves each sample's t as it is.
+fn shuffled(t: &[u32], generator: &mut impl Rng) -> Vec<u32> {
+    let rows = || 0..t.len() as u32;
+    let mut others = Vec::from_iter(rows());
+    others.shuffle(generator);
+    // Both in the order of t: the n-th sample of a t takes from the n-th of the shuffled ones.
+    let mut takers = Vec::from_iter(rows());
+    takers.sort_by_key(|row| t[*row as usize]);
+    others.sort_by_key(|row| t[*row as usize]);
+    let mut permutation = vec![0; t.len()];
+    takers.into_iter().zip(others).for_each(|(taker, other)| permutation[taker as usize] = other);
+    permutation
 }
 
 impl Algorithm for Quad {
@@ -229,12 +213,16 @@ impl Algorithm for Quad {
     }
 
     fn parts(&mut self) -> Parts<'_> {
-        Parts::default()
+        let parts = Parts::default()
             .trained("actor", &mut self.actor)
             .trained("critic", &mut self.critics)
             .weights("target_actor", self.target_actor.weights_mut())
             .weights("target_critic", self.target_critics.weights_mut())
             .number("eta", &mut self.eta)
-            .maybe("nu_squared", &mut self.nu_squared)
+            .maybe("nu_squared", &mut self.nu_squared);
+        match &mut self.lambda_means {
+            Some(means) => parts.number("lambda_means", means),
+            None => parts,
+        }
     }
 }

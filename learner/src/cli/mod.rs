@@ -1,5 +1,6 @@
 //! The command line: what the user typed, with every word that scripts rely on.
 
+mod sweep;
 mod train;
 
 use std::io::{ErrorKind, Write};
@@ -12,6 +13,7 @@ use quad_service::parse_endpoint;
 use crate::config::{hyperparameters, presets, tasks};
 use crate::report::Select;
 
+pub use sweep::{Shard, SweepArgs};
 pub use train::TrainArgs;
 
 const FETCH_NOTE: &str = "\
@@ -37,12 +39,15 @@ pub enum Command {
     /// Train on a dataset, publish snapshots, hand out evaluations, keep the run in a folder
     #[command(after_help = train::EXAMPLES)]
     Train(Box<TrainArgs>),
+    /// Do all runs of a study: many methods, tasks and seeds, several at a time, resumed by the same command
+    #[command(after_help = sweep::EXAMPLES)]
+    Sweep(SweepArgs),
     /// List tasks and algorithms, or print every value that an algorithm has for a task
     Presets(PresetsArgs),
     /// Datasets: list the names, fetch one, inspect a file
     #[command(subcommand)]
     Datasets(DatasetsCommand),
-    /// Print the scores of finished or running runs, their summary over seeds, and the paper's figures for the same tasks
+    /// Print the scores of finished or running runs, statistics over seeds and tasks, and the paper's tables with ours beside them
     Report(ReportArgs),
     /// Check by a run's folder alone that each episode is scored once, with the weights that are kept there
     Verify(VerifyArgs),
@@ -122,21 +127,27 @@ pub struct DoctorArgs {
 /// Arguments of `learner report`.
 #[derive(Debug, Args)]
 pub struct ReportArgs {
-    /// Run folders
+    /// Run folders, or folders with runs below them, whose evaluations are summarised only
     #[arg(value_name = "DIR", required = true)]
     pub dirs: Vec<PathBuf>,
-    /// Print JSON instead of a table
-    #[arg(long)]
+    /// Print JSON instead of tables
+    #[arg(long, group = "style")]
     pub json: bool,
     /// Print the summaries as Markdown
-    #[arg(long, conflicts_with = "json")]
+    #[arg(long, group = "style")]
     pub markdown: bool,
+    /// Print the summaries as LaTeX, whose tables need its package booktabs
+    #[arg(long, group = "style")]
+    pub latex: bool,
+    /// Print the summaries as CSV: tables after one another, with what is said of them as comments
+    #[arg(long, group = "style")]
+    pub csv: bool,
     /// Which evaluations of a run are its score
     #[arg(long, value_enum, default_value = "last")]
     pub select: Select,
-    /// Also draw the learning curves of all the folders into one SVG file
-    #[arg(long, value_name = "FILE")]
-    pub plot: Option<PathBuf>,
+    /// Also draw learning curves, performance profiles and scores over τ into this folder, each as SVG and PNG
+    #[arg(long, value_name = "DIR")]
+    pub figures: Option<PathBuf>,
 }
 
 fn parse_task(text: &str) -> Result<String, String> {

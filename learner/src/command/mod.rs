@@ -2,6 +2,7 @@
 
 mod doctor;
 mod outside;
+mod sweep;
 mod train;
 
 use std::fmt::Alignment::{Left, Right};
@@ -15,8 +16,8 @@ use crate::cli::{Cli, Command, DatasetsCommand, DoctorArgs, InspectArgs, Presets
 use crate::config::hyperparameters::{self, Values};
 use crate::config::{Preset, tasks};
 use crate::data::{Source, cache};
-use crate::report::{Report, Style, Table, learning_curves};
-use crate::run::{RunDir, RunDirError, verify};
+use crate::report::{Report, Style, Table, draw_all, runs_in};
+use crate::run::{RunDirError, verify};
 
 /// Does what the command line says.
 ///
@@ -25,6 +26,7 @@ use crate::run::{RunDir, RunDirError, verify};
 pub fn run(cli: &Cli) -> anyhow::Result<()> {
     let done = match &cli.command {
         Command::Train(args) => train::train(args),
+        Command::Sweep(args) => sweep::sweep(args),
         Command::Presets(args) => list_presets(args),
         Command::Datasets(command) => datasets(command),
         Command::Report(args) => report(args),
@@ -65,22 +67,22 @@ fn print_preset(preset: &Preset, algorithm: Option<&str>) -> anyhow::Result<()> 
 }
 
 fn report(args: &ReportArgs) -> anyhow::Result<()> {
+    let report = Report::read(&args.dirs, args.select)?;
     // What else lies beside runs, where a user writes `runs/*`, does not keep them from being read.
-    let (runs, others): (Vec<_>, Vec<_>) = args.dirs.iter().cloned().partition(|dir| RunDir::is_occupied(dir));
-    let dirs = if runs.is_empty() { &args.dirs } else { &runs };
-    let report = Report::read(dirs, args.select)?;
-    for other in &others {
+    for other in args.dirs.iter().filter(|dir| runs_in(dir).is_empty()) {
         warn!("there is no run in {}", other.display());
     }
-    if let Some(path) = &args.plot {
-        learning_curves(path, &report.runs)?;
-        info!("learning curves: {}", path.display());
+    if let Some(folder) = &args.figures {
+        draw_all(folder, &report)?;
+        info!("figures: {}", folder.display());
     }
-    print(&match (args.json, args.markdown) {
-        (true, _) => serde_json::to_string_pretty(&report)?,
-        (_, true) => report.markdown(),
-        _ => report.text(),
-    })
+    let style = match (args.markdown, args.latex, args.csv) {
+        (true, ..) => Style::Markdown,
+        (_, true, _) => Style::Latex,
+        (.., true) => Style::Csv,
+        _ => Style::Text,
+    };
+    print(&if args.json { serde_json::to_string_pretty(&report)? } else { report.render(style) })
 }
 
 fn check_run(args: &VerifyArgs) -> anyhow::Result<()> {

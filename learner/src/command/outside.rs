@@ -1,5 +1,7 @@
 //! What a run has to do with the world outside: where it meets evaluators, and those that it starts itself.
 
+use std::thread::available_parallelism;
+
 use quad_service::{Certificates, CertificatesError, Endpoints, Hint, Role, SessionError, default_endpoint};
 use tracing::{info, warn};
 
@@ -29,7 +31,7 @@ impl Outside {
     pub fn new(args: &TrainArgs, eval_interval: u64) -> anyhow::Result<Self> {
         Ok(Self {
             endpoints: endpoints(args, eval_interval)?,
-            evaluators: LocalEvaluators::new(args.evaluators)?,
+            evaluators: LocalEvaluators::new(args.evaluators, available_parallelism()?.get())?,
             is_default: args.listen.is_none() && args.connect.is_none(),
         })
     }

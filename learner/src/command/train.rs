@@ -15,7 +15,7 @@ use super::outside::Outside;
 use crate::cli::{TrainArgs, print};
 use crate::config::{DatasetInfo, Experiment, Preset, RunConfig, RunInfo, hyperparameters};
 use crate::data::{LocalDataset, Source};
-use crate::report::{RunReport, learning_curves};
+use crate::report::{RunReport, of_run};
 use crate::run::{self, Begun, Log, Past, RunDir};
 use crate::service::{Display, Ending, Life, MainLoop, Metrics, Run, STUCK, Threads};
 
@@ -213,7 +213,7 @@ fn summarise(run_dir: &RunDir) -> anyhow::Result<RunReport> {
     if !report.evaluations.is_empty() {
         run_dir.write_json("report.json", &report)?;
         let picture = run_dir.learning_curve();
-        learning_curves(&picture, std::slice::from_ref(&report))?;
+        of_run(&report).write_svg(&picture)?;
         text = format!("\n{}\nlearning curve: {}\n", report.table(), picture.display());
     }
     print(&format!("{text}run folder: {}", run_dir.path().display()))?;

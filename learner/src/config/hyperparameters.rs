@@ -80,7 +80,8 @@ pub fn unknown_hint(name: &str) -> String {
     format!("{}there are {}", did_you_mean(name, names), names.join(", "))
 }
 
-fn fits(pattern: &str, name: &str) -> bool {
+/// Whether a name fits a pattern, in which `*` stands for any letters.
+pub fn fits(pattern: &str, name: &str) -> bool {
     match pattern.split_once('*') {
         None => pattern == name,
         Some((before, after)) => name.strip_prefix(before).is_some_and(|rest| {

@@ -45,10 +45,14 @@ pub fn departures(runs: &[&RunReport], scored_in: &str, select: Select) -> Vec<S
 
 /// The values of the task for the algorithm, and for the variant of it that the paper has a row of.
 fn as_published(run: &RunReport) -> anyhow::Result<Experiment> {
+    as_given(run, !published::methods(&run.algorithm, &run.variant).is_empty())
+}
+
+/// The values of the task for the algorithm, and for the variant of it if that is not to be a departure.
+pub fn as_given(run: &RunReport, of_variant: bool) -> anyhow::Result<Experiment> {
     let mut asked = toml::Table::from_iter([("algorithm".to_owned(), run.algorithm.as_str().into())]);
     let variant = run.config.experiment.definition()?.variant;
-    let is_published = !published::methods(&run.algorithm, &run.variant).is_empty();
-    if let Some(key) = variant.filter(|_| is_published) {
+    if let Some(key) = variant.filter(|_| of_variant) {
         let agent = toml::Table::from_iter([(key.to_owned(), run.variant.as_str().into())]);
         asked.insert("agent".to_owned(), agent.into());
     }

@@ -1,15 +1,23 @@
-//! The picture of a run: score over gradient steps, with the dataset's mean beside it. SVG.
+//! A picture of lines with bands, as SVG and as PNG.
 
+use std::error::Error;
 use std::path::Path;
+use std::sync::LazyLock;
 
-use anyhow::anyhow;
+use anyhow::{Context, anyhow};
+use plotters::coord::Shift;
 use plotters::coord::types::RangedCoordf64;
 use plotters::prelude::*;
+use plotters::style::register_font;
 
-use super::run::{EvaluationReport, RunReport};
+use super::statistics::Estimate;
 
 const SIZE: (u32, u32) = (900, 540);
-const DATASET: RGBColor = RGBColor(110, 110, 110);
+/// Pixels of a PNG for each of an SVG.
+const FINER: u32 = 2;
+/// Points of a line that are shown as such.
+const MOST_POINTS: usize = 40;
+const REFERENCE: RGBColor = RGBColor(110, 110, 110);
 /// Colours that stay apart for most colour-blind readers (Okabe and Ito).
 const COLOURS: [RGBColor; 7] = [
     RGBColor(0, 114, 178),
@@ -21,99 +29,160 @@ const COLOURS: [RGBColor; 7] = [
     RGBColor(0, 0, 0),
 ];
 
-/// Draws the learning curves of some runs into one SVG file: the mean over an evaluation's episodes as a line with
-/// points, and for a single run a band of ± one standard deviation over them. The dashed line is the dataset's mean.
-pub fn learning_curves(path: &Path, runs: &[RunReport]) -> anyhow::Result<()> {
-    let file = path.file_name().ok_or_else(|| anyhow!("{} is no file name", path.display()))?;
-    let partial = path.with_file_name(format!("{}.partial", file.display()));
-    draw(&partial, runs).map_err(|error| anyhow!("cannot draw {}: {error}", path.display()))?;
-    std::fs::rename(&partial, path)?;
-    Ok(())
+/// What is drawn.
+#[derive(Clone, Debug, Default)]
+pub struct Picture {
+    pub title: String,
+    /// What x is.
+    pub x: &'static str,
+    /// Whether x is the power of ten that the axis shows.
+    pub is_power: bool,
+    /// What y is.
+    pub y: String,
+    /// Whether the lines fall from the top, so that the legend stands below them.
+    pub is_falling: bool,
+    /// Dashed lines at some y, each with its name.
+    pub references: Vec<(String, f64)>,
+    pub lines: Vec<Line>,
 }
 
-type Chart<'a, 'b> = ChartContext<'a, SVGBackend<'b>, Cartesian2d<RangedCoordf64, RangedCoordf64>>;
-type Drawn = Result<(), Box<dyn std::error::Error>>;
+/// A line through points by x, and a band between the ends of their intervals where they have some.
+#[derive(Clone, Debug)]
+pub struct Line {
+    pub label: String,
+    pub points: Vec<(f64, Estimate)>,
+}
 
-fn draw(path: &Path, runs: &[RunReport]) -> Drawn {
-    let root = SVGBackend::new(path, SIZE).into_drawing_area();
-    root.fill(&WHITE)?;
-    let (last_step, range) = limits(runs);
-    let measure = match [true, false].map(|normalised| runs.iter().any(|run| run.normalised == normalised)) {
-        [_, false] => "D4RL-normalised score",
-        [false, true] if runs.iter().any(|run| run.measure() == "score") => "score",
-        [false, true] => "return",
-        [true, true] => "D4RL-normalised score, or return",
-    };
-    let title = match runs {
-        [run] => format!("{}: {measure} over {} episodes", run.run, episodes(run)),
-        _ => measure.to_owned(),
-    };
-    let mut chart = ChartBuilder::on(&root)
-        .caption(title, ("sans-serif", 20))
-        .margin(16)
-        .x_label_area_size(44)
-        .y_label_area_size(56)
-        .build_cartesian_2d(0.0..last_step, range)?;
-    chart
-        .configure_mesh()
-        .x_desc("gradient steps")
-        .y_desc(measure)
-        .x_label_formatter(&|step| format!("{step:.0}"))
-        .light_line_style(WHITE)
-        .draw()?;
-    draw_references(&mut chart, runs, last_step)?;
-    for (run, colour) in runs.iter().zip(COLOURS.iter().cycle()) {
-        draw_run(&mut chart, run, *colour, runs.len() == 1)?;
+type Chart<'a, DB> = ChartContext<'a, DB, Cartesian2d<RangedCoordf64, RangedCoordf64>>;
+type Drawn = Result<(), Box<dyn Error>>;
+
+impl Picture {
+    /// The picture as an SVG file.
+    ///
+    /// # Errors
+    /// The file cannot be written.
+    pub fn write_svg(&self, path: &Path) -> anyhow::Result<()> {
+        let mut svg = String::new();
+        let drawn = self.draw(SVGBackend::with_string(&mut svg, SIZE).into_drawing_area(), 1);
+        drawn.map_err(|error| anyhow!("cannot draw {}: {error}", path.display()))?;
+        replace(path, svg.as_bytes())
     }
-    chart
-        .configure_series_labels()
-        .position(SeriesLabelPosition::UpperLeft)
-        .background_style(WHITE.mix(0.8))
-        .border_style(DATASET.mix(0.4))
-        .draw()?;
-    root.present()?;
-    Ok(())
-}
 
-fn draw_references(chart: &mut Chart, runs: &[RunReport], last_step: f64) -> Drawn {
-    let mut references: Vec<f64> = runs.iter().map(|run| run.dataset_score).collect();
-    references.sort_by(f64::total_cmp);
-    references.dedup();
-    for score in references {
-        let line = DashedLineSeries::new([(0.0, score), (last_step, score)], 6, 4, DATASET.stroke_width(2));
-        let legend = |(x, y)| PathElement::new([(x, y), (x + 20, y)], DATASET.stroke_width(2));
-        chart.draw_series(line)?.label(format!("dataset mean {score:.1}")).legend(legend);
+    /// The picture as a PNG file, of twice as many pixels.
+    ///
+    /// # Errors
+    /// The file cannot be written.
+    pub fn write_png(&self, path: &Path) -> anyhow::Result<()> {
+        let (width, height) = (SIZE.0 * FINER, SIZE.1 * FINER);
+        let mut pixels = vec![0; (width * height * 3) as usize];
+        let drawn = self.draw(BitMapBackend::with_buffer(&mut pixels, (width, height)).into_drawing_area(), FINER);
+        drawn.map_err(|error| anyhow!("cannot draw {}: {error}", path.display()))?;
+        let mut file = Vec::new();
+        let mut encoder = png::Encoder::new(&mut file, width, height);
+        encoder.set_color(png::ColorType::Rgb);
+        encoder.write_header()?.write_image_data(&pixels)?;
+        replace(path, &file)
     }
-    Ok(())
+
+    /// Draws with lengths `by` times as long as usual.
+    fn draw<DB: DrawingBackend>(&self, root: DrawingArea<DB, Shift>, by: u32) -> Drawn
+    where
+        DB::ErrorType: 'static,
+    {
+        LazyLock::force(&FONT);
+        root.fill(&WHITE)?;
+        let font = |size: u32| ("sans-serif", size * by).into_font();
+        let [x, y] = self.limits();
+        let mut chart = ChartBuilder::on(&root)
+            .caption(&self.title, font(18))
+            .margin(16 * by)
+            .margin_right(36 * by)
+            .x_label_area_size(44 * by)
+            .y_label_area_size(56 * by)
+            .build_cartesian_2d(x.clone(), y)?;
+        // Of powers, the whole ones.
+        let tick = |x: &f64| match self.is_power {
+            true if (x - x.round()).abs() > 1e-6 => String::new(),
+            true => format!("{}", 10f64.powf(x.round())),
+            false => format!("{x}"),
+        };
+        chart
+            .configure_mesh()
+            .x_desc(self.x)
+            .y_desc(&self.y)
+            .axis_desc_style(font(15))
+            .label_style(font(13))
+            .x_label_formatter(&tick)
+            .light_line_style(WHITE)
+            .draw()?;
+        for (name, y) in &self.references {
+            let line =
+                DashedLineSeries::new([(x.start, *y), (x.end, *y)], 6 * by, 4 * by, REFERENCE.stroke_width(2 * by));
+            chart.draw_series(line)?.label(name).legend(legend(REFERENCE, by));
+        }
+        for (line, colour) in self.lines.iter().zip(COLOURS.iter().cycle()) {
+            draw_line(&mut chart, line, *colour, by)?;
+        }
+        chart
+            .configure_series_labels()
+            .position(if self.is_falling { SeriesLabelPosition::LowerLeft } else { SeriesLabelPosition::UpperLeft })
+            .legend_area_size(26 * by)
+            .label_font(font(13))
+            .background_style(WHITE.mix(0.8))
+            .border_style(REFERENCE.mix(0.4))
+            .draw()?;
+        root.present()?;
+        Ok(())
+    }
+
+    /// What the axes show: everything, from 0 or below, with some room above for the legend.
+    fn limits(&self) -> [std::ops::Range<f64>; 2] {
+        let points = || self.lines.iter().flat_map(|line| &line.points);
+        let range = |values: Vec<f64>, least: f64, most: f64| {
+            values.iter().copied().fold(least, f64::min)..values.iter().copied().fold(most, f64::max)
+        };
+        let first = points().map(|(x, _)| *x).next().unwrap_or(0.0);
+        let x = range(points().map(|(x, _)| *x).collect(), if self.is_power { first } else { 0.0 }, first + 1e-9);
+        let of_points = points().flat_map(|(_, y)| [Some(y.value), y.low, y.high]).flatten();
+        let y = range(of_points.chain(self.references.iter().map(|(_, y)| *y)).collect(), 0.0, 0.01);
+        let labels = if self.is_falling { 0 } else { self.lines.len() + self.references.len() };
+        let room = 1.05 + 0.05 * labels as f64;
+        [x, y.start..y.start + (y.end - y.start) * room]
+    }
 }
 
-fn draw_run(chart: &mut Chart, run: &RunReport, colour: RGBColor, has_band: bool) -> Drawn {
-    if has_band {
-        let edge =
-            |sign: f64| move |e: &EvaluationReport| (e.step as f64, e.score.mean + sign * e.score.std.unwrap_or(0.0));
-        let upper = run.evaluations.iter().map(edge(1.0));
-        let band: Vec<_> = upper.chain(run.evaluations.iter().rev().map(edge(-1.0))).collect();
+fn draw_line<DB: DrawingBackend>(chart: &mut Chart<DB>, line: &Line, colour: RGBColor, by: u32) -> Drawn
+where
+    DB::ErrorType: 'static,
+{
+    let edge = |end: fn(&Estimate) -> Option<f64>| line.points.iter().filter_map(move |(x, y)| Some((*x, end(y)?)));
+    let band: Vec<_> = edge(|y| y.high).chain(edge(|y| y.low).rev()).collect();
+    if !band.is_empty() {
         chart.draw_series([Polygon::new(band, colour.mix(0.15))])?;
     }
-    let points: Vec<_> = run.evaluations.iter().map(|e| (e.step as f64, e.score.mean)).collect();
-    let label = format!("{} ({})", run.run, run.variant);
-    let legend = move |(x, y)| PathElement::new([(x, y), (x + 20, y)], colour.stroke_width(2));
-    chart.draw_series(LineSeries::new(points.clone(), colour.stroke_width(2)))?.label(label).legend(legend);
-    chart.draw_series(points.into_iter().map(|point| Circle::new(point, 3, colour.filled())))?;
+    let points: Vec<_> = line.points.iter().map(|(x, y)| (*x, y.value)).collect();
+    let series = LineSeries::new(points.clone(), colour.stroke_width(2 * by));
+    chart.draw_series(series)?.label(&line.label).legend(legend(colour, by));
+    let points = if points.len() > MOST_POINTS { Vec::new() } else { points };
+    chart.draw_series(points.into_iter().map(|point| Circle::new(point, 3 * by, colour.filled())))?;
     Ok(())
 }
 
-fn episodes(run: &RunReport) -> usize {
-    run.evaluations.iter().map(|e| e.episodes).max().unwrap_or(0)
+fn legend(colour: RGBColor, by: u32) -> impl Fn((i32, i32)) -> PathElement<(i32, i32)> {
+    move |(x, y)| PathElement::new([(x, y), (x + 20 * by as i32, y)], colour.stroke_width(2 * by))
 }
 
-/// The last step, and the scores to show: everything, with some room above for the legend.
-fn limits(runs: &[RunReport]) -> (f64, std::ops::Range<f64>) {
-    let evaluations = || runs.iter().flat_map(|run| &run.evaluations);
-    let last_step = evaluations().map(|e| e.step).max().unwrap_or(1);
-    let spreads = evaluations().flat_map(|e| [-1.0, 1.0].map(|sign| e.score.mean + sign * e.score.std.unwrap_or(0.0)));
-    let scores: Vec<f64> = spreads.chain(runs.iter().map(|run| run.dataset_score)).collect();
-    let lowest = scores.iter().copied().fold(0.0, f64::min);
-    let highest = scores.iter().copied().fold(1.0, f64::max);
-    (last_step as f64, lowest..lowest + (highest - lowest) * 1.25)
+/// The font, which measures the text of an SVG and draws that of a PNG.
+static FONT: LazyLock<()> = LazyLock::new(|| {
+    let font = include_bytes!("../../assets/DejaVuSans.ttf");
+    // It is part of the program, and the tests draw with it.
+    let _ = register_font("sans-serif", FontStyle::Normal, font);
+});
+
+/// A reader of the file finds all of it, or what was there.
+fn replace(path: &Path, content: &[u8]) -> anyhow::Result<()> {
+    let file = path.file_name().ok_or_else(|| anyhow!("{} is no file name", path.display()))?;
+    let partial = path.with_file_name(format!("{}.partial", file.display()));
+    let written = std::fs::write(&partial, content).and_then(|()| std::fs::rename(&partial, path));
+    written.with_context(|| format!("cannot write {}", path.display()))
 }

@@ -17,6 +17,9 @@ pub struct Published {
     pub score: Printed,
     /// Where it stands.
     pub source: &'static str,
+    /// The paper's tables that have the method.
+    #[serde(skip)]
+    pub tables: &'static [u8],
     /// What the figure does not show.
     pub remarks: Vec<Remark>,
 }
@@ -25,7 +28,9 @@ pub struct Published {
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct Remark {
     /// What it is, in words.
-    pub reason: String,
+    pub reason: &'static str,
+    /// The figure with which the reason ends, if it ends with one.
+    pub instead: Option<f64>,
     /// Whether the figure is the best of several, by the very returns that it reports.
     pub selected: bool,
 }
@@ -53,6 +58,7 @@ struct Tables {
 struct Method {
     name: String,
     source: String,
+    tables: Vec<u8>,
     /// Ours of that method, and its variant.
     algorithm: Option<String>,
     variant: Option<String>,
@@ -76,15 +82,15 @@ struct KnownRemark {
 
 impl KnownRemark {
     /// The remark, if it is about this figure.
-    fn on(&self, method: &str, task: &str) -> Option<Remark> {
+    fn on(&'static self, method: &str, task: &str) -> Option<Remark> {
         let is_of_task = match (self.tasks.is_empty(), self.instead.is_empty()) {
             (true, true) => true,
             (true, false) => self.instead.contains_key(task),
             (false, _) => self.tasks.iter().any(|start| task.starts_with(start)),
         };
-        let instead = self.instead.get(task).map(|figure| format!(" {figure:.1}")).unwrap_or_default();
         let is_on = is_of_task && self.methods.iter().any(|known| known == method);
-        is_on.then(|| Remark { reason: format!("{}{instead}", self.reason), selected: self.selected })
+        let instead = self.instead.get(task).copied();
+        is_on.then_some(Remark { reason: &self.reason, instead, selected: self.selected })
     }
 }
 
@@ -99,7 +105,8 @@ pub fn scores(task: &str) -> Vec<Published> {
         let figures = scores?.get(&method.name)?;
         let score = Printed { mean: *figures.first()?, std: figures.get(1).copied() };
         let remarks = TABLES.remark.iter().filter_map(|known| known.on(&method.name, task)).collect();
-        Some(Published { method: &method.name, score, source: &method.source, remarks })
+        let Method { name, source, tables, .. } = method;
+        Some(Published { method: name, score, source, tables, remarks })
     };
     TABLES.method.iter().filter_map(published).collect()
 }

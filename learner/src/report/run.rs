@@ -9,6 +9,7 @@ use anyhow::Context;
 use quad_dataset::environment;
 use serde::Serialize;
 
+use super::lambda::LambdaReport;
 use super::spread::Spread;
 use super::table::{Style, Table};
 use crate::config::RunConfig;
@@ -54,7 +55,7 @@ pub struct RunReport {
     pub task: String,
     /// Its algorithm.
     pub algorithm: String,
-    /// The variant of the algorithm: `quad`, `dac` or `none` for QUAD's kinds of guidance, or another algorithm's name.
+    /// The variant of the algorithm: the kind of guidance for QUAD, such as `quad`, `dac` and `none`, or another algorithm's name.
     pub variant: String,
     /// The hyper-parameters that matter most.
     pub agent: String,
@@ -78,6 +79,9 @@ pub struct RunReport {
     pub mean_last_5: Option<f64>,
     /// The same of those in the last 50,000 steps of the run; absent if it has no more steps than that.
     pub mean_last_50000_steps: Option<f64>,
+    /// What λ was; absent where the algorithm has none.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub lambda: Option<LambdaReport>,
     /// Whether the evaluators' user decides what counts as a score, such as success, and it is not the return.
     #[serde(skip)]
     own_score: bool,
@@ -97,7 +101,8 @@ impl RunReport {
         let agent = config.experiment.method();
         let agent = agent.with_context(|| format!("config.toml in {} cannot be used", path.display()))?;
         let variant = config.experiment.variant()?.to_owned();
-        Ok(Self::new(path, config, agent, variant, &dir.read_scores()?))
+        let lambda = LambdaReport::read(path, &variant)?;
+        Ok(Self { lambda, ..Self::new(path, config, agent, variant, &dir.read_scores()?) })
     }
 
     fn new(path: &Path, config: RunConfig, agent: String, variant: String, lines: &[ScoreLine]) -> Self {
@@ -144,6 +149,7 @@ impl RunReport {
             mean_last_50000_steps: final_steps.and_then(in_final_steps),
             evaluations,
             missing,
+            lambda: None,
             precisions,
             config,
         }
@@ -169,13 +175,19 @@ impl RunReport {
         self.config.experiment.schedule().evaluated_steps().count()
     }
 
-    /// How far it has come, in words.
+    /// The step of the last complete evaluation of a run that is not complete.
+    pub fn reached(&self) -> Option<u64> {
+        let last = self.evaluations.iter().rfind(|evaluation| evaluation.complete);
+        (!self.is_complete()).then_some(last.map_or(0, |evaluation| evaluation.step))
+    }
+
+    /// How far a run has come that is not complete, in words.
     pub fn how_complete(&self) -> String {
-        let last = self.evaluations.iter().rfind(|evaluation| evaluation.complete).map_or(0, |e| e.step);
         format!(
-            "{} of {} evaluations are complete, the last of them after {last} of {} steps",
+            "{} of {} evaluations are complete, the last of them after {} of {} steps",
             self.evaluations_complete(),
             self.evaluations_planned(),
+            self.reached().unwrap_or(self.steps),
             self.steps
         )
     }
@@ -225,7 +237,7 @@ impl RunReport {
                 writeln!(text, "mean {} of the {name:19} {mean:.2}", self.measure()).ok();
             }
         }
-        text
+        text + &self.lambda.as_ref().map(|lambda| lambda.text(&self.variant)).unwrap_or_default()
     }
 }
 

@@ -5,7 +5,7 @@ use std::collections::BTreeSet;
 use quad_dataset::{Goal, environment};
 use serde::Serialize;
 
-use super::departures::departures;
+use super::departures::{as_given, departures};
 use super::published::{self, Published};
 use super::run::{RunReport, joined};
 use super::selection::Select;
@@ -13,22 +13,27 @@ use super::spread::Spread;
 use crate::config::Device;
 use crate::config::settings::{self, Settings, differences};
 
-/// Runs that differ in their seed alone: in task, data, device and every hyper-parameter they agree. The precision in which
-/// evaluators scored them may differ; it is named.
+/// Runs that differ in their seed alone: in task, data, device and every hyper-parameter they agree, and in how far they have
+/// come. The precision in which evaluators scored them may differ; it is named.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct GroupReport {
     /// What they learn.
     pub task: String,
     /// Their algorithm.
     pub algorithm: String,
-    /// The variant of the algorithm: `quad`, `dac` or `none` for QUAD's kinds of guidance, or another algorithm's name.
+    /// The variant of the algorithm: the kind of guidance for QUAD, such as `quad`, `dac` and `none`, or another algorithm's name.
     pub variant: String,
+    /// What tables and figures call these runs: the variant and, of the settings in which other runs of it on the task differ, those
+    /// that are not the task's own.
+    pub method: String,
     /// The hyper-parameters that matter most.
     pub agent: String,
     /// What the paper calls this variant of the algorithm, if it has a row of it.
     pub methods: Vec<&'static str>,
     /// Gradient steps that were asked for.
     pub steps: u64,
+    /// Where runs that are not complete have come to: the step of their last complete evaluation.
+    pub reached: Option<u64>,
     /// Where they trained.
     pub device: Device,
     /// Whether scores are D4RL-normalised; without reference returns they are returns.
@@ -37,6 +42,11 @@ pub struct GroupReport {
     pub scored_in: String,
     /// The seeds, one for each run that is counted.
     pub seeds: Vec<u64>,
+    /// The score of each of these; empty if they are not complete, or have too few evaluations for one.
+    pub scores: Vec<f64>,
+    /// These runs.
+    #[serde(skip)]
+    pub runs: Vec<RunReport>,
     /// Different goals behind the scores, in an environment that draws one for a whole run.
     pub goals: Option<usize>,
     /// `mean_last_3` over the runs; absent if one of them has none.
@@ -48,7 +58,7 @@ pub struct GroupReport {
     /// The score of each run's best evaluation, over the runs; absent unless that is what counts.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub best: Option<Spread>,
-    /// Runs that are counted although evaluations of them are missing, each with how many there are.
+    /// Those whose evaluations are not complete, each with how many there are.
     pub unfinished: Vec<String>,
     /// Runs that are not counted, each with the reason.
     pub left_out: Vec<String>,
@@ -70,19 +80,22 @@ impl GroupReport {
         format!("{seeds} seed{plural}{goals}, {steps} on {device}, scored in {scored_in}")
     }
 
-    /// The algorithm, and what the paper calls this variant of it where it has another name.
-    pub fn named(&self) -> String {
-        let is_other = |method: &&str| !method.eq_ignore_ascii_case(&self.variant);
-        match self.methods.iter().any(is_other) {
-            true => format!("{} ({})", self.agent, self.methods.join(", ")),
-            false => self.agent.clone(),
-        }
+    /// What its numbers are.
+    pub fn measure(&self) -> &'static str {
+        if self.normalised { "D4RL-normalised score" } else { self.runs.first().map_or("return", RunReport::measure) }
     }
 
-    /// How many gradient steps, and that a run has not come to the end of them if that is so.
+    /// Each seed with its run's score.
+    pub fn by_seed(&self) -> impl Iterator<Item = (&u64, &f64)> {
+        self.seeds.iter().zip(&self.scores)
+    }
+
+    /// How many gradient steps, and that the runs have not come to the end of them if that is so.
     pub fn steps_in_words(&self) -> String {
-        let part = if self.unfinished.is_empty() { "" } else { " (not complete)" };
-        format!("{} steps{part}", self.steps)
+        match self.reached {
+            Some(step) => format!("{step} of {} steps (not complete)", self.steps),
+            None => format!("{} steps", self.steps),
+        }
     }
 }
 
@@ -92,24 +105,41 @@ pub fn groups(runs: &[RunReport], select: Select) -> Vec<GroupReport> {
     for run in runs {
         let mut settings = settings::of_run(&run.config);
         settings.remove("seed");
-        match groups.iter_mut().find(|(known, members)| members[0].task == run.task && *known == settings) {
+        let is_alike = |(known, members): &&mut (Settings, Vec<&RunReport>)| {
+            let has_come_as_far = members[0].reached() == run.reached() || run.reached() == Some(0);
+            members[0].task == run.task && *known == settings && has_come_as_far
+        };
+        match groups.iter_mut().find(is_alike) {
             Some((_, members)) => members.push(run),
             None => groups.push((settings, vec![run])),
         }
     }
-    let differs = |index: usize| {
+    // The keys in which a group differs from others of its task.
+    let differs = |index: usize, is_other: &dyn Fn(&RunReport) -> bool| {
         let (own, members) = &groups[index];
-        let is_sibling =
-            |other: &RunReport| (&other.task, &other.algorithm) == (&members[0].task, &members[0].algorithm);
-        let siblings = groups.iter().filter(|(_, others)| is_sibling(others[0]));
-        let keys: BTreeSet<&String> = siblings.flat_map(|(other, _)| differences(own, other)).collect();
-        let value = |key: &String| own.get(key).map_or_else(|| format!("no {key}"), |value| format!("{key} = {value}"));
-        keys.into_iter().map(value).collect()
+        let others = groups.iter().filter(|(_, others)| others[0].task == members[0].task && is_other(others[0]));
+        others.flat_map(|(other, _)| differences(own, other)).collect::<BTreeSet<&String>>()
     };
-    groups.iter().enumerate().map(|(index, (_, runs))| group(runs, differs(index), select)).collect()
+    let all = groups.iter().enumerate().map(|(index, (own, runs))| {
+        let value = |key: &String| own.get(key).map_or_else(|| format!("no {key}"), |value| format!("{key} = {value}"));
+        let RunReport { algorithm, variant, .. } = runs[0];
+        let of_variant = differs(index, &|other| (&other.algorithm, &other.variant) == (algorithm, variant));
+        // The task's own values need no name: of several τ, that of the paper is just QUAD on each task.
+        let given = as_given(runs[0], true).map(|given| settings::of_experiment(&given)).unwrap_or_default();
+        let changed = of_variant.into_iter().filter(|key| given.get(*key) != own.get(*key)).map(value);
+        let method = Vec::from_iter(std::iter::once(named(algorithm, variant)).chain(changed)).join(", ");
+        let differs = differs(index, &|other| other.algorithm == *algorithm).into_iter().map(value).collect();
+        group(runs, method, differs, select)
+    });
+    all.collect()
 }
 
-fn group(runs: &[&RunReport], differs: Vec<String>, select: Select) -> GroupReport {
+/// QUAD's variants have names of their own: DAC, and none for behaviour cloning.
+fn named(algorithm: &str, variant: &str) -> String {
+    if algorithm == "quad" || algorithm == variant { variant.to_owned() } else { format!("{algorithm} {variant}") }
+}
+
+fn group(runs: &[&RunReport], method: String, differs: Vec<String>, select: Select) -> GroupReport {
     let mut counted: Vec<&RunReport> = Vec::new();
     let mut left_out = Vec::new();
     for run in runs {
@@ -126,6 +156,11 @@ fn group(runs: &[&RunReport], differs: Vec<String>, select: Select) -> GroupRepo
         let values: Option<Vec<_>> = counted.iter().map(|run| value(run)).collect();
         Spread::of(&values?)
     };
+    let score = |run: &&RunReport| match select {
+        Select::Last => run.mean_last_5,
+        Select::Best => run.best().map(|best| best.score.mean),
+    };
+    let scores: Option<Vec<f64>> = counted.iter().map(score).collect();
     let first = runs[0];
     let scored_in = joined(counted.iter().flat_map(|run| &run.precisions));
     let published = published::scores(&first.task);
@@ -136,12 +171,15 @@ fn group(runs: &[&RunReport], differs: Vec<String>, select: Select) -> GroupRepo
         task: first.task.clone(),
         algorithm: first.algorithm.clone(),
         variant: first.variant.clone(),
+        method,
         agent: first.agent.clone(),
         methods: published::methods(&first.algorithm, &first.variant),
         steps: first.steps,
+        reached: first.reached(),
         device: first.config.run.device,
         normalised: first.normalised,
         seeds: counted.iter().map(|run| run.seed).collect(),
+        scores: scores.filter(|_| first.is_complete()).unwrap_or_default(),
         goals: has_one_goal.then_some(counted.len()),
         mean_last_3: over(|run| run.mean_last_3),
         mean_last_5: over(|run| run.mean_last_5),
@@ -151,6 +189,7 @@ fn group(runs: &[&RunReport], differs: Vec<String>, select: Select) -> GroupRepo
         left_out,
         differs,
         departures: if published.is_empty() { Vec::new() } else { departures(&counted, &scored_in, select) },
+        runs: counted.into_iter().cloned().collect(),
         scored_in,
         published,
     }

@@ -1,16 +1,19 @@
-//! The whole report: a table of each run, a summary over seeds, and the paper's figures beside it.
+//! The whole report: a table of each run, summaries over seeds, methods and tasks, and the paper's tables with ours beside them.
 
+use std::collections::BTreeSet;
 use std::fmt::Alignment::{Left, Right};
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 
 use serde::Serialize;
 
-use super::published::{Published, Remark};
+use super::paper;
 use super::run::RunReport;
 use super::seeds::{self, GroupReport};
 use super::selection::Select;
 use super::spread::Spread;
-use super::table::{Style, Table};
+use super::study::{self, Comparison, MethodReport};
+use super::table::{Part, Style, Table};
+use crate::run::RunDir;
 
 /// What `learner report` says.
 #[derive(Clone, Debug, PartialEq, Serialize)]
@@ -21,35 +24,52 @@ pub struct Report {
     pub runs: Vec<RunReport>,
     /// The folders summarised over seeds.
     pub groups: Vec<GroupReport>,
+    /// Each method over its tasks and seeds.
+    pub study: Vec<MethodReport>,
+    /// Each method against the first.
+    pub comparisons: Vec<Comparison>,
+    /// Folders of runs that were named themselves.
+    #[serde(skip)]
+    in_full: BTreeSet<PathBuf>,
 }
 
 impl Report {
-    /// Reads run folders.
+    /// Reads run folders, and those below other folders.
     ///
     /// # Errors
-    /// One of them holds no run, or a file that no learner writes.
+    /// There is no run in any of them, or one has a file that no learner writes.
     pub fn read(paths: &[PathBuf], select: Select) -> anyhow::Result<Self> {
-        let runs: Vec<_> = paths.iter().map(|path| RunReport::read(path)).collect::<anyhow::Result<_>>()?;
-        Ok(Self { groups: seeds::groups(&runs, select), runs, select })
-    }
-
-    /// A table of each run; with several runs the summary over seeds; for tasks of the paper, its figures.
-    pub fn text(&self) -> String {
-        let mut parts: Vec<_> = self.runs.iter().map(|run| self.table(run)).collect();
-        parts.extend(self.select.warning().map(str::to_owned));
-        if self.runs.len() > 1 {
-            parts.push(self.over_seeds(Style::Text));
+        let mut found: Vec<PathBuf> = Vec::new();
+        for path in paths.iter().flat_map(|path| runs_in(path)) {
+            if !found.contains(&path) {
+                found.push(path);
+            }
         }
-        parts.extend(self.beside_the_paper(Style::Text));
-        parts.join("\n")
+        // Where there is none, the first path's error says so.
+        let dirs = if found.is_empty() { &paths[..1] } else { &found };
+        let runs: Vec<_> = dirs.iter().map(|path| RunReport::read(path)).collect::<anyhow::Result<_>>()?;
+        let groups = seeds::groups(&runs, select);
+        let (study, comparisons) = study::study(&groups);
+        Ok(Self { select, runs, groups, study, comparisons, in_full: paths.iter().cloned().collect() })
     }
 
-    /// The summary over seeds and the paper's figures as Markdown.
-    pub fn markdown(&self) -> String {
-        let mut parts: Vec<_> = self.select.warning().map(str::to_owned).into_iter().collect();
-        parts.push(self.over_seeds(Style::Markdown));
-        parts.extend(self.beside_the_paper(Style::Markdown));
-        parts.join("\n")
+    /// Every part: a table of each run that was named itself, the summaries over seeds, methods and tasks if there are several
+    /// runs, and the paper's tables where they have these tasks. Other styles than text leave out the single runs.
+    pub fn render(&self, style: Style) -> String {
+        let mut parts = Vec::new();
+        if style == Style::Text {
+            let in_full = self.runs.iter().filter(|run| self.in_full.contains(&run.dir));
+            parts.extend(in_full.map(|run| Part::Words(self.table(run))));
+        }
+        parts.extend(self.select.warning().map(|warning| Part::Words(warning.to_owned())));
+        if self.runs.len() > 1 || style != Style::Text {
+            parts.extend(self.over_seeds());
+        }
+        if self.runs.len() > 1 && !self.study.is_empty() {
+            parts.extend(study::tables(&self.study, &self.comparisons));
+        }
+        parts.extend([1, 2].into_iter().flat_map(|number| paper::table(number, &self.groups, self.select)));
+        parts.iter().map(|part| part.render(style)).collect::<Vec<_>>().join("\n")
     }
 
     fn table(&self, run: &RunReport) -> String {
@@ -61,7 +81,7 @@ impl Report {
         run.table() + &best.unwrap_or_default()
     }
 
-    fn over_seeds(&self, style: Style) -> String {
+    fn over_seeds(&self) -> Vec<Part> {
         let scores: &[_] = match self.select {
             Select::Last => &["last 3", "last 5", "last 50000 steps"],
             Select::Best => &["best evaluation"],
@@ -90,108 +110,26 @@ impl Report {
             row.push(g.differs.join(", "));
             table.push(row);
         }
-        let title = "Over seeds: mean ± standard deviation of the runs, divided by n - 1 (in parentheses: by n).";
-        let mut text = format!("{title}\n\n{}", table.render(style));
+        let title = "Over seeds: mean ± standard deviation of the runs, divided by n - 1 (in parentheses: by n).\n";
+        let mut marked = Vec::new();
         for group in &self.groups {
-            text.extend(group.unfinished.iter().map(|run| format!("\nNot complete: {run}.\n")));
-            text.extend(group.left_out.iter().map(|run| format!("\nNot counted: {run}.\n")));
+            marked.extend(group.unfinished.iter().map(|run| format!("Not complete, and in no other figure: {run}.\n")));
+            marked.extend(group.left_out.iter().map(|run| format!("Not counted: {run}.\n")));
         }
-        text
+        let mut parts = vec![Part::Words(title.to_owned()), Part::Table(table)];
+        parts.extend((!marked.is_empty()).then(|| Part::Words(marked.concat())));
+        parts
     }
+}
 
-    /// For each task of the paper: what these runs score, what is published, and how the protocols differ.
-    fn beside_the_paper(&self, style: Style) -> Vec<String> {
-        let mut tasks: Vec<&str> = Vec::new();
-        for group in self.groups.iter().filter(|group| !group.published.is_empty()) {
-            if !tasks.contains(&&*group.task) {
-                tasks.push(&group.task);
-            }
-        }
-        tasks.into_iter().map(|task| self.task(task, style)).collect()
+/// A folder that holds a run, or those of such folders at any depth below it, in alphabetical order.
+pub fn runs_in(path: &Path) -> Vec<PathBuf> {
+    if RunDir::is_occupied(path) {
+        return vec![path.to_owned()];
     }
-
-    fn task(&self, task: &str, style: Style) -> String {
-        let groups = || self.groups.iter().filter(|group| group.task == task);
-        let mut table = Table::new(&[
-            (task, Left),
-            ("score", Right),
-            ("± by n", Right),
-            ("± by n - 1", Right),
-            ("what stands behind it", Left),
-        ]);
-        let mut notes = String::from(
-            "\nThe paper does not say how its ± is computed. DAC's code, on which its own is built, divides by the number of \
-             seeds n.\n",
-        );
-        let published = groups().next().map_or(&[][..], |group| &group.published);
-        // As wide as the letters beside the paper's figures.
-        let width = published.iter().map(|published| published.remarks.len()).max().unwrap_or(0);
-        let number = |value: Option<f64>| value.map(|value| format!("{value:.2}")).unwrap_or_default();
-        for g in groups() {
-            let ours = format!("ours: {}", g.named());
-            let mut row = |score: Option<Spread>, what: &str| {
-                let [mean, by_n, by_one_less] =
-                    [score.map(|s| s.mean), score.and_then(|s| s.population_std), score.and_then(|s| s.std)];
-                let mean = mean.map_or_else(|| "-".to_owned(), |mean| number(Some(mean)));
-                let behind = format!("{what}; {}", g.behind());
-                table.push([ours.clone(), format!("{mean} {:width$}", ""), number(by_n), number(by_one_less), behind]);
-            };
-            match self.select {
-                Select::Last => row(g.mean_last_5, "last 5 evaluations"),
-                Select::Best => row(g.best, "best evaluation of each run"),
-            }
-            if self.select == Select::Last
-                && g.mean_last_50000_steps.is_some()
-                && g.mean_last_50000_steps != g.mean_last_5
-            {
-                row(g.mean_last_50000_steps, "last 50000 steps");
-            }
-            if !g.departures.is_empty() {
-                let departures = g.departures.join("; ");
-                notes += &format!("\nNot the paper's protocol ({ours}, {} steps): {departures}.\n", g.steps);
-            }
-            if let Some(goals) = g.goals {
-                notes += &format!(
-                    "\nAntMaze-v0 has one goal a run: {goals} behind this ± ({ours}), where D4RL's code asks for 50 to 100 \
-                     seeds.\n"
-                );
-            }
-        }
-        notes += &self.published(published, width, &mut table);
-        table.render(style) + &notes
-    }
-
-    /// Adds the paper's figures to a table; gives the remarks on them, to which the letters beside the figures refer.
-    fn published(&self, published: &[Published], width: usize, table: &mut Table) -> String {
-        let mut remarks: Vec<&Remark> = Vec::new();
-        for remark in published.iter().flat_map(|published| &published.remarks) {
-            if !remarks.contains(&remark) {
-                remarks.push(remark);
-            }
-        }
-        let lettered = || remarks.iter().zip('a'..='z');
-        for p in published {
-            let printed = |value: f64| format!("{value:.1}");
-            let letters = lettered().filter(|(remark, _)| p.remarks.contains(remark)).map(|(_, letter)| letter);
-            let mean = format!("{} {:width$}", printed(p.score.mean), String::from_iter(letters));
-            let std = p.score.std.map(printed).unwrap_or_default();
-            table.push([p.method.to_owned(), mean, std, String::new(), p.source.to_owned()]);
-        }
-        let mut text = String::from(if remarks.is_empty() { "" } else { "\nOf the paper's figures:\n\n" });
-        let with = |is_one: &dyn Fn(&Remark) -> bool| {
-            let figures = published.iter().filter(|published| published.remarks.iter().any(is_one));
-            Vec::from_iter(figures.map(|published| published.method)).join(", ")
-        };
-        for (remark, letter) in lettered() {
-            let selected = if remark.selected { "selected by test returns: " } else { "" };
-            text += &format!("- {letter} ({}): {selected}{}\n", with(&|other| other == *remark), remark.reason);
-        }
-        if self.select == Select::Best {
-            let selected = with(&|remark| remark.selected);
-            text += &format!(
-                "\nOf the paper's figures, such selection stands behind those of {selected}, as far as is known.\n"
-            );
-        }
-        text
-    }
+    let entries = std::fs::read_dir(path).into_iter().flatten().flatten();
+    // Links are not followed: they may lead back.
+    let folders = entries.filter(|entry| entry.file_type().is_ok_and(|kind| kind.is_dir())).map(|entry| entry.path());
+    let folders: BTreeSet<PathBuf> = folders.collect();
+    folders.iter().flat_map(|folder| runs_in(folder)).collect()
 }

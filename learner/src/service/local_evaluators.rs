@@ -1,6 +1,7 @@
-//! Evaluators that the learner starts itself, and that end with it: `learner train --evaluators N`.
+//! Evaluators that the learner starts itself, and that end with it: `learner train --evaluators N`, and those of a sweep.
 
 use std::fs::File;
+use std::io;
 use std::os::unix::process::CommandExt;
 use std::path::{Path, PathBuf};
 use std::process::{Child, Command, Stdio};
@@ -16,10 +17,30 @@ const EVALUATOR: &str = "evaluator";
 const LEAVE: Duration = Duration::from_secs(4);
 const GLANCE: Duration = Duration::from_millis(20);
 
+/// Makes a process that will end when the thread that starts it does, and that hears nothing of a terminal's Ctrl-C: that is
+/// for its parent, which tells it to leave.
+fn end_with_parent(command: &mut Command) {
+    command.stdin(Stdio::null()).process_group(0);
+    // SAFETY: the new process makes one system call, which may be made between fork and exec.
+    #[allow(unsafe_code)]
+    unsafe {
+        command.pre_exec(|| Ok(set_parent_process_death_signal(Some(Signal::TERM))?));
+    }
+}
+
+/// Starts a process that ends with this thread, with all that it says at the end of a file.
+pub(crate) fn spawn_logged(command: &mut Command, log: &Path) -> io::Result<Child> {
+    end_with_parent(command);
+    let file = File::options().create(true).append(true).open(log)?;
+    command.stdout(file.try_clone()?).stderr(file).spawn()
+}
+
 /// What is to be started, and what was.
 #[derive(Default)]
 pub(crate) struct LocalEvaluators {
     count: usize,
+    /// Cores for all of them together.
+    cores: usize,
     program: PathBuf,
     started: Vec<Started>,
 }
@@ -32,11 +53,11 @@ struct Started {
 }
 
 impl LocalEvaluators {
-    /// So many, which are not started yet.
+    /// So many, which are not started yet, with so many cores for all of them together.
     ///
     /// # Errors
     /// There is no evaluator beside this program, nor on the PATH.
-    pub fn new(count: usize) -> anyhow::Result<Self> {
+    pub fn new(count: usize, cores: usize) -> anyhow::Result<Self> {
         if count == 0 {
             return Ok(Self::default());
         }
@@ -54,22 +75,19 @@ impl LocalEvaluators {
                     .hint(hint);
             }
         }
-        Ok(Self { count, program, started: Vec::new() })
+        Ok(Self { count, cores, program, started: Vec::new() })
     }
 
-    /// Starts them. They connect to the first of these endpoints, and write their logs into the run's folder.
+    /// Starts them. They connect to the first of these endpoints, and write their logs into a folder.
     ///
     /// To be called by a thread that lives as long as the learner: the system ends them when that thread ends.
     ///
     /// # Errors
     /// A process or its log cannot be made.
-    pub fn start(&mut self, reachable_at: &[String], run_dir: &Path) -> anyhow::Result<()> {
+    pub fn start(&mut self, reachable_at: &[String], folder: &Path) -> anyhow::Result<()> {
         for number in 1..=self.count {
-            let log = run_dir.join(format!("evaluator-{number}.log"));
-            let started = self.command(reachable_at, number).and_then(|mut command| {
-                let file = File::options().create(true).append(true).open(&log)?;
-                Ok(command.stdout(file.try_clone()?).stderr(file).spawn()?)
-            });
+            let log = folder.join(format!("evaluator-{number}.log"));
+            let started = spawn_logged(&mut self.command(reachable_at, number), &log);
             let process =
                 started.with_context(|| format!("cannot start an evaluator that logs to {}", log.display()))?;
             self.started.push(Started { process, log, ended: false });
@@ -77,21 +95,13 @@ impl LocalEvaluators {
         Ok(())
     }
 
-    fn command(&self, reachable_at: &[String], number: usize) -> anyhow::Result<Command> {
+    fn command(&self, reachable_at: &[String], number: usize) -> Command {
         let mut command = Command::new(&self.program);
         command.args(["serve", "--name", &format!("{EVALUATOR}-{number}"), "--connect"]).args(reachable_at.first());
         if std::env::var_os("RAYON_NUM_THREADS").is_none() {
-            let cores = std::thread::available_parallelism()?.get();
-            command.env("RAYON_NUM_THREADS", cores.div_ceil(self.count).to_string());
+            command.env("RAYON_NUM_THREADS", self.cores.div_ceil(self.count).to_string());
         }
-        // A terminal's Ctrl-C is for the learner, which lets them deliver what they have.
-        command.stdin(Stdio::null()).process_group(0);
-        // SAFETY: the new process makes one system call, which may be made between fork and exec.
-        #[allow(unsafe_code)]
-        unsafe {
-            command.pre_exec(|| Ok(set_parent_process_death_signal(Some(Signal::TERM))?));
-        }
-        Ok(command)
+        command
     }
 
     /// What people are to be told of those that have ended by themselves.

@@ -6,6 +6,7 @@ mod presets;
 mod published;
 mod report;
 mod run;
+mod study;
 mod threads;
 mod verify;
 

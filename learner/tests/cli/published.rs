@@ -13,18 +13,18 @@ fn the_papers_protocol_stands_beside_the_papers_figures() {
     let group = reported.group();
     assert_eq!((&group["mean_last_5"]["mean"], &group["mean_last_50000_steps"]["mean"]), (&json!(99.5), &json!(100.5)));
     assert_eq!((&group["departures"], &group["published"][0]["score"]["mean"]), (&json!([]), &json!(104.9)));
-    reported.has_row(&[HOPPER, "score", "± by n ", "± by n - 1"]);
     reported.has_row(&[
-        "ours: quad",
-        " 99.50 ",
-        " 1.12 ",
-        " 1.29 ",
-        "last 5 evaluations; 4 seeds, 2000000 steps on cpu",
+        "Table 1 of the paper",
+        "divided by n - 1 (in parentheses: by n)",
+        "DAC's code",
+        "number of seeds n",
     ]);
-    reported.has_row(&["ours: quad", " 100.50 ", "last 50000 steps", "scored in f32"]);
-    reported.has_row(&["QUAD", " 104.9 ", " 0.2 ", "Table 1"]);
-    reported.has_row(&["IQL"]);
-    reported.has_row(&["DAC's code", "divides by the number of seeds n"]);
+    reported.has_row(&["task", "ours: quad", "QUAD", "DAC", "IQL"]);
+    reported.has_row(&[HOPPER, " 99.50 ± 1.29 (1.12) [1]", " 104.9 ± 0.2 ", " 103.1 ", " 94.7 "]);
+    reported.has_row(&["Table 2 of the paper"]);
+    reported.has_row(&[HOPPER, " 99.50 ± 1.29 (1.12) [1]", " 104.9 ± 0.2", " 103.4 ± 0.2"]);
+    reported.has_row(&["- [1] 4 seeds, 2000000 steps on cpu, scored in f32."]);
+    reported.has_row(&["Sources: QUAD: Table 1; DAC: Table 1, from Fang et al. 2024"]);
     assert!(!reported.text.contains("Not the paper's"), "{}", reported.text);
     assert!(reported.markdown.contains("\n| --- |"), "{}", reported.markdown);
 }
@@ -35,18 +35,16 @@ fn what_is_known_of_the_papers_figures_stands_below_them() {
     let published = reported.group()["published"].as_array().unwrap();
     let of = |method: &str| published.iter().find(|figure| figure["method"] == method).unwrap();
     assert_eq!((&of("QUAD")["remarks"], &of("DQL")["remarks"][0]["selected"]), (&json!([]), &json!(true)));
-    reported.has_row(&["AlignIQL", " 54.0 bcd "]);
-    reported.has_row(&["DTQL", " 66.4 de "]);
-    reported.says(&["\n- a (DQL): selected by test returns: most likely the best of a run's"]);
+    reported.has_row(&["antmaze-large-diverse-v0", " 54.0 bcd ", " 66.4 de ", " 14.9 h"]);
+    reported.says(&["- a (DQL): selected by test returns: most likely the best of a run's"]);
     reported.has_row(&["- d (AlignIQL, DTQL): AlignIQL's and DTQL's most likely changed places"]);
-    reported.has_row(&["CQL", " 14.9 h "]);
-    reported.has_row(&["- h (CQL): ", "CORL", " 20.5"]);
+    reported.has_row(&["- h (CQL): ", "CORL", " 20.5 in antmaze-large-diverse-v0"]);
 }
 
 #[test]
 fn the_best_evaluation_counts_only_where_it_is_asked_for_and_the_report_says_so() {
     // Of seed s the best evaluation has 1000 + s, at 20,000 steps.
-    let runs = paper(HOPPER, 200_000, |step| if step == 20_000 { 1000.0 } else { 50.0 });
+    let runs = paper(HOPPER, 2_000_000, |step| if step == 20_000 { 1000.0 } else { 50.0 });
     let [last, best] = [&[][..], &["--select", "best"]].map(|flags| report_with(&runs, flags));
     assert_eq!((&last.json["select"], &last.group()["best"]), (&json!("last"), &Value::Null));
     assert_eq!((&best.json["select"], &best.group()["best"]["mean"]), (&json!("best"), &json!(1001.5)));
@@ -55,7 +53,8 @@ fn the_best_evaluation_counts_only_where_it_is_asked_for_and_the_report_says_so(
     best.says(&reasons);
     best.says(&["such selection stands behind those of DQL, EQL, Onestep-RL, as far as is known"]);
     best.has_row(&["task", "best evaluation"]);
-    best.has_row(&["ours: quad", " 1001.50 ", "best evaluation of each run; 4 seeds"]);
+    best.has_row(&["Table 1 of the paper", "a run's score is its best evaluation"]);
+    best.has_row(&[HOPPER, " 1001.50 ± 1.29 (1.12) [1]"]);
     assert!(best.text.contains("mean score of the best evaluation, after 20000 steps: 1003.00"), "{}", best.text);
     for words in reasons.into_iter().chain(["1001.50", "such selection", "after 20000 steps"]) {
         assert!(!last.text.contains(words) && !last.markdown.contains(words), "{words} in\n{}", last.text);
@@ -106,7 +105,8 @@ fn another_algorithm_is_compared_with_its_own_authors_values() {
     };
     let reported = report(&guided("dac"));
     assert_eq!(reported.group()["departures"], json!([]), "{}", reported.text);
-    reported.has_row(&["ours: quad, guidance dac, 10 candidates (DAC-Rep, DAC)", " 51.50 "]);
+    reported.has_row(&["ours: dac", "DAC-Rep"]);
+    reported.has_row(&[HOPPER, " 51.50 "]);
     let reported = report(&guided("none"));
     assert_eq!(reported.group()["departures"], json!(["agent.guidance is \"none\", not \"quad\""]));
 
@@ -120,6 +120,7 @@ fn another_algorithm_is_compared_with_its_own_authors_values() {
         (&json!([]), &json!([])),
         "of other algorithms nothing is expected"
     );
-    reported.has_row(&["ours: iql "]);
-    reported.has_row(&["ours: quad, guidance quad, 10 candidates "]);
+    reported.has_row(&["ours: iql", "ours: quad"]);
+    reported.has_row(&[HOPPER, " - [1] ", " - [2] "]);
+    reported.has_row(&["- [2] 1 seed, 100000 of 2000000 steps (not complete) on cpu"]);
 }

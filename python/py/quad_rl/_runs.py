@@ -40,7 +40,7 @@ def runs(folders: str | PathLike[str] | Iterable[str | PathLike[str]] = "runs/*"
 
 
 def _rows(run: dict[str, Any]) -> list[dict[str, Any]]:
-    of_run = {name: value for name, value in run.items() if name not in ("evaluations", "missing")}
+    of_run = _flat("", {name: value for name, value in run.items() if name not in ("evaluations", "missing")})
     of_run |= _flat("", json.loads(_quad_rl.toml_to_json(Path(run["dir"], "config.toml").read_text())))
     evaluations = [
         {

@@ -10,3 +10,4 @@ mod local_evaluators;
 mod names;
 mod pace;
 mod runs;
+mod sweep;

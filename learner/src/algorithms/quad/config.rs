@@ -15,6 +15,12 @@ pub(super) enum Guidance {
     Dac,
     /// No Q-gradient: behaviour cloning. The critics are trained all the same.
     None,
+    /// A control: Q-gradients weighted by the same λ in all samples, the user's.
+    Constant,
+    /// A control, strength without selection: weighted by the moving average of λ at the sample's denoising step.
+    Mean,
+    /// A control, distribution without selection: weighted by the λ of another sample at the same denoising step.
+    Shuffled,
 }
 
 /// How a critic's values of several sampled next actions become one.
@@ -65,6 +71,8 @@ pub(super) struct Quad {
     pub tau: f32,
     /// Stabiliser δ of Eq. 24, on the scale of squared normalised Q-gradients.
     pub delta: Positive,
+    /// λ of guidance `constant`, and only of it.
+    pub lambda: Option<Share>,
     /// Next actions sampled per next state for the target, S.
     pub samples: Count,
     /// How their values are combined.
@@ -81,7 +89,7 @@ pub(super) struct Quad {
     pub gradient_clip: Positive,
     /// EMA rate of both target networks, α_ema.
     pub ema_rate: Rate,
-    /// EMA rate of ν̂² (Eq. 23).
+    /// EMA rate of ν̂² (Eq. 23), and of λ's means with guidance `mean`.
     pub nu_ema_rate: Rate,
     /// The target actor follows in updates whose number, from 0, is a multiple of this …
     pub actor_ema_every: Steps,
@@ -94,6 +102,11 @@ impl Quad {
     pub fn read(table: &toml::Table) -> Result<Self, AgentError> {
         let config: Self = read(table)?;
         check("tau", config.tau, config.tau > 0.0, "above 0 (`inf` is allowed)")?;
+        match (config.guidance, config.lambda) {
+            (Guidance::Constant, None) => check("lambda", "absent", false, "given where agent.guidance is `constant`")?,
+            (Guidance::Constant, _) | (_, None) => {}
+            (_, Some(lambda)) => check("lambda", *lambda, false, "absent unless agent.guidance is `constant`")?,
+        }
         let Eta { initial, minimum, maximum, .. } = config.eta;
         check("eta.maximum", *maximum, *maximum >= *minimum, "at least eta.minimum")?;
         let within = (*minimum..=*maximum).contains(&*initial);

@@ -1,12 +1,11 @@
 //! Tests: the update against an independent implementation (docs/golden.md).
 
 use super::*;
-use crate::algorithms::diffusion::Noisy;
 use crate::algorithms::golden::{
     Golden, batch, chain_noise, check_update, context, denoising, devices, fresh, goldens, load, table,
 };
 use crate::algorithms::hyperparameters::{NotNegative, Positive};
-use candle_core::Device;
+use candle_core::{DType, Device};
 
 fn start(golden: &Golden, device: &Device) -> Quad {
     let mut quad = Quad::new(Config::read(&table(golden)).unwrap(), context(golden, device)).unwrap();
@@ -17,7 +16,9 @@ fn start(golden: &Golden, device: &Device) -> Quad {
 }
 
 fn noise(golden: &Golden, device: &Device) -> Noise {
-    Noise { next: chain_noise(golden, "next_noise", device), denoising: denoising(golden, device) }
+    let permutation = golden.inputs.get("permutation");
+    let permutation = permutation.map(|rows| rows.to_dtype(DType::U32).unwrap().to_device(device).unwrap());
+    Noise { next: chain_noise(golden, "next_noise", device), denoising: denoising(golden, device), permutation }
 }
 
 fn check(golden: &Golden, device: &Device) {
@@ -85,7 +86,7 @@ fn the_noise_of_a_step_is_repeatable_and_no_other_steps() {
     let golden = goldens("quad").remove(0);
     let quad = start(&golden, &Device::Cpu);
     let numbers = |step: u64| {
-        let Noise { next, denoising: Denoising { t, epsilon } } = quad.noise(step).unwrap();
+        let Noise { next, denoising: Denoising { t, epsilon }, .. } = quad.noise(step).unwrap();
         let [next, epsilon] = [next, epsilon].map(|x| x.flatten_all().unwrap().to_vec1::<f32>().unwrap());
         (next, t, epsilon)
     };
@@ -109,7 +110,7 @@ fn every_denoising_step_is_drawn_equally_often() {
 
 #[test]
 fn golden_update_of_a_fresh_seed() {
-    for variant in ["quad", "dac", "maxq", "none", "one-sample", "ten-critics"] {
+    for variant in ["quad", "dac", "maxq", "none", "one-sample", "ten-critics", "constant", "mean", "shuffled"] {
         let Some(golden) = fresh(variant) else { return };
         devices().iter().for_each(|device| check(&golden, device));
     }
@@ -129,20 +130,34 @@ fn golden_parts() {
         }
         // Guidance comes from the target critics as the update has just moved them.
         quad.target_critics.weights_mut().load(&mut golden.expected.clone(), "target_critic.").unwrap();
-        let Noisy { actions: noisy, t, .. } =
-            noise.denoising.noisy(quad.actor.network.schedule(), &batch.actions).unwrap();
-        golden.close("noisy_actions", &noisy);
-        let gradients = quad.target_critics.action_gradients(&batch.observations, &noisy).unwrap();
+        let noisy = noise.denoising.noisy(quad.actor.network.schedule(), &batch.actions).unwrap();
+        golden.close("noisy_actions", &noisy.actions);
+        let gradients = quad.target_critics.action_gradients(&batch.observations, &noisy.actions).unwrap();
         golden.close("critic_action_gradients", &gradients);
-        let predicted = quad.actor.network.predict(&batch.observations, &noisy, &t).unwrap().detach();
-        let guide = quad.guide(&batch, &noisy, &predicted).unwrap();
+        let predicted = quad.actor.network.predict(&batch.observations, &noisy.actions, &noisy.t).unwrap().detach();
+        let guide = quad.guide(&batch, &noisy, &predicted, noise.permutation.as_ref()).unwrap();
         let mean = gradients.mean(0).unwrap().broadcast_div(&golden.expected["q_scale"]).unwrap();
         let difference =
             (&guide.gradient - &mean).unwrap().abs().unwrap().max_all().unwrap().to_scalar::<f32>().unwrap();
         assert!(difference < 1e-4 * mean.abs().unwrap().max_all().unwrap().to_scalar::<f32>().unwrap());
         golden.close("nu_squared", &guide.nu_squared);
+        golden.close("sigma_squared", &guide.sigma_squared);
         golden.close("lambda", &guide.lambda);
     }
+}
+
+#[test]
+fn a_shuffle_moves_samples_among_those_of_their_denoising_step() {
+    let golden = goldens("quad").into_iter().find(|golden| golden.config["agent"]["guidance"] == "shuffled").unwrap();
+    let mut quad = start(&golden, &Device::Cpu);
+    quad.context.batch_size = 500;
+    let Noise { denoising: Denoising { t, .. }, permutation, .. } = quad.noise(0).unwrap();
+    let mut rows: Vec<u32> = permutation.unwrap().to_vec1().unwrap();
+    assert!(rows.iter().zip(&t).all(|(row, step)| t[*row as usize] == *step));
+    // Of n things in random order one stays on average; of three t's three do.
+    assert!(rows.iter().enumerate().filter(|(place, row)| *place == **row as usize).count() < 20);
+    rows.sort_unstable();
+    assert_eq!(rows, Vec::from_iter(0..500));
 }
 
 #[test]

@@ -30,16 +30,6 @@ pub(super) const METRICS: &[Metric] = &[
         help: "Strength η of behaviour cloning (Eq. 19). With a threshold b it rises while the BC loss is above b and falls while it is below; without one, or without guidance, it is constant.",
     },
     Metric {
-        name: "lambda_mean",
-        label: "λ",
-        help: "Mean over the batch of λ = ν̂²/(ν̂² + σ²/τ + δ) (Eq. 24), in (0, 1]: how far the critics' gradients are trusted. 1 with guidance dac, 0 with guidance none.",
-    },
-    Metric {
-        name: "delta_share",
-        label: "",
-        help: "Share of the batch, 0 to 1, in which δ is more than a hundredth of the denominator of λ (Eq. 24), so that it decides λ and not the critics. 0 unless guidance is quad.",
-    },
-    Metric {
         name: "nu_squared",
         label: "",
         help: "ν̂²: moving average of the variance over the batch of the critics' mean alignment (Eq. 21–23). 0 without guidance.",
@@ -47,4 +37,41 @@ pub(super) const METRICS: &[Metric] = &[
     Metric { name: "critic_gradient_norm", label: "", help: "Global norm of the critics' gradient before clipping." },
     Metric { name: "actor_gradient_norm", label: "", help: "Global norm of the actor's gradient before clipping." },
     Metric { name: "learning_rate", label: "", help: "The actor's learning rate; falls to 0 along a cosine." },
+    Metric {
+        name: "delta_share",
+        label: "",
+        help: "Share of the batch, 0 to 1, in which δ is more than a hundredth of the denominator of λ (Eq. 24), so that it decides λ and not the critics. 0 with guidance dac and constant, and, like all that follow, without guidance.",
+    },
+    Metric {
+        name: "lambda_mean",
+        label: "λ",
+        help: "Mean over the batch of λ = ν̂²/(ν̂² + σ²/τ + δ) (Eq. 24), in (0, 1]: how far the critics' gradients are trusted. With guidance constant, mean or shuffled it is what they have in its place, as in all metrics of λ; 1 with dac.",
+    },
+    Metric { name: "lambda_quantile_10", label: "", help: "A tenth of the batch has a λ below this." },
+    Metric { name: "lambda_quantile_50", label: "", help: "Median of λ over the batch." },
+    Metric { name: "lambda_quantile_90", label: "", help: "A tenth of the batch has a λ above this." },
+    Metric {
+        name: "lambda_fifth_1",
+        label: "",
+        help: "Mean of λ over the samples whose denoising step t is in the first fifth of 1…T, the least noisy; with T = 5, as in the paper, it is t = 1. Of all samples where the batch has none of it.",
+    },
+    Metric { name: "lambda_fifth_2", label: "", help: "The same of t in the second fifth." },
+    Metric { name: "lambda_fifth_3", label: "", help: "The same of t in the third fifth." },
+    Metric { name: "lambda_fifth_4", label: "", help: "The same of t in the fourth fifth." },
+    Metric { name: "lambda_fifth_5", label: "", help: "The same of t in the last fifth, the noisiest." },
+    Metric {
+        name: "lambda_above_99_share",
+        label: "",
+        help: "Share of the batch, 0 to 1, whose λ is above 0.99: there QUAD is DAC to within 1 %.",
+    },
+    Metric {
+        name: "variance_ratio",
+        label: "",
+        help: "Mean over the batch of σ²/(ν̂² + δ), which is what λ falls with: the critics' disagreement on the alignment (Eq. 22) over how much it varies between samples.",
+    },
+    Metric {
+        name: "guidance_cosine",
+        label: "",
+        help: "Mean over the batch of the cosine between the gradients of guidance, ḡ, and of behaviour cloning, ε_θ − ε, with respect to ε_θ: 1 where both pull in one direction, −1 where they pull against each other.",
+    },
 ];

@@ -53,6 +53,14 @@ fn every_remark_is_on_a_figure_and_says_something_else_than_it() {
     }
 }
 
+/// The table's tasks are those that a method of it alone has figures for.
+#[test]
+fn table_2_has_seven_tasks() {
+    let is_of =
+        |number: u8| TABLES.scores.keys().filter(move |task| scores(task).iter().any(|one| one.tables == [number]));
+    assert_eq!([is_of(1).count(), is_of(2).count()], [15, 7]);
+}
+
 /// Each is a line below a table, and has a letter there.
 #[test]
 fn the_remarks_of_a_task_are_few_and_short() {

@@ -11,3 +11,15 @@ fn columns_are_aligned_by_characters() {
     let markdown = "| a    |     b |\n| --- | ---: |\n| long |     1 |\n| x    | 1 ± 2 |\n";
     assert_eq!(table.render(Style::Markdown), markdown);
 }
+
+#[test]
+fn what_a_format_would_take_for_its_own_is_escaped() {
+    let mut table = Table::new(&[("a_b", Left), ("b", Right)]);
+    table.push(["50 %, & more".to_owned(), "1 ± 2 \"x\"".to_owned()]);
+    let latex = "\\begin{tabular}{lr}\n\\toprule\na\\_b & b \\\\\n\\midrule\n50 \\%, \\& more & 1 $\\pm$ 2 \"x\" \\\\\n\\bottomrule\n\\end{tabular}\n";
+    assert_eq!(table.render(Style::Latex), latex);
+    assert_eq!(table.render(Style::Csv), "a_b,b\n\"50 %, & more\",\"1 ± 2 \"\"x\"\"\"\n");
+    let words = Part::Words("±1 of a_b\nand\n".to_owned());
+    assert_eq!(words.render(Style::Latex), "$\\pm$1 of a\\_b\n\nand\n\n");
+    assert_eq!(words.render(Style::Csv), "# ±1 of a_b\n# and\n");
+}

@@ -1,0 +1,138 @@
+//! `learner sweep`, from the command line to the sentence about all runs.
+
+use std::collections::{BTreeMap, VecDeque};
+use std::env;
+use std::fmt::Alignment::{Left, Right};
+use std::fs;
+use std::path::{Path, PathBuf};
+use std::thread::available_parallelism;
+
+use anyhow::{Context, anyhow};
+use quad_service::{Hint, SessionError, hinted, open_router, stay_in_background, unfinished};
+use tracing::info;
+
+use crate::cli::{SweepArgs, print};
+use crate::report::{Style, Table};
+use crate::service::LocalEvaluators;
+use crate::sweep::{Cost, Ended, PlannedRun, State, Study, Sweep};
+
+/// Runs, and how far each is.
+type Runs = Vec<(PlannedRun, State)>;
+
+/// Does it; an error is a run that is not complete.
+pub fn sweep(args: &SweepArgs) -> anyhow::Result<()> {
+    let study = Study::read(&args.study)?;
+    let folder = args.runs.join(&study.name);
+    let runs = chosen(&study, args, &folder)?;
+    if args.list {
+        return print(&list(&runs));
+    }
+    info!("{}: {}", study.name, study.about);
+    let count = runs.len();
+    let left: Runs = runs.into_iter().filter(|(_, state)| *state != State::Complete).collect();
+    let begun = left.iter().filter(|(_, state)| *state != State::NotBegun).count();
+    info!("{count} runs: {} complete, {} to do, of which {begun} have begun", count - left.len(), left.len());
+    let ended = if left.is_empty() { Ended::default() } else { work(args, &folder, left)? };
+    conclude(&folder, count, ended)
+}
+
+/// The runs that were asked for, and how far each is.
+fn chosen(study: &Study, args: &SweepArgs, folder: &Path) -> anyhow::Result<Runs> {
+    let runs = study.runs.len();
+    if let Some(index) = args.index.filter(|index| *index >= runs) {
+        let error = anyhow!("there is no run {index}; the study has {runs}, from 0 to {}", runs - 1);
+        return Err(hinted(error, "--list prints them"));
+    }
+    let is_chosen = |run: &&PlannedRun| {
+        args.index.is_none_or(|index| run.index == index) && args.shard.is_none_or(|shard| shard.has(run.index))
+    };
+    let with_state = |run: &PlannedRun| Ok((run.clone(), State::of(run, &folder.join(&run.name))?));
+    study.runs.iter().filter(is_chosen).map(with_state).collect()
+}
+
+fn list(runs: &Runs) -> String {
+    let mut table = Table::new(&[("index", Right), ("run", Left), ("state", Left)]);
+    for (PlannedRun { index, name, experiment, .. }, state) in runs {
+        table.push([index.to_string(), name.clone(), state.text(experiment.steps)]);
+    }
+    table.render(Style::Text)
+}
+
+/// How the machine is shared.
+struct Machine {
+    /// Runs at a time.
+    jobs: usize,
+    /// Threads of each learner.
+    threads: usize,
+    /// Evaluators for all of them.
+    evaluators: LocalEvaluators,
+}
+
+impl Machine {
+    /// For so many runs: what the command line does not say follows from the cores that this process may use.
+    fn share(args: &SweepArgs, runs: usize) -> anyhow::Result<Self> {
+        let cores = available_parallelism()?.get();
+        let threads = env::var("RAYON_NUM_THREADS").ok().and_then(|threads| threads.parse().ok()).unwrap_or(1);
+        let at_most = args.jobs.map_or(cores * 3 / 4 / threads, usize::from);
+        let jobs = at_most.clamp(1, runs);
+        let left = cores.saturating_sub(jobs * threads).max(1);
+        let count = if args.connect.is_some() { 0 } else { args.evaluators.unwrap_or(left) };
+        Ok(Self { jobs, threads, evaluators: LocalEvaluators::new(count, left)? })
+    }
+}
+
+fn work(args: &SweepArgs, folder: &Path, left: Runs) -> anyhow::Result<Ended> {
+    let Machine { jobs, threads, mut evaluators } = Machine::share(args, left.len())?;
+    // Once, not by each learner.
+    let mut datasets = BTreeMap::<Option<String>, PathBuf>::new();
+    for (run, _) in &left {
+        let dataset = &run.experiment.dataset;
+        if !datasets.contains_key(dataset) {
+            datasets.insert(dataset.clone(), run.source.obtain()?.path);
+        }
+    }
+    let mut step_seconds = BTreeMap::new();
+    // A single run, as of an array job, begins at once and foretells its time itself.
+    if args.index.is_none() {
+        let cost = Cost::measure(&left, |run| &*datasets[&run.experiment.dataset])?;
+        info!("{}", cost.text(jobs));
+        step_seconds = cost.step_seconds;
+    }
+    // The tasks of an array job do not write into each other's logs.
+    let logs = args.index.map_or(folder.to_owned(), |_| folder.join(&left[0].0.name));
+    fs::create_dir_all(&logs).with_context(|| format!("cannot make the folder {}", logs.display()))?;
+
+    let mut runtime = tokio::runtime::Builder::new_multi_thread();
+    let runtime = runtime.worker_threads(2).on_thread_start(stay_in_background).enable_all().build()?;
+    let ended = runtime.block_on(async {
+        let (_router, endpoint) = match args.connect.clone() {
+            Some(endpoint) => (None, endpoint),
+            None => {
+                open_router().await.map(|(router, endpoint)| (Some(router), endpoint)).hint_of(SessionError::hint)?
+            }
+        };
+        evaluators.start(std::slice::from_ref(&endpoint), &logs)?;
+        info!(
+            "{jobs} at a time; learners and evaluators meet at {endpoint}; logs are {}/RUN/learner.log",
+            folder.display()
+        );
+        let (folder, waiting) = (folder.to_owned(), VecDeque::from(left));
+        anyhow::Ok(Sweep { folder, waiting, jobs, threads, endpoint, evaluators, step_seconds }.run().await)
+    });
+    runtime.shutdown_background();
+    ended
+}
+
+/// Tells how all runs have ended.
+fn conclude(folder: &Path, count: usize, ended: Ended) -> anyhow::Result<()> {
+    let Ended { unfinished: stopped, failed } = ended;
+    if !failed.is_empty() {
+        let error = anyhow!("{} of {count} runs have failed:\n  {}", failed.len(), failed.join("\n  "));
+        return Err(error).hint("when that is mended, the same command goes on with what is not complete");
+    }
+    if stopped > 0 {
+        let kept = "what they have reached is kept, and the same command goes on from there";
+        return Err(unfinished(anyhow!("{stopped} of {count} runs are not complete"), kept));
+    }
+    print(&format!("all {count} runs are complete: learner report {}", folder.display()))
+}

@@ -1,0 +1,141 @@
+//! Tables 1 and 2 of the paper, with our runs beside its figures.
+
+use std::fmt::Alignment::{Left, Right};
+
+use super::published::{Published, Remark};
+use super::seeds::GroupReport;
+use super::selection::Select;
+use super::spread::Spread;
+use super::table::{Part, Table};
+
+/// What the paper prints for a task.
+type Figure<'a> = (&'a str, &'a Published);
+
+/// A table of the paper, in its rows the tasks that some of these runs have learnt, with what stands behind each figure below
+/// it; nothing without such runs.
+pub fn table(number: u8, groups: &[GroupReport], select: Select) -> Vec<Part> {
+    // Table 2 is about the guidance of QUAD.
+    let is_in = |group: &&GroupReport| {
+        let is_of_table = group.published.iter().any(|published| published.tables == [number]);
+        is_of_table && (number == 1 || group.algorithm == "quad")
+    };
+    let groups: Vec<&GroupReport> = groups.iter().filter(is_in).collect();
+    if groups.is_empty() {
+        return Vec::new();
+    }
+    let tasks = once_each(groups.iter().map(|group| &*group.task));
+    let ours = once_each(groups.iter().map(|group| &*group.method));
+    let of_task = |task: &&str| groups.iter().find(|group| group.task == *task).map(|group| (group, &group.published));
+    let figures =
+        tasks.iter().filter_map(of_task).flat_map(|(group, all)| all.iter().map(|figure| (&*group.task, figure)));
+    let figures: Vec<Figure> = figures.filter(|(_, figure)| figure.tables.contains(&number)).collect();
+    let theirs = once_each(figures.iter().map(|(_, figure)| figure.method));
+    let mut notes = Notes::of(&figures);
+
+    let header = ours.iter().map(|method| format!("ours: {method}")).chain(theirs.iter().map(|m| (*m).to_owned()));
+    let header = std::iter::once((String::from("task"), Left)).chain(header.map(|name| (name, Right)));
+    let mut table = Table::new(&Vec::from_iter(header));
+    for task in tasks {
+        let mut row = vec![task.to_owned()];
+        for method in &ours {
+            let of_method = |group: &&&GroupReport| group.task == task && group.method == *method;
+            // Complete runs come before those that are not.
+            let group = groups.iter().filter(of_method).min_by_key(|group| group.reached.is_some());
+            row.push(group.map_or_else(|| "-".to_owned(), |group| notes.ours(group)));
+        }
+        row.extend(theirs.iter().map(|method| {
+            let figure = figures.iter().find(|(of, figure)| *of == task && figure.method == *method);
+            figure.map_or_else(|| "-".to_owned(), |(_, figure)| notes.theirs(figure))
+        }));
+        table.push(row);
+    }
+    let score = match select {
+        Select::Last => "the mean of its last 5 evaluations",
+        Select::Best => "its best evaluation",
+    };
+    let title = format!(
+        "Table {number} of the paper. Ours: mean ± standard deviation over seeds, divided by n - 1 (in parentheses: by n); a run's \
+         score is {score}. The paper does not say how its ± is computed; DAC's code, on which its own is built, divides by \
+         the number of seeds n.\n"
+    );
+    vec![Part::Words(title), Part::Table(table), Part::Words(notes.text(&figures, select))]
+}
+
+fn once_each<'a>(names: impl Iterator<Item = &'a str>) -> Vec<&'a str> {
+    let mut known = Vec::new();
+    for name in names {
+        if !known.contains(&name) {
+            known.push(name);
+        }
+    }
+    known
+}
+
+/// What stands behind figures: of ours numbered, of the paper's with letters.
+struct Notes {
+    ours: Vec<String>,
+    theirs: Vec<&'static str>,
+}
+
+impl Notes {
+    fn of(figures: &[Figure]) -> Self {
+        let reasons = figures.iter().flat_map(|(_, figure)| &figure.remarks).map(|remark| remark.reason);
+        Self { ours: Vec::new(), theirs: once_each(reasons) }
+    }
+
+    /// A figure of ours, with the number of its note.
+    fn ours(&mut self, group: &GroupReport) -> String {
+        let mut note = group.behind();
+        if !group.departures.is_empty() {
+            note += &format!(". Not the paper's protocol: {}", group.departures.join("; "));
+        }
+        if let Some(goals) = group.goals {
+            note += &format!(
+                ". AntMaze-v0 has one goal a run: {goals} behind this ±, where D4RL's code asks for 50 to 100 seeds"
+            );
+        }
+        let known = self.ours.iter().position(|other| *other == note);
+        let index = known.unwrap_or_else(|| {
+            self.ours.push(note);
+            self.ours.len() - 1
+        });
+        let score = Spread::of(&group.scores).map_or_else(|| "-".to_owned(), Spread::text_of_both);
+        format!("{score} [{}]", index + 1)
+    }
+
+    /// A figure as the paper prints it, with the letters of its remarks.
+    fn theirs(&self, figure: &Published) -> String {
+        let is_on = |reason: &str| figure.remarks.iter().any(|remark| remark.reason == reason);
+        let letters = self.theirs.iter().zip('a'..='z').filter(|(reason, _)| is_on(reason)).map(|(_, letter)| letter);
+        let letters = String::from_iter(letters);
+        let std = figure.score.std.map(|std| format!(" ± {std:.1}")).unwrap_or_default();
+        format!("{:.1}{std} {letters}", figure.score.mean).trim_end().to_owned()
+    }
+
+    /// All notes, a line each.
+    fn text(&self, figures: &[Figure], select: Select) -> String {
+        let numbered = self.ours.iter().zip(1..).map(|(note, number)| format!("- [{number}] {note}.\n"));
+        let mut text = String::from_iter(numbered);
+        let sources = figures.iter().map(|(_, figure)| format!("{}: {}", figure.method, figure.source));
+        let sources: Vec<String> = sources.collect();
+        text += &format!("- Sources: {}.\n", once_each(sources.iter().map(|source| &**source)).join("; "));
+        for (reason, letter) in self.theirs.iter().zip('a'..='z') {
+            let remark = |figure: &Published| figure.remarks.iter().find(|remark| remark.reason == *reason).cloned();
+            let on: Vec<(&Figure, Remark)> = figures.iter().filter_map(|one| Some((one, remark(one.1)?))).collect();
+            let methods = once_each(on.iter().map(|((_, figure), _)| figure.method)).join(", ");
+            let selected = if on.iter().any(|(_, remark)| remark.selected) { "selected by test returns: " } else { "" };
+            let instead =
+                on.iter().filter_map(|((task, _), remark)| Some(format!(" {:.1} in {task}", remark.instead?)));
+            let instead = Vec::from_iter(instead).join(",");
+            text += &format!("- {letter} ({methods}): {selected}{reason}{instead}\n");
+        }
+        if select == Select::Best {
+            let selected = figures.iter().filter(|(_, figure)| figure.remarks.iter().any(|remark| remark.selected));
+            let selected = once_each(selected.map(|(_, figure)| figure.method)).join(", ");
+            text += &format!(
+                "- Of the paper's figures, such selection stands behind those of {selected}, as far as is known.\n"
+            );
+        }
+        text
+    }
+}

@@ -1,0 +1,147 @@
+//! What a study will cost, foretold by a second's measurement of each of its configurations.
+
+use std::collections::BTreeMap;
+use std::path::Path;
+use std::sync::Arc;
+use std::time::{Duration, Instant};
+
+use anyhow::Context as _;
+use indicatif::{HumanBytes, HumanDuration};
+use quad_dataset::{BatchSampler, DatasetError, ReadOptions, Transitions, environment};
+use quad_protocol::Origin;
+use quad_service::Hint;
+
+use super::state::State;
+use super::study::PlannedRun;
+use crate::algorithms::Context;
+use crate::config::{Device, Experiment, settings};
+use crate::train::agent::Agent;
+
+/// How long each configuration is measured.
+const MEASURED: Duration = Duration::from_secs(1);
+/// Most configurations that are; further ones are taken to cost as much as these on average.
+const MOST_MEASURED: usize = 20;
+/// Checkpoints that a run keeps.
+const CHECKPOINTS: u64 = 3;
+
+/// What one configuration takes.
+#[derive(Clone, Copy)]
+struct Price {
+    /// Seconds of one gradient step, on one thread.
+    step: f64,
+    /// Bytes of a snapshot.
+    snapshot: u64,
+    /// Bytes of a checkpoint.
+    checkpoint: u64,
+}
+
+/// What runs will cost.
+pub(crate) struct Cost {
+    /// Seconds of a gradient step, by the run's number.
+    pub step_seconds: BTreeMap<usize, f64>,
+    /// Of training that is left, in all runs together.
+    seconds: f64,
+    /// At the end, of all runs together.
+    bytes: u64,
+    /// Configurations that were measured.
+    measured: usize,
+}
+
+impl Cost {
+    /// Measures these runs, of which so much is done, from data that is on this machine.
+    ///
+    /// # Errors
+    /// A dataset cannot be read, or a run could not begin with it.
+    pub fn measure<'a>(
+        runs: &[(PlannedRun, State)],
+        dataset: impl Fn(&PlannedRun) -> &'a Path,
+    ) -> anyhow::Result<Self> {
+        let mut prices: BTreeMap<String, Price> = BTreeMap::new();
+        for (run, _) in runs {
+            let key = configuration(run);
+            if prices.len() < MOST_MEASURED && !prices.contains_key(&key) {
+                let transitions = read(dataset(run), &run.experiment)?;
+                let price = price(&run.experiment, transitions);
+                prices.insert(key, price.with_context(|| format!("the run {} cannot begin", run.name))?);
+            }
+        }
+        let measured = prices.len();
+        let mean = |value: fn(&Price) -> f64| prices.values().map(value).sum::<f64>() / measured.max(1) as f64;
+        let other = Price {
+            step: mean(|price| price.step),
+            snapshot: mean(|price| price.snapshot as f64) as u64,
+            checkpoint: mean(|price| price.checkpoint as f64) as u64,
+        };
+        let mut cost = Self { step_seconds: BTreeMap::new(), seconds: 0.0, bytes: 0, measured };
+        for (run, state) in runs {
+            let price = prices.get(&configuration(run)).copied().unwrap_or(other);
+            let Experiment { steps, .. } = run.experiment;
+            let snapshots = run.experiment.schedule().evaluated_steps().count().max(1) as u64;
+            cost.step_seconds.insert(run.index, price.step);
+            cost.seconds += price.step * (steps - state.step(steps).min(steps)) as f64;
+            cost.bytes += snapshots * price.snapshot + CHECKPOINTS * price.checkpoint;
+        }
+        Ok(cost)
+    }
+
+    /// In words, for so many runs at a time.
+    pub fn text(&self, jobs: usize) -> String {
+        let left = HumanDuration(Duration::from_secs_f64(self.seconds / jobs as f64));
+        format!(
+            "training takes about {left}, {jobs} at a time (by a second's measurement of {} configurations, each alone on one \
+             thread); these runs take {} of disk",
+            self.measured,
+            HumanBytes(self.bytes)
+        )
+    }
+}
+
+/// What runs of the same price share: everything but the seed.
+fn configuration(run: &PlannedRun) -> String {
+    let mut settings = settings::of_experiment(&run.experiment);
+    settings.remove("seed");
+    format!("{settings:?} {:?}", run.source)
+}
+
+fn read(path: &Path, experiment: &Experiment) -> anyhow::Result<Transitions> {
+    let environment = environment::find(&experiment.environment).ok();
+    let options = ReadOptions { environment, reward: experiment.reward, scale: experiment.scale };
+    let read = Transitions::read(path, &options).hint_of(DatasetError::hint);
+    read.with_context(|| format!("cannot learn from {}", path.display()))
+}
+
+fn price(experiment: &Experiment, transitions: Transitions) -> anyhow::Result<Price> {
+    let batch_size = experiment.batch_size as usize;
+    anyhow::ensure!(transitions.len() >= batch_size, "there are fewer transitions than a batch has");
+    let context = Context {
+        transitions: Arc::new(transitions),
+        batch_size,
+        total_steps: experiment.steps,
+        seed: experiment.seed,
+        precision: experiment.precision,
+        device: Device::Cpu.open()?,
+    };
+    let mut agent = Agent::new(experiment.definition()?, &experiment.agent, context)?;
+    let mut sampler = BatchSampler::new(agent.items(), batch_size, experiment.seed, 0);
+    let origin = Origin {
+        environment: experiment.environment.clone(),
+        seed: experiment.seed,
+        step: 0,
+        episodes: experiment.episodes,
+    };
+    let one_thread = rayon::ThreadPoolBuilder::new().num_threads(1).build()?;
+    one_thread.install(|| {
+        // The first step makes what later ones use again.
+        agent.update(sampler.next_items())?;
+        let (begin, mut steps) = (Instant::now(), 0);
+        while begin.elapsed() < MEASURED {
+            agent.update(sampler.next_items())?;
+            steps += 1;
+        }
+        Ok(Price {
+            step: begin.elapsed().as_secs_f64() / f64::from(steps),
+            snapshot: agent.policy(&origin)?.len() as u64,
+            checkpoint: agent.save()?.len() as u64,
+        })
+    })
+}

@@ -1,0 +1,61 @@
+//! What a person sees of a sweep: a line for each run at work and one for all on a terminal, plain log lines otherwise.
+
+use std::time::{Duration, Instant};
+
+use indicatif::{ProgressBar, ProgressDrawTarget, ProgressStyle};
+use tracing::info;
+
+/// How often the figures on a terminal change.
+const REDRAW: Duration = Duration::from_secs(1);
+/// How often a log gets them.
+const LINES: Duration = Duration::from_secs(30);
+
+/// The display.
+pub(super) struct Display {
+    /// Hidden where stderr is no terminal.
+    bar: ProgressBar,
+    next: Instant,
+}
+
+impl Display {
+    /// Starts it.
+    pub fn start() -> Self {
+        let bar = ProgressBar::with_draw_target(None, ProgressDrawTarget::stderr());
+        // Without a style of ours the lines still come, with a little more beside them.
+        if let Ok(style) = ProgressStyle::with_template("{msg}") {
+            bar.set_style(style);
+        }
+        let mut display = Self { bar, next: Instant::now() };
+        display.next += display.interval();
+        display
+    }
+
+    fn interval(&self) -> Duration {
+        if self.bar.is_hidden() { LINES } else { REDRAW }
+    }
+
+    /// An event, as a line of its own.
+    pub fn say(&self, text: &str) {
+        if self.bar.is_hidden() { info!("{text}") } else { self.bar.println(text) }
+    }
+
+    /// Whether it is time to show something new.
+    pub fn is_due(&self) -> bool {
+        Instant::now() >= self.next
+    }
+
+    /// Shows these lines in place of the last ones.
+    pub fn show(&mut self, lines: &[String]) {
+        if self.bar.is_hidden() {
+            lines.iter().for_each(|line| info!("{line}"));
+        } else {
+            self.bar.set_message(lines.join("\n"));
+        }
+        self.next = Instant::now() + self.interval();
+    }
+
+    /// Takes the lines away.
+    pub fn finish(&self) {
+        self.bar.finish_and_clear();
+    }
+}

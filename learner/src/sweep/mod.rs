@@ -1,0 +1,25 @@
+//! Many runs: what a study file asks for, what it will cost, and the learners that do it.
+//!
+//! Owns the format of study files and the folder of a study, `runs/STUDY`, in which each run has its own folder. It is called
+//! by the command `learner sweep` and runs on the main thread; each run is a process, `learner train`, that meets the shared
+//! evaluators at a router in this process. It uses `service` for evaluators, `report` and `run` for how far a run is, and
+//! [`train`](crate::train) to measure how long steps take.
+//!
+//! In reading order: `study` is the file, `axes` are its lists of values, `rules` say which combinations, `names` what runs are
+//! called; `state` is how far a run is; `cost` is foretold; `work` runs the learners, each a `job`, and
+//! `display` shows them.
+
+mod axes;
+mod cost;
+mod display;
+mod job;
+mod names;
+mod rules;
+mod state;
+mod study;
+mod work;
+
+pub(crate) use cost::Cost;
+pub(crate) use state::State;
+pub(crate) use study::{PlannedRun, Study};
+pub(crate) use work::{Ended, Sweep};

@@ -1,0 +1,141 @@
+//! `learner report` over a folder of runs.
+
+use std::fs;
+use std::path::Path;
+
+use serde_json::{Value, json};
+
+use crate::printed;
+use crate::run::Run;
+
+const TASKS: [&str; 2] = ["hopper-demo", "walker2d-demo"];
+
+/// A complete run of five evaluations with two episodes each, whose score is their mean.
+fn complete(run: Run, score: f64) -> Run {
+    let numbers = [("experiment.steps", 5000), ("experiment.eval_interval", 1000), ("experiment.episodes", 2)];
+    let mut run = run.set(&numbers.map(|(key, value)| (key, toml::Value::from(value))));
+    for step in 1..=5 {
+        for episode in 0..2 {
+            run.score(1000 * step, episode, score + 2.0 * (step as f64 - 3.0), "00");
+        }
+    }
+    run
+}
+
+/// QUAD with two temperatures, DAC and IQL on two tasks with five seeds, each run in a folder of its own below this one.
+fn write_study(folder: &Path) {
+    for (task, base) in TASKS.into_iter().zip([40.0, 90.0]) {
+        for seed in 0..5 {
+            let quad = |key: &str, value: toml::Value| Run::new(task, seed).set(&[(key, value)]);
+            let noise = [0.0, 3.0, -1.0, 2.0, -4.0][seed as usize];
+            for (name, run, score) in [
+                ("1", quad("experiment.agent.tau", 0.1.into()), base + noise),
+                ("2", quad("experiment.agent.tau", 10.0.into()), base + 10.0 + noise / 2.0),
+                ("3", quad("experiment.agent.guidance", "dac".into()), base + 0.1 - noise),
+                ("4", Run::by("iql", task, seed), base + 15.0 + noise),
+            ] {
+                complete(run, score).write(&folder.join(task).join(name).join(seed.to_string()));
+            }
+        }
+    }
+}
+
+fn study(folder: &Path) -> Value {
+    serde_json::from_str(&printed(&["report", folder.to_str().unwrap(), "--json"])).unwrap()
+}
+
+#[test]
+fn a_study_is_summed_up_over_tasks_and_seeds() {
+    let folder = tempfile::tempdir().unwrap();
+    write_study(folder.path());
+    let report = study(folder.path());
+    assert_eq!(report, study(folder.path()), "the same runs give the same intervals");
+    let methods: Vec<_> = report["study"].as_array().unwrap().iter().map(|one| &one["method"]).collect();
+    assert_eq!(methods, ["quad", "quad, agent.tau = 10.0", "dac", "iql"]);
+    let first = &report["study"][0];
+    assert_eq!((&first["tasks"], &first["seeds"]), (&json!(TASKS), &json!([0, 1, 2, 3, 4])));
+    let near =
+        |figure: &Value, value: f64| assert!((figure.as_f64().unwrap() - value).abs() < 1e-9, "{figure} {value}");
+    // Ten scores: 36, 39, 40, 42, 43, 86, 89, 90, 92, 93, of which two at either end are cut.
+    near(&first["iqm"]["value"], 390.0 / 6.0);
+    near(&first["mean"]["value"], 65.0);
+    near(&first["optimality_gap"]["value"], 0.35);
+    assert!(first["iqm"]["low"].as_f64().unwrap() < 65.0 && first["iqm"]["high"].as_f64().unwrap() > 65.0);
+    let share = |at: f64| first["profile"].as_array().unwrap().iter().find(|one| one["threshold"] == at).unwrap();
+    assert_eq!([&share(0.0)["value"], &share(50.0)["value"], &share(92.0)["value"]], [1.0, 0.5, 0.1]);
+
+    let [_, dac, iql] = &report["comparisons"].as_array().unwrap()[..] else { panic!("{report}") };
+    assert_eq!((&iql["against"], &iql["pairs"]), (methods[0], &json!(10)));
+    assert_eq!((&iql["mean_difference"], &iql["probability_of_improvement"]["value"]), (&json!(15.0), &json!(1.0)));
+    // Of 1024 ways to choose ten signs, two are as far from 0; Holm triples the smallest of three.
+    near(&iql["p"], 2.0 / 1024.0);
+    near(&iql["p_holm"], 6.0 / 1024.0);
+    assert!(dac["p_holm"].as_f64().unwrap() > 0.5, "{dac}");
+}
+
+#[test]
+fn what_is_not_complete_counts_in_no_statistic() {
+    let folder = tempfile::tempdir().unwrap();
+    write_study(folder.path());
+    let mut stopped = complete(Run::by("iql", TASKS[0], 4), 1000.0);
+    stopped.scores.pop();
+    stopped.write(&folder.path().join(TASKS[0]).join("4/4"));
+    let report = study(folder.path());
+    let iql = &report["study"][3];
+    near_mean_of(iql, (40.0 + 15.0 + 1.0 + 90.0 + 15.0) / 2.0);
+    let text = printed(&["report", folder.path().to_str().unwrap()]);
+    assert!(text.contains("4 to 5") && text.contains("4 of 5 evaluations are complete"), "{text}");
+    assert!(!text.contains("last 5 evaluations:"), "runs below a folder are not printed one by one: {text}");
+}
+
+fn near_mean_of(method: &Value, value: f64) {
+    assert!((method["mean"]["value"].as_f64().unwrap() - value).abs() < 1e-9, "{method}");
+}
+
+#[test]
+fn returns_are_summed_up_task_by_task_and_a_single_seed_has_no_interval() {
+    let folder = tempfile::tempdir().unwrap();
+    for (name, task) in [("a", "my-robot"), ("b", "other-robot")] {
+        let environment = toml::Value::from(task);
+        let run = Run::new("own-data", 0).set(&[("experiment.environment", environment), ("run.preset", task.into())]);
+        complete(run, 50.0).write(&folder.path().join(name));
+    }
+    let report = study(folder.path());
+    let both = report["study"].as_array().unwrap();
+    assert_eq!(both.len(), 2, "{report}");
+    for method in both {
+        assert_eq!(
+            (&method["iqm"], &method["optimality_gap"]),
+            (&json!({ "value": 50.0, "low": null, "high": null }), &Value::Null)
+        );
+    }
+    let text = printed(&["report", folder.path().to_str().unwrap()]);
+    assert!(text.contains("No interval for quad: of a single seed in a task, the spread is not known."), "{text}");
+}
+
+#[test]
+fn figures_and_tables_come_in_the_formats_of_papers() {
+    let folder = tempfile::tempdir().unwrap();
+    write_study(folder.path());
+    let figures = folder.path().join("figures");
+    let [runs, drawn] = [folder.path(), &figures].map(|path| path.to_str().unwrap().to_owned());
+    let print = |style: &str| printed(&["report", &runs, style, "--figures", &drawn]);
+    let [latex, csv] = [print("--latex"), print("--csv")];
+    assert!(latex.contains("\\begin{tabular}{llrrrrr}\n\\toprule\nmethod & tasks & seeds & IQM & mean"), "{latex}");
+    assert!(latex.lines().any(|line| line.starts_with("iql & 2 & 5 & 80.00 [")), "{latex}");
+    assert!(csv.lines().any(|line| line.starts_with("quad,2,5,\"65.00 [")), "{csv}");
+    for name in ["profile", "curve-hopper-demo", "curve-walker2d-demo", "tau-hopper-demo", "tau-walker2d-demo"] {
+        let [svg, png] = ["svg", "png"].map(|kind| fs::read(figures.join(format!("{name}.{kind}"))).unwrap());
+        assert!(png.starts_with(b"\x89PNG\r\n\x1a\n") && png.len() > 10_000, "{name}");
+        let svg = String::from_utf8(svg).unwrap();
+        assert!(svg.starts_with("<svg") && svg.contains("<polygon"), "{name}");
+        assert!(svg.contains("quad"), "{name}: {svg}");
+        let label = if name.starts_with("tau") { "τ" } else { "iql" };
+        assert!(svg.contains(label), "{name}: {svg}");
+        // The axis of τ names whole powers of ten.
+        assert!(
+            !name.starts_with("tau") || ["0.1", "1", "10"].iter().all(|tau| svg.contains(&format!("\n{tau}\n"))),
+            "{svg}"
+        );
+    }
+}

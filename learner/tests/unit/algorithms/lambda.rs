@@ -1,0 +1,33 @@
+//! Tests of `algorithms/quad/lambda.rs`. Expected are NumPy's numbers; the golden folders have more of them.
+
+use super::*;
+
+const LAMBDA: [f32; 7] = [0.2, 0.995, 0.5, 0.9, 1.0, 0.3, 0.4];
+const T: [u32; 7] = [1, 2, 3, 1, 7, 3, 4];
+
+fn close(found: &[f32], expected: &[f32]) {
+    let is_close = found.iter().zip(expected).all(|(found, expected)| (found - expected).abs() < 1e-6);
+    assert!(found.len() == expected.len() && is_close, "{found:?}, but expected is {expected:?}");
+}
+
+#[test]
+fn quantiles_and_means_of_fifths_are_numpys() {
+    close(&quantiles(&LAMBDA), &[0.26, 0.5, 0.997]);
+    close(&quantiles(&[0.5]), &[0.5; 3]);
+    // No t is in the fourth fifth of 1…7.
+    close(&by_fifth(&LAMBDA, &T, 7, 0.61), &[0.698_333_3, 0.4, 0.4, 0.61, 1.0]);
+    let each = [1, 2, 3, 4, 5].map(|t| t as f32 / 10.0);
+    close(&by_fifth(&each, &[1, 2, 3, 4, 5], 5, 0.0), &each);
+}
+
+#[test]
+fn a_batch_is_measured_in_one_pass() {
+    let (lambda, sigma_squared) = ([0.995, 0.5], [0.1, 0.3]);
+    let (gradient, error) = ([1.0, 0.0, 0.0, 0.0], [3.0, 4.0, 1.0, 0.0]);
+    let numbers = [&[0.4, 0.25][..], &lambda, &sigma_squared, &gradient, &error].concat();
+    let found = measure(&numbers, &[1, 2], 2, 0.1);
+    close(&found[..2], &[0.25, 0.7475]);
+    // The share above 0.99; σ²/(ν̂² + δ); the mean of the cosine 0.6 and, of a gradient that is 0, of 0.
+    close(&found[10..], &[0.5, 0.4, 0.3]);
+    assert_eq!(measure(&[], &[1, 2], 2, 0.1), [0.0; COUNT]);
+}
