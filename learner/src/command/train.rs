@@ -4,7 +4,7 @@ use std::path::{Path, PathBuf};
 use std::time::{Duration, SystemTime, UNIX_EPOCH};
 
 use anyhow::{Context, anyhow};
-use quad_dataset::{DatasetError, ReadOptions, Transitions, environment};
+use quad_dataset::{Transitions, environment};
 use quad_policy::Precision;
 use quad_protocol::Name;
 use quad_service::{Health, Hint, hinted, stay_in_background, unfinished};
@@ -14,7 +14,7 @@ use tracing::{debug, info, warn};
 use super::outside::Outside;
 use crate::cli::{TrainArgs, print};
 use crate::config::{DatasetInfo, Experiment, Preset, RunConfig, RunInfo, hyperparameters};
-use crate::data::{LocalDataset, Source};
+use crate::data::{LocalDataset, Source, load};
 use crate::report::{RunReport, of_run};
 use crate::run::{self, Begun, Log, Past, RunDir};
 use crate::service::{Display, Ending, Life, MainLoop, Metrics, Run, STUCK, Threads};
@@ -39,13 +39,7 @@ pub fn train(args: &TrainArgs) -> anyhow::Result<()> {
     args.device.check(experiment.precision)?;
     let dataset = source.obtain().hint(record_hint(&experiment))?;
 
-    let options = ReadOptions {
-        environment: environment::find(&experiment.environment).ok(),
-        reward: experiment.reward,
-        scale: experiment.scale,
-    };
-    let transitions = read_dataset(&dataset.path, &options)?;
-    check_batch(&transitions, &experiment).hint("record more data, or ask for less with --set batch_size=N")?;
+    let transitions = load(&dataset.path, &experiment)?;
     let config = run_config(args, &name, preset.task_name(), experiment, dataset, &transitions)?;
     if let Some(begun) = &begun {
         begun.check_same(&config)?;
@@ -83,19 +77,6 @@ fn record_hint(experiment: &Experiment) -> String {
         "give a file by --dataset FILE; `evaluator collect --env {} --out FILE` records one",
         experiment.environment
     )
-}
-
-fn read_dataset(path: &Path, options: &ReadOptions) -> anyhow::Result<Transitions> {
-    let result = Transitions::read(path, options);
-    let hint = result.as_ref().err().map(DatasetError::hint).unwrap_or_default();
-    result.with_context(|| format!("cannot learn from {}", path.display())).hint(hint)
-}
-
-/// A batch never holds a transition twice while there are others, so it cannot be larger than the dataset.
-fn check_batch(transitions: &Transitions, experiment: &Experiment) -> anyhow::Result<()> {
-    let (there, batch) = (transitions.len(), experiment.batch_size);
-    anyhow::ensure!(there >= batch as usize, "{there} transitions are fewer than a batch of {batch}");
-    Ok(())
 }
 
 async fn run_to_its_end(

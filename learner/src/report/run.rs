@@ -97,12 +97,20 @@ impl RunReport {
     /// # Errors
     /// There is no run in it, or a file is not what a learner writes.
     pub fn read(path: &Path) -> anyhow::Result<Self> {
+        let scored = Self::scored(path)?;
+        Ok(Self { lambda: LambdaReport::read(path, &scored.variant)?, ..scored })
+    }
+
+    /// The same without what λ was, for which all of `metrics.jsonl` is read.
+    ///
+    /// # Errors
+    /// Those of [`read`](Self::read).
+    pub fn scored(path: &Path) -> anyhow::Result<Self> {
         let (dir, config) = RunDir::open(path)?;
         let agent = config.experiment.method();
         let agent = agent.with_context(|| format!("config.toml in {} cannot be used", path.display()))?;
         let variant = config.experiment.variant()?.to_owned();
-        let lambda = LambdaReport::read(path, &variant)?;
-        Ok(Self { lambda, ..Self::new(path, config, agent, variant, &dir.read_scores()?) })
+        Ok(Self::new(path, config, agent, variant, &dir.read_scores()?))
     }
 
     fn new(path: &Path, config: RunConfig, agent: String, variant: String, lines: &[ScoreLine]) -> Self {

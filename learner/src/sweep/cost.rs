@@ -7,14 +7,14 @@ use std::time::{Duration, Instant};
 
 use anyhow::Context as _;
 use indicatif::{HumanBytes, HumanDuration};
-use quad_dataset::{BatchSampler, DatasetError, ReadOptions, Transitions, environment};
+use quad_dataset::{BatchSampler, Transitions};
 use quad_protocol::Origin;
-use quad_service::Hint;
 
 use super::state::State;
 use super::study::PlannedRun;
 use crate::algorithms::Context;
 use crate::config::{Device, Experiment, settings};
+use crate::data::load;
 use crate::train::agent::Agent;
 
 /// How long each configuration is measured.
@@ -60,7 +60,7 @@ impl Cost {
         for (run, _) in runs {
             let key = configuration(run);
             if prices.len() < MOST_MEASURED && !prices.contains_key(&key) {
-                let transitions = read(dataset(run), &run.experiment)?;
+                let transitions = load(dataset(run), &run.experiment)?;
                 let price = price(&run.experiment, transitions);
                 prices.insert(key, price.with_context(|| format!("the run {} cannot begin", run.name))?);
             }
@@ -103,16 +103,8 @@ fn configuration(run: &PlannedRun) -> String {
     format!("{settings:?} {:?}", run.source)
 }
 
-fn read(path: &Path, experiment: &Experiment) -> anyhow::Result<Transitions> {
-    let environment = environment::find(&experiment.environment).ok();
-    let options = ReadOptions { environment, reward: experiment.reward, scale: experiment.scale };
-    let read = Transitions::read(path, &options).hint_of(DatasetError::hint);
-    read.with_context(|| format!("cannot learn from {}", path.display()))
-}
-
 fn price(experiment: &Experiment, transitions: Transitions) -> anyhow::Result<Price> {
     let batch_size = experiment.batch_size as usize;
-    anyhow::ensure!(transitions.len() >= batch_size, "there are fewer transitions than a batch has");
     let context = Context {
         transitions: Arc::new(transitions),
         batch_size,

@@ -53,7 +53,7 @@ impl State {
             let hint = "give the study's file another name, choose another --runs, or move that folder away";
             return Err(hinted(anyhow!("{path} has a run of other settings than the study's: {keys}"), hint));
         }
-        let scored = RunReport::read(dir)?.is_complete();
+        let scored = RunReport::scored(dir)?.is_complete();
         let trained = run.experiment.eval_interval > 0 || folder.snapshots()?.last() == Some(&run.experiment.steps);
         let step = || rows(dir).last().map_or(0, |row| row.step);
         Ok(match (scored && trained, failed) {
@@ -117,7 +117,7 @@ impl Progress {
             }
             _ => 0.0,
         };
-        let report = RunReport::read(dir).ok();
+        let report = RunReport::scored(dir).ok();
         let newest = report.iter().flat_map(|report| &report.evaluations).rfind(|evaluation| evaluation.complete);
         let score = newest.map(|evaluation| (evaluation.step, evaluation.score.mean));
         Self { step: rows.last().map_or(0, |row| row.step), rate, score }

@@ -1,0 +1,31 @@
+//! The transitions that a run learns from, as its settings have them.
+
+use std::path::Path;
+
+use anyhow::{Context, anyhow};
+use quad_dataset::{DatasetError, ReadOptions, Transitions, environment};
+use quad_service::Hint;
+
+use crate::config::Experiment;
+
+/// Reads a file or folder of transitions for an experiment.
+///
+/// # Errors
+/// It cannot be read or learnt from, or it has fewer transitions than a batch: a batch never holds one twice while there are
+/// others.
+pub fn load(path: &Path, experiment: &Experiment) -> anyhow::Result<Transitions> {
+    let options = ReadOptions {
+        environment: environment::find(&experiment.environment).ok(),
+        reward: experiment.reward,
+        scale: experiment.scale,
+    };
+    let result = Transitions::read(path, &options);
+    let hint = result.as_ref().err().map(DatasetError::hint).unwrap_or_default();
+    let transitions = result.with_context(|| format!("cannot learn from {}", path.display())).hint(hint)?;
+    let (there, batch) = (transitions.len(), experiment.batch_size);
+    if there < batch as usize {
+        return Err(anyhow!("{there} transitions are fewer than a batch of {batch}"))
+            .hint("record more data, or ask for less with --set batch_size=N");
+    }
+    Ok(transitions)
+}
