@@ -145,6 +145,10 @@ pub struct ReportArgs {
     /// Which evaluations of a run are its score
     #[arg(long, value_enum, default_value = "last")]
     pub select: Select,
+    /// Also write one file with everything, to send or to print: tables, figures, settings, data, films that are in the runs' folders
+    /// (film.gif and film.png), and the commands that make the runs again
+    #[arg(long, value_name = "FILE.html")]
+    pub html: Option<PathBuf>,
     /// Also draw learning curves, performance profiles and scores over τ into this folder, each as SVG and PNG
     #[arg(long, value_name = "DIR")]
     pub figures: Option<PathBuf>,

@@ -214,6 +214,14 @@ fn run_name(path: &Path) -> anyhow::Result<Name> {
         .hint("its last part must be 1 to 64 letters, digits, dots, dashes or underscores")
 }
 
+/// The CPU and what of it training uses.
+fn machine(precision: Precision) -> String {
+    let cpu = std::fs::read_to_string("/proc/cpuinfo").unwrap_or_default();
+    let name = cpu.lines().find_map(|line| line.strip_prefix("model name")?.split_once(": "));
+    let name = name.map_or(std::env::consts::ARCH, |(_, name)| name.trim());
+    format!("{name}, {} threads, {}", rayon::current_num_threads(), precision.arithmetic())
+}
+
 fn run_config(
     args: &TrainArgs,
     name: &Name,
@@ -229,6 +237,7 @@ fn run_config(
             started: now()?,
             task: task.to_owned(),
             version: env!("CARGO_PKG_VERSION").to_owned(),
+            machine: Some(machine(experiment.precision)),
             device: args.device,
         },
         dataset: DatasetInfo {

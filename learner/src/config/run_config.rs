@@ -34,6 +34,10 @@ pub struct RunInfo {
     pub task: String,
     /// Version of the learner.
     pub version: String,
+    /// The machine on which the run began: its CPU, how many threads of it, and the instructions it multiplies with. Older runs do
+    /// not say.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub machine: Option<String>,
     /// Where it trains; runs from before there was a choice do not say.
     #[serde(default)]
     pub device: Device,

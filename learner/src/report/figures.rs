@@ -16,10 +16,22 @@ use crate::config::settings::{self, Settings};
 const TAU: &str = "agent.tau";
 const BAND: &str = "mean over seeds, with its 95 % interval";
 
-/// Draws all pictures of a report into a folder, each as SVG and as PNG: of each task the learning curves, and the scores over
-/// τ where runs differ in it; of all tasks the performance profiles. The folder is made if it is not there.
+/// Draws all pictures of a report into a folder, each as SVG and as PNG. The folder is made if it is not there.
 pub fn draw_all(folder: &Path, report: &Report) -> anyhow::Result<()> {
     std::fs::create_dir_all(folder).with_context(|| format!("cannot make {}", folder.display()))?;
+    for (name, picture) in all(report) {
+        picture.write_svg(&folder.join(format!("{name}.svg")))?;
+        picture.write_png(&folder.join(format!("{name}.png")))?;
+    }
+    Ok(())
+}
+
+/// All pictures of a report, each with a name for its file: of each task the learning curves, and the scores over τ where runs
+/// differ in it; of all tasks the performance profiles.
+pub fn all(report: &Report) -> Vec<(String, Picture)> {
+    if let [run] = &report.runs[..] {
+        return vec![(format!("curve-{}", run.task), of_run(run))];
+    }
     let mut of_task: BTreeMap<&str, Vec<&GroupReport>> = BTreeMap::new();
     for group in report.groups.iter().filter(|group| !group.runs.is_empty()) {
         of_task.entry(&group.task).or_default().push(group);
@@ -29,11 +41,8 @@ pub fn draw_all(folder: &Path, report: &Report) -> anyhow::Result<()> {
         pictures.push((format!("curve-{task}"), curves(task, &groups)));
         pictures.push((format!("tau-{task}"), over_tau(task, &groups)));
     }
-    for (name, picture) in pictures.iter().filter(|(_, picture)| !picture.lines.is_empty()) {
-        picture.write_svg(&folder.join(format!("{name}.svg")))?;
-        picture.write_png(&folder.join(format!("{name}.png")))?;
-    }
-    Ok(())
+    pictures.retain(|(_, picture)| picture.lines.iter().any(|line| !line.points.is_empty()));
+    pictures
 }
 
 /// The learning curve of one run: the mean over an evaluation's episodes ± one standard deviation, and the dataset's mean.

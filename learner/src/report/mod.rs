@@ -1,6 +1,6 @@
 //! What runs achieved: their evaluations, summaries over seeds, what is published for the same tasks, and pictures.
 //!
-//! Owns nothing: it reads run folders, which a learner may be writing, and gives text, JSON, SVG and PNG. It runs on the thread
+//! Owns nothing: it reads run folders, which a learner may be writing, and gives text, JSON, HTML, SVG and PNG. It runs on the thread
 //! of its caller: `learner report`, and `learner train` at the end of a run, both on the main thread. It imports `config`, `run`
 //! and the list of algorithms.
 //!
@@ -11,15 +11,18 @@
 //! In reading order: `run` reads a run; `seeds` puts runs together that differ in their seed alone; `statistics` are
 //! definitions, which `study` applies to methods over tasks and seeds; `published` are the paper's figures, `departures` is how
 //! a run differs from what the paper ran, `lambda` what QUAD's λ was in a run; `paper` has the paper's tables with ours beside
-//! them; `summary` is the whole report; `figures` are its pictures, which `plot` draws. `selection`, `spread` and `table` are
+//! them; `summary` is the whole report; `figures` are its pictures, which `plot` draws; `html`
+//! is all of that in one file, with the commands of `remake`. `selection`, `spread` and `table` are
 //! small parts of these.
 
 mod departures;
 mod figures;
+mod html;
 mod lambda;
 mod paper;
 mod plot;
 mod published;
+mod remake;
 mod run;
 mod seeds;
 mod selection;
@@ -30,6 +33,7 @@ mod summary;
 mod table;
 
 pub(crate) use figures::{draw_all, of_run};
+pub(crate) use html::write as write_html;
 pub(crate) use run::RunReport;
 pub(crate) use selection::Select;
 pub(crate) use spread::Spread;

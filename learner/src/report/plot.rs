@@ -57,15 +57,23 @@ type Chart<'a, DB> = ChartContext<'a, DB, Cartesian2d<RangedCoordf64, RangedCoor
 type Drawn = Result<(), Box<dyn Error>>;
 
 impl Picture {
+    /// The picture as SVG.
+    ///
+    /// # Errors
+    /// It cannot be drawn.
+    pub fn svg(&self) -> anyhow::Result<String> {
+        let mut svg = String::new();
+        let drawn = self.draw(SVGBackend::with_string(&mut svg, SIZE).into_drawing_area(), 1);
+        drawn.map_err(|error| anyhow!("cannot draw {}: {error}", self.title))?;
+        Ok(svg)
+    }
+
     /// The picture as an SVG file.
     ///
     /// # Errors
     /// The file cannot be written.
     pub fn write_svg(&self, path: &Path) -> anyhow::Result<()> {
-        let mut svg = String::new();
-        let drawn = self.draw(SVGBackend::with_string(&mut svg, SIZE).into_drawing_area(), 1);
-        drawn.map_err(|error| anyhow!("cannot draw {}: {error}", path.display()))?;
-        replace(path, svg.as_bytes())
+        replace(path, self.svg()?.as_bytes())
     }
 
     /// The picture as a PNG file, of twice as many pixels.
@@ -180,7 +188,7 @@ static FONT: LazyLock<()> = LazyLock::new(|| {
 });
 
 /// A reader of the file finds all of it, or what was there.
-fn replace(path: &Path, content: &[u8]) -> anyhow::Result<()> {
+pub(super) fn replace(path: &Path, content: &[u8]) -> anyhow::Result<()> {
     let file = path.file_name().ok_or_else(|| anyhow!("{} is no file name", path.display()))?;
     let partial = path.with_file_name(format!("{}.partial", file.display()));
     let written = std::fs::write(&partial, content).and_then(|()| std::fs::rename(&partial, path));

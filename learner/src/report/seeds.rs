@@ -1,6 +1,7 @@
 //! Runs that are alike but for their seed, and what becomes of those that are not.
 
 use std::collections::BTreeSet;
+use std::path::PathBuf;
 
 use quad_dataset::{Goal, environment};
 use serde::Serialize;
@@ -47,6 +48,9 @@ pub struct GroupReport {
     /// These runs.
     #[serde(skip)]
     pub runs: Vec<RunReport>,
+    /// The folders of all runs, counted or not.
+    #[serde(skip)]
+    pub dirs: Vec<PathBuf>,
     /// Different goals behind the scores, in an environment that draws one for a whole run.
     pub goals: Option<usize>,
     /// `mean_last_3` over the runs; absent if one of them has none.
@@ -188,6 +192,7 @@ fn group(runs: &[&RunReport], method: String, differs: Vec<String>, select: Sele
         unfinished: unfinished.map(|run| format!("in {} {}", run.dir.display(), run.how_complete())).collect(),
         left_out,
         differs,
+        dirs: runs.iter().map(|run| run.dir.clone()).collect(),
         departures: if published.is_empty() { Vec::new() } else { departures(&counted, &scored_in, select) },
         runs: counted.into_iter().cloned().collect(),
         scored_in,

@@ -61,15 +61,21 @@ impl Report {
             let in_full = self.runs.iter().filter(|run| self.in_full.contains(&run.dir));
             parts.extend(in_full.map(|run| Part::Words(self.table(run))));
         }
-        parts.extend(self.select.warning().map(|warning| Part::Words(warning.to_owned())));
-        if self.runs.len() > 1 || style != Style::Text {
+        parts.extend(self.summaries(style != Style::Text));
+        parts.iter().map(|part| part.render(style)).collect::<Vec<_>>().join("\n")
+    }
+
+    /// The parts but for the tables of single runs; `with_one`: also the summary over seeds of a single run.
+    pub fn summaries(&self, with_one: bool) -> Vec<Part> {
+        let mut parts = Vec::from_iter(self.select.warning().map(|warning| Part::Words(warning.to_owned())));
+        if self.runs.len() > 1 || with_one {
             parts.extend(self.over_seeds());
         }
         if self.runs.len() > 1 && !self.study.is_empty() {
             parts.extend(study::tables(&self.study, &self.comparisons));
         }
         parts.extend([1, 2].into_iter().flat_map(|number| paper::table(number, &self.groups, self.select)));
-        parts.iter().map(|part| part.render(style)).collect::<Vec<_>>().join("\n")
+        parts
     }
 
     fn table(&self, run: &RunReport) -> String {

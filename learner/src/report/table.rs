@@ -1,6 +1,8 @@
 //! Tables and sentences for people: aligned for a terminal, as Markdown, LaTeX or CSV.
 
-use std::fmt::Alignment::{self, Left, Right};
+use std::fmt::Alignment::{self, Right};
+
+use serde::Serialize;
 
 /// How a report is written.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -16,6 +18,8 @@ pub enum Style {
 }
 
 /// A part of a report.
+#[derive(Serialize)]
+#[serde(rename_all = "lowercase")]
 pub enum Part {
     /// Lines of text.
     Words(String),
@@ -33,16 +37,17 @@ impl Part {
     }
 }
 
-/// A table: how each column is aligned, and rows of cells, of which the first is the header.
+/// A table: which columns are aligned to the right, and rows of cells, of which the first is the header.
+#[derive(Serialize)]
 pub struct Table {
-    columns: Vec<Alignment>,
+    right: Vec<bool>,
     rows: Vec<Vec<String>>,
 }
 
 impl Table {
     pub fn new<T: AsRef<str>>(header: &[(T, Alignment)]) -> Self {
-        let columns = header.iter().map(|(_, alignment)| *alignment).collect();
-        Self { columns, rows: vec![header.iter().map(|(name, _)| name.as_ref().to_owned()).collect()] }
+        let right = header.iter().map(|(_, alignment)| *alignment == Right).collect();
+        Self { right, rows: vec![header.iter().map(|(name, _)| name.as_ref().to_owned()).collect()] }
     }
 
     /// A row has a cell for each column.
@@ -55,7 +60,7 @@ impl Table {
             Style::Text => self.lines(|cells| format!("{}\n", cells.join("  ").trim_end())).concat(),
             Style::Markdown => {
                 let mut lines = self.lines(|cells| format!("| {} |\n", cells.join(" | ")));
-                let rule = self.columns.iter().map(|alignment| if *alignment == Right { "---:" } else { "---" });
+                let rule = self.right.iter().map(|right| if *right { "---:" } else { "---" });
                 lines.insert(1, format!("| {} |\n", Vec::from_iter(rule).join(" | ")));
                 lines.concat()
             }
@@ -65,7 +70,7 @@ impl Table {
                 };
                 let mut lines: Vec<String> = self.rows.iter().map(line).collect();
                 lines.insert(1, "\\midrule\n".to_owned());
-                let columns = self.columns.iter().map(|alignment| if *alignment == Right { 'r' } else { 'l' });
+                let columns = self.right.iter().map(|right| if *right { 'r' } else { 'l' });
                 let columns = String::from_iter(columns);
                 format!(
                     "\\begin{{tabular}}{{{columns}}}\n\\toprule\n{}\\bottomrule\n\\end{{tabular}}\n",
@@ -82,11 +87,11 @@ impl Table {
     /// The rows, with cells as wide as their columns.
     fn lines(&self, line: impl Fn(&[String]) -> String) -> Vec<String> {
         let width = |column: usize| self.rows.iter().map(|row| row[column].chars().count()).max().unwrap_or(0);
-        let widths: Vec<usize> = (0..self.columns.len()).map(width).collect();
+        let widths: Vec<usize> = (0..self.right.len()).map(width).collect();
         let padded = |row: &Vec<String>| {
-            let cells = row.iter().zip(&widths).zip(&self.columns).map(|((cell, width), alignment)| match alignment {
-                Left => format!("{cell:<width$}"),
-                _ => format!("{cell:>width$}"),
+            let cells = row.iter().zip(&widths).zip(&self.right).map(|((cell, width), right)| match right {
+                false => format!("{cell:<width$}"),
+                true => format!("{cell:>width$}"),
             });
             line(&Vec::from_iter(cells))
         };

@@ -210,3 +210,23 @@ fn scores_without_references_are_called_returns_unless_they_are_something_else()
     assert!(text.contains("mean return of the dataset") && !text.contains("score "), "{text}");
     assert!(!reported.svg("curve-hopper-demo.svg").contains("normalised"));
 }
+
+#[test]
+fn a_page_holds_all_that_is_shown_and_takes_nothing_for_html() {
+    let folder = tempfile::tempdir().unwrap();
+    let path = |name: &str| folder.path().join(name).to_str().unwrap().to_owned();
+    let dataset = "<script>alert(1)</script>.hdf5";
+    small(3, 0.0).set(&[("experiment.dataset", dataset.into())]).write(&folder.path().join("a"));
+    small(4, 1.0).write(&folder.path().join("b"));
+    fs::write(path("a/film.gif"), "GIF89a of a run").unwrap();
+    printed(&["report", &path("a"), &path("b"), "--html", &path("page.html")]);
+    let page = fs::read_to_string(path("page.html")).unwrap();
+    assert!(!page.contains("<script") && page.contains("&lt;script&gt;alert(1)"), "{page}");
+    // Nothing is fetched: neither scripts nor pictures have addresses.
+    assert!(!page.contains("href=\"http") && !page.contains("src=\"/") && !page.contains("url("), "{page}");
+    let film = "src=\"data:image/gif;base64,R0lGODlhIG9mIGEgcnVu\"";
+    let command = format!("--seed 4 --run-dir {} --evaluators 2", path("b"));
+    for words in ["<svg", film, &command, "8.50 ± 0.71 (0.50)", "steps = 6000", "100 transitions of 3 episodes"] {
+        assert!(page.contains(words), "{words} is missing in\n{page}");
+    }
+}

@@ -15,6 +15,7 @@ pub(crate) fn config(name: &str, seed: u64) -> RunConfig {
             started: 1,
             task: "hopper-demo".into(),
             version: "0.1.0".into(),
+            machine: None,
             device: Device::Cpu,
         },
         dataset: DatasetInfo {

@@ -1,5 +1,7 @@
 //! Tests of `report/table.rs`.
 
+use std::fmt::Alignment::Left;
+
 use super::*;
 
 #[test]

@@ -1,0 +1,156 @@
+//! The report as one HTML file that needs no other file: to send to a colleague, or to print.
+
+use std::collections::BTreeSet;
+use std::path::Path;
+
+use anyhow::Context;
+use base64::prelude::{BASE64_STANDARD, Engine};
+use minijinja::Environment;
+use minijinja::value::Serde;
+use serde::Serialize;
+
+use super::figures;
+use super::lambda::LambdaReport;
+use super::plot;
+use super::remake;
+use super::run::RunReport;
+use super::seeds::GroupReport;
+use super::summary::Report;
+use super::table::Part;
+
+/// Pictures of an episode that a run's folder may hold, with their media types: `evaluator film RUN --out RUN/film.gif`.
+const FILMS: [(&str, &str); 2] = [("film.png", "image/png"), ("film.gif", "image/gif")];
+
+/// What the template is filled with.
+#[derive(Serialize)]
+struct Page {
+    title: String,
+    subtitle: String,
+    version: &'static str,
+    parts: Vec<Part>,
+    figures: Vec<Figure>,
+    films: Vec<Film>,
+    groups: Vec<Group>,
+    commands: String,
+}
+
+#[derive(Serialize)]
+struct Figure {
+    title: String,
+    svg: String,
+}
+
+#[derive(Serialize)]
+struct Film {
+    run: String,
+    /// A `data:` address.
+    data: String,
+}
+
+/// Runs that differ in their seed alone.
+#[derive(Serialize)]
+struct Group {
+    title: String,
+    facts: Vec<Fact>,
+    /// TOML, without the seed.
+    settings: String,
+}
+
+#[derive(Serialize)]
+struct Fact {
+    name: &'static str,
+    value: String,
+}
+
+/// Writes the report.
+///
+/// # Errors
+/// The file cannot be written, or a film of a run not be read.
+pub fn write(path: &Path, report: &Report) -> anyhow::Result<()> {
+    let mut templates = Environment::new();
+    // By its name all that is filled in is escaped, and nothing of a run's name is taken for HTML.
+    templates.add_template("report.html", include_str!("../../assets/report.html"))?;
+    let page = templates.get_template("report.html")?.render(Serde(page(report)?))?;
+    plot::replace(path, page.as_bytes())
+}
+
+fn page(report: &Report) -> anyhow::Result<Page> {
+    let tasks: BTreeSet<&str> = report.runs.iter().map(|run| &*run.task).collect();
+    let plural = if report.runs.len() == 1 { "" } else { "s" };
+    let complete = report.runs.iter().filter(|run| run.is_complete()).count();
+    let figures = figures::all(report).into_iter().map(|(_, picture)| {
+        let svg = picture.svg()?;
+        Ok(Figure { title: picture.title, svg })
+    });
+    Ok(Page {
+        title: Vec::from_iter(tasks).join(", "),
+        subtitle: format!("{} run{plural}, {complete} complete", report.runs.len()),
+        version: env!("CARGO_PKG_VERSION"),
+        parts: report.summaries(true),
+        figures: figures.collect::<anyhow::Result<_>>()?,
+        films: films(&report.runs)?,
+        groups: report.groups.iter().map(|group| of_group(group, &report.runs)).collect::<anyhow::Result<_>>()?,
+        commands: commands(&report.runs),
+    })
+}
+
+fn films(runs: &[RunReport]) -> anyhow::Result<Vec<Film>> {
+    let mut films = Vec::new();
+    for run in runs {
+        for (path, kind) in FILMS.map(|(name, kind)| (run.dir.join(name), kind)) {
+            if path.exists() {
+                let bytes = std::fs::read(&path).with_context(|| format!("cannot read {}", path.display()))?;
+                let data = format!("data:{kind};base64,{}", BASE64_STANDARD.encode(bytes));
+                films.push(Film { run: run.run.clone(), data });
+            }
+        }
+    }
+    Ok(films)
+}
+
+fn of_group(group: &GroupReport, runs: &[RunReport]) -> anyhow::Result<Group> {
+    let runs: Vec<&RunReport> = runs.iter().filter(|run| group.dirs.contains(&run.dir)).collect();
+    let once_each = |value: &dyn Fn(&RunReport) -> Option<String>| {
+        let values: BTreeSet<String> = runs.iter().filter_map(|run| value(run)).collect();
+        Vec::from_iter(values).join("\n")
+    };
+    let lambda = |run: &RunReport, lambda: &LambdaReport| format!("{}: {}", run.run, lambda.text(&run.variant).trim());
+    let dataset = |run: &RunReport| {
+        let data = &run.config.dataset;
+        let name = run.config.experiment.dataset.as_deref().unwrap_or_default();
+        let sha256 = data.sha256.as_deref().unwrap_or("unknown");
+        let returns = format!("returns from {:.1} to {:.1}", data.min_return, data.max_return);
+        Some(format!("{name}: {}, {returns}\nSHA-256 {sha256}", data.summary()))
+    };
+    let facts = [
+        ("algorithm", group.agent.clone()),
+        ("behind it", group.behind()),
+        ("data", once_each(&dataset)),
+        ("learner", once_each(&|run| Some(format!("version {}", run.config.run.version)))),
+        ("trained on", once_each(&|run| run.config.run.machine.clone())),
+        ("departures", group.departures.join("\n")),
+        ("λ", once_each(&|run| Some(lambda(run, run.lambda.as_ref()?)))),
+    ];
+    let facts = facts.into_iter().filter(|(_, value)| !value.is_empty()).map(|(name, value)| Fact { name, value });
+    let mut settings = toml::Table::try_from(&runs.first().context("a group has runs")?.config.experiment)?;
+    settings.remove("seed");
+    Ok(Group {
+        title: format!("{}: {}", group.task, group.method),
+        facts: facts.collect(),
+        settings: toml::to_string(&settings)?,
+    })
+}
+
+fn commands(runs: &[RunReport]) -> String {
+    let command = |run: &RunReport| {
+        remake::command(run).unwrap_or_else(|| {
+            format!(
+                "# {}: save the settings below as FILE.toml, and learner train --preset FILE.toml",
+                run.dir.display()
+            )
+        })
+    };
+    let dirs: Vec<String> = runs.iter().map(|run| remake::quoted(&run.dir.to_string_lossy())).collect();
+    let report = format!("learner report {} --html report.html", dirs.join(" "));
+    runs.iter().map(command).chain([report]).collect::<Vec<_>>().join("\n")
+}

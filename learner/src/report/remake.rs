@@ -1,0 +1,54 @@
+//! The command that makes a run again.
+
+use crate::config::settings::{self, differences};
+use crate::config::tables::parse_assignment;
+
+use super::departures::as_given;
+use super::run::RunReport;
+
+/// `learner train` with all that decides the outcome of the run. Nothing if what the run began from is no task of this learner's, but a
+/// file of its user's, or lacks a value that its task has.
+pub fn command(run: &RunReport) -> Option<String> {
+    let experiment = &run.config.experiment;
+    let given = as_given(run, false).ok()?;
+    let (ours, theirs) = (settings::of_experiment(experiment), settings::of_experiment(&given));
+    let mut words = vec!["learner train --task".to_owned(), quoted(&run.task)];
+    let mut say = |flag: &str, value: &str| words.extend([flag.to_owned(), quoted(value)]);
+    if ours.get("algorithm") != Some(&"\"quad\"".to_owned()) {
+        say("--algorithm", &run.algorithm);
+    }
+    if let Some(dataset) = &experiment.dataset {
+        say("--dataset", dataset);
+    }
+    for key in differences(&ours, &theirs).filter(|key| *key != "seed") {
+        say("--set", &assignment(key, ours.get(key)?));
+    }
+    if run.config.run.device != Default::default() {
+        say("--device", run.config.run.device.name());
+    }
+    say("--seed", &run.seed.to_string());
+    say("--run-dir", &run.dir.to_string_lossy());
+    if experiment.eval_interval > 0 {
+        say("--evaluators", "2");
+    }
+    Some(words.join(" "))
+}
+
+/// `KEY=VALUE`; a word goes without its quotes where that says the same.
+fn assignment(key: &str, value: &str) -> String {
+    let [exact, bare] = [value, value.trim_matches('"')].map(|value| format!("{key}={value}"));
+    if parse_assignment(&bare) == parse_assignment(&exact) { bare } else { exact }
+}
+
+/// A word as a shell reads it.
+pub fn quoted(word: &str) -> String {
+    let is_plain = |c: char| c.is_ascii_alphanumeric() || "-_./=:,+".contains(c);
+    if !word.is_empty() && word.chars().all(is_plain) {
+        return word.to_owned();
+    }
+    format!("'{}'", word.replace('\'', r"'\''"))
+}
+
+#[cfg(test)]
+#[path = "../../tests/unit/report/remake.rs"]
+mod tests;
