@@ -7,12 +7,13 @@ use anyhow::{Context, anyhow};
 use quad_dataset::{Transitions, environment};
 use quad_policy::Precision;
 use quad_protocol::Name;
-use quad_service::{Health, Hint, hinted, stay_in_background, unfinished};
+use quad_service::{Health, Hint, hinted, print, stay_in_background, unfinished};
 use tokio::sync::mpsc;
 use tracing::{debug, info, warn};
 
+use super::dry_run;
 use super::outside::Outside;
-use crate::cli::{TrainArgs, print};
+use crate::cli::TrainArgs;
 use crate::config::{DatasetInfo, Experiment, Preset, RunConfig, RunInfo, hyperparameters};
 use crate::data::{LocalDataset, Source, load};
 use crate::report::{RunReport, of_run};
@@ -61,6 +62,9 @@ pub fn train(args: &TrainArgs) -> anyhow::Result<()> {
         warn!("{}", Precision::UNAVAILABLE);
     }
     debug!("{config:?}");
+    if args.dry_run {
+        return dry_run::foretell(&path, &config, transitions);
+    }
 
     // Zenoh and the training thread have threads of their own; this runtime serves the metrics and the main loop.
     let mut runtime = tokio::runtime::Builder::new_multi_thread();
