@@ -40,6 +40,8 @@ install_packages() {
     python3 -c 'import ensurepip, venv' >/dev/null 2>&1 || missing+=(python3-venv)
     have shellcheck || missing+=(shellcheck)
     have openssl || missing+=(openssl)
+    # A browser for the page.
+    have chromium || missing+=(chromium)
     # Pictures without a GPU; the file is libegl-mesa0's.
     [ -e /usr/share/glvnd/egl_vendor.d/50_mesa.json ] || missing+=(libegl1 libegl-mesa0 libgl1-mesa-dri)
     # Hosts on one machine, which only root can make.

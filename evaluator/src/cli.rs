@@ -4,10 +4,11 @@ use std::num::NonZeroUsize;
 use std::path::PathBuf;
 use std::sync::Arc;
 
-use clap::{Args, Parser, Subcommand};
+use clap::{Args, CommandFactory, Parser, Subcommand};
+use clap_complete::Shell;
 use quad_dataset::EnvironmentSpec;
 use quad_dataset::environment;
-use quad_service::Hint;
+use quad_service::{Hint, print};
 
 use crate::doctor::{self, DoctorArgs};
 use crate::serve::{self, ServeArgs};
@@ -33,6 +34,11 @@ enum Command {
     Collect(CollectArgs),
     VerifyDataset(VerifyArgs),
     Doctor(DoctorArgs),
+    /// Print a script by which a shell completes this program's arguments
+    Completions {
+        /// The shell
+        shell: Shell,
+    },
 }
 
 /// Record a dataset of mediocre behaviour to learn from, without downloading anything
@@ -80,30 +86,27 @@ impl Cli {
     pub fn run(self) -> anyhow::Result<()> {
         match self.command {
             Command::Serve(args) => serve::serve(args, Arc::new(Simulations)),
-            Command::Score(args) => {
-                print(&score::score(&args)?);
-                Ok(())
-            }
-            Command::Film(args) => {
-                print(&film::film(&args)?);
-                Ok(())
-            }
+            Command::Score(args) => print(&score::score(&args)?),
+            Command::Film(args) => print(&film::film(&args)?),
             Command::Collect(args) => {
                 let summary = collect::collect(args.env, &args.out, args.transitions.get(), args.seed)
                     .hint_of(CollectError::hint)?;
-                print(&collected(&args, &summary));
-                Ok(())
+                print(&collected(&args, &summary))
             }
             Command::VerifyDataset(args) => {
                 let spec = args.env.map_or_else(|| verify::environment_of(&args.file), Ok);
                 let report = spec.and_then(|spec| verify::verify(&args.file, spec)).hint_of(VerifyError::hint)?;
-                print(&if args.json { serde_json::to_string(&report)? } else { verified(&report) });
-                Ok(())
+                print(&if args.json { serde_json::to_string(&report)? } else { verified(&report) })
             }
             Command::Doctor(args) => {
                 let findings = doctor::examine(&args)?;
-                print(&if args.json { findings.json()? } else { findings.to_string() });
+                print(&if args.json { findings.json()? } else { findings.to_string() })?;
                 findings.verdict()
+            }
+            Command::Completions { shell } => {
+                let mut script = Vec::new();
+                clap_complete::generate(shell, &mut Cli::command(), "evaluator", &mut script);
+                print(&String::from_utf8_lossy(&script))
             }
         }
     }
@@ -131,10 +134,4 @@ fn verified(report: &Report) -> String {
          terminals differ   {terminals_differ}",
         obs_error.median, obs_error.p99, obs_error.max, reward_error.max
     )
-}
-
-/// A command's result goes to standard output; everything else is a log line.
-#[allow(clippy::print_stdout)]
-fn print(result: &str) {
-    println!("{result}");
 }

@@ -6,6 +6,7 @@
 //! - `cli` is the command line, [`command`] goes from there to the exit.
 //! - `sweep` does many runs, each as a process.
 //! - `service` is a run at work: threads, main loop, Zenoh.
+//! - `page` shows runs to a browser.
 //! - `report` summarises scores as tables and as a picture.
 //! - [`train`] makes gradient steps.
 //! - `run` is the folder of a run.
@@ -21,6 +22,7 @@ pub mod command;
 pub mod config;
 mod data;
 mod evaluation;
+mod page;
 mod report;
 mod run;
 mod service;

@@ -1,4 +1,4 @@
-//! How an error is shown to the user, and the exit code.
+//! How a result or an error is shown to the user, and the exit code.
 
 use std::fmt;
 use std::io::{self, Write};
@@ -81,6 +81,17 @@ const UNFINISHED: u8 = 75;
 /// How long the last words wait for stderr to be read.
 const LAST_WORDS: Duration = Duration::from_secs(1);
 
+/// Prints a command's result to stdout, where logs do not go. The reader may stop at any time, like `head` does.
+///
+/// # Errors
+/// Stdout cannot be written to.
+pub fn print(text: &str) -> anyhow::Result<()> {
+    match writeln!(io::stdout(), "{}", text.trim_end()) {
+        Err(error) if error.kind() == io::ErrorKind::BrokenPipe => Ok(()),
+        result => Ok(result?),
+    }
+}
+
 /// Runs `main`, and ends the logging. An error is printed to stderr with its causes and hints; the exit code is then 1, or 75
 /// if the error is one of [`unfinished`]; otherwise 0.
 ///
@@ -93,14 +104,14 @@ pub fn run_main(logging: Logging, main: impl FnOnce() -> anyhow::Result<()>) -> 
     let (tell, told) = channel();
     thread::spawn(move || {
         // With stderr closed, the exit code is all that can be said.
-        print(&error, &mut io::stderr().lock()).ok();
+        show(&error, &mut io::stderr().lock()).ok();
         tell.send(()).ok();
     });
     told.recv_timeout(LAST_WORDS).ok();
     if unfinished { UNFINISHED.into() } else { ExitCode::FAILURE }
 }
 
-fn print(error: &anyhow::Error, to: &mut impl Write) -> io::Result<()> {
+fn show(error: &anyhow::Error, to: &mut impl Write) -> io::Result<()> {
     let mut last = String::new();
     for (depth, cause) in error.chain().enumerate() {
         let text = cause.to_string();
@@ -127,7 +138,7 @@ mod tests {
 
     fn printed<T>(result: anyhow::Result<T>) -> String {
         let mut text = Vec::new();
-        print(&result.err().unwrap(), &mut text).unwrap();
+        show(&result.err().unwrap(), &mut text).unwrap();
         String::from_utf8(text).unwrap()
     }
 

@@ -12,7 +12,8 @@
 //! - `health`: whether the parts of a process still do their work.
 //! - `metrics_server`: `/metrics` and `/healthz`.
 //! - `shutdown`: the signals that end a process.
-//! - `exit`: how an error is shown to the user, and the exit code.
+//! - `exit`: how a result or an error is shown to the user, and the exit code.
+//! - `progress`: how far something is, for people.
 //! - [`doctor`]: checks of a machine, before a run is started on it.
 
 mod access;
@@ -24,6 +25,7 @@ mod exit;
 mod health;
 mod logging;
 mod metrics_server;
+mod progress;
 mod router;
 mod session;
 mod shutdown;
@@ -32,10 +34,11 @@ mod threads;
 pub use background::stay_in_background;
 pub use certificates::{Certificates, CertificatesError, Role};
 pub use endpoints::{Endpoints, SessionError, default_endpoint, parse_endpoint};
-pub use exit::{Hint, hinted, hints, run_main, unfinished};
+pub use exit::{Hint, hinted, hints, print, run_main, unfinished};
 pub use health::{Beat, Health};
 pub use logging::{Logging, init_logging};
 pub use metrics_server::{BindError, MetricsServer, serve_metrics};
+pub use progress::Progress;
 pub use router::open_router;
 pub use session::{open_session, reachable_at};
 pub use shutdown::shutdown_signal;

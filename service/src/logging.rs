@@ -1,5 +1,6 @@
 //! Which log lines are written, and where to.
 
+use std::env;
 use std::io::IsTerminal;
 use std::sync::{Mutex, PoisonError};
 use std::time::{Duration, Instant};
@@ -31,7 +32,7 @@ pub struct Logging {
     _writer: WorkerGuard,
 }
 
-/// Sends log lines to stderr, coloured on a terminal; the environment variable RUST_LOG chooses which. Only a thread of the
+/// Sends log lines to stderr, coloured on a terminal without NO_COLOR; the environment variable RUST_LOG chooses which. Only a thread of the
 /// log's own waits when stderr is not read.
 ///
 /// To be called once, first thing in `main`; further calls do nothing.
@@ -39,7 +40,8 @@ pub fn init_logging() -> Logging {
     let writer = NonBlockingBuilder::default().buffered_lines_limit(MOST_WAITING).thread_name("log");
     let (lines, guard) = writer.finish(std::io::stderr());
     let filter = EnvFilter::try_from_default_env().unwrap_or_else(|_| EnvFilter::new(DEFAULT_FILTER));
-    subscriber(lines, filter, std::io::stderr().is_terminal()).try_init().ok();
+    let colours = std::io::stderr().is_terminal() && env::var_os("NO_COLOR").is_none_or(|value| value.is_empty());
+    subscriber(lines, filter, colours).try_init().ok();
     Logging { _writer: guard }
 }
 

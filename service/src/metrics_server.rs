@@ -1,4 +1,4 @@
-//! `/metrics` and `/healthz`.
+//! `/metrics`, `/healthz` and the pages of a program.
 
 use std::collections::VecDeque;
 use std::io;
@@ -51,7 +51,7 @@ pub struct BindError {
 }
 
 /// Serves over HTTP at `address`: at `/metrics` what `registry` gathers, in Prometheus's text format; at `/healthz` `ok`,
-/// or status 503 and a line for each problem.
+/// or status 503 and a line for each problem; and the `pages` of the program's own.
 ///
 /// Clients that send or read slowly, or only hold connections, are cut off; they cost a bounded amount of memory.
 ///
@@ -61,12 +61,14 @@ pub async fn serve_metrics(
     address: SocketAddr,
     registry: Registry,
     health: Health,
+    pages: Router,
 ) -> Result<MetricsServer, BindError> {
     let bind_error = |source| BindError { address, source };
     let listener = TcpListener::bind(address).await.map_err(bind_error)?;
     let address = listener.local_addr().map_err(bind_error)?;
     let metrics = get(metrics).with_state(registry);
-    let router = Router::new().route("/metrics", metrics).route("/healthz", get(healthz).with_state(health));
+    let router =
+        Router::new().route("/metrics", metrics).route("/healthz", get(healthz).with_state(health)).merge(pages);
     let task = tokio::spawn(accept(listener, router));
     Ok(MetricsServer { address, task })
 }

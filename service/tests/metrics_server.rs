@@ -5,20 +5,21 @@ use std::io::{Read, Write};
 use std::net::{SocketAddr, TcpStream};
 use std::time::{Duration, Instant};
 
+use axum::Router;
 use prometheus::{IntGauge, Registry};
 use quad_service::{Health, MetricsServer, serve_metrics};
 
 const ANY_PORT: SocketAddr = SocketAddr::new(std::net::IpAddr::V4(std::net::Ipv4Addr::LOCALHOST), 0);
 
 async fn server() -> (MetricsServer, IntGauge) {
-    server_with(Health::default()).await
+    server_with(Health::default(), Router::new()).await
 }
 
 async fn server_with(health: Health) -> (MetricsServer, IntGauge) {
     let registry = Registry::new();
     let gauge = IntGauge::new("quad_test_apples", "Apples in the test.").unwrap();
     registry.register(Box::new(gauge.clone())).unwrap();
-    (serve_metrics(ANY_PORT, registry, health).await.unwrap(), gauge)
+    (serve_metrics(ANY_PORT, registry, health, Router::new()).await.unwrap(), gauge)
 }
 
 /// Head and body of the response.
@@ -125,12 +126,12 @@ async fn a_hundred_idle_connections_keep_no_client_out() {
 async fn an_address_in_use_is_an_error_and_free_again_afterwards() {
     let (server, _) = server().await;
     let address = server.address;
-    let error = serve_metrics(address, Registry::new(), Health::default()).await.unwrap_err();
+    let error = serve_metrics(address, Registry::new(), Health::default(), Router::new()).await.unwrap_err();
     assert_eq!(error.to_string(), format!("cannot serve metrics at {address}"));
     assert_eq!(error.source.kind(), std::io::ErrorKind::AddrInUse);
     drop(server);
     for _ in 0..100 {
-        if serve_metrics(address, Registry::new(), Health::default()).await.is_ok() {
+        if serve_metrics(address, Registry::new(), Health::default(), Router::new()).await.is_ok() {
             return;
         }
         tokio::time::sleep(Duration::from_millis(50)).await;

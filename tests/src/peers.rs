@@ -61,6 +61,15 @@ pub fn has_prometheus() -> bool {
     found
 }
 
+/// Whether Debian's browser is there; if not, the test is to be skipped.
+pub fn has_chromium() -> bool {
+    let found = Command::new("chromium").arg("--version").output().is_ok_and(|output| output.status.success());
+    if !found {
+        missing("Chromium", "install it with: apt-get install --no-install-recommends chromium");
+    }
+    found
+}
+
 /// Whether pictures can be drawn here, as `evaluator doctor` says; if not, the test is to be skipped.
 pub fn has_egl() -> bool {
     let output = Command::new(binary("evaluator")).arg("doctor").output().expect("the evaluator starts");

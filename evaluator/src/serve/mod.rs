@@ -122,9 +122,10 @@ async fn serve_until_stopped(args: ServeArgs, environments: Arc<dyn Environments
     // Serves for as long as it is held.
     let _server = match args.metrics {
         Some(address) => {
-            let server = quad_service::serve_metrics(address, metrics.registry.clone(), health.clone())
-                .await
-                .hint("choose another address or port for --metrics, or port 0 for a free one")?;
+            let server =
+                quad_service::serve_metrics(address, metrics.registry.clone(), health.clone(), Default::default())
+                    .await
+                    .hint("choose another address or port for --metrics, or port 0 for a free one")?;
             info!("metrics at http://{}/metrics", server.address);
             Some(server)
         }

@@ -3,10 +3,11 @@
 mod sweep;
 mod train;
 
-use std::io::{ErrorKind, Write};
+use std::net::SocketAddr;
 use std::path::PathBuf;
 
 use clap::{Args, Parser, Subcommand};
+use clap_complete::Shell;
 use quad_dataset::{EnvironmentSpec, environment};
 use quad_service::parse_endpoint;
 
@@ -47,12 +48,21 @@ pub enum Command {
     /// Datasets: list the names, fetch one, inspect a file
     #[command(subcommand)]
     Datasets(DatasetsCommand),
+    /// List all runs: what each is, how far it is, its last score, its size, and whether a learner is at work on it
+    List(ListArgs),
+    /// Serve a page on which a browser lists all runs, finished and at work, and compares those that are ticked
+    Page(PageArgs),
     /// Print the scores of finished or running runs, statistics over seeds and tasks, and the paper's tables with ours beside them
     Report(ReportArgs),
     /// Check by a run's folder alone that each episode is scored once, with the weights that are kept there
     Verify(VerifyArgs),
     /// Check that this machine is fit for a run, and say how to mend what is not
     Doctor(DoctorArgs),
+    /// Print a script by which a shell completes this program's arguments
+    Completions {
+        /// The shell
+        shell: Shell,
+    },
 }
 
 /// Arguments of `learner presets`.
@@ -124,6 +134,28 @@ pub struct DoctorArgs {
     pub json: bool,
 }
 
+/// Arguments of `learner list`.
+#[derive(Debug, Args)]
+pub struct ListArgs {
+    /// Run folders, or folders with runs below them
+    #[arg(value_name = "DIR", default_value = "runs")]
+    pub dirs: Vec<PathBuf>,
+    /// Print a JSON array of objects instead of a table
+    #[arg(long)]
+    pub json: bool,
+}
+
+/// Arguments of `learner page`.
+#[derive(Debug, Args)]
+pub struct PageArgs {
+    /// Run folder, or folder with runs below it
+    #[arg(long, value_name = "DIR", default_value = "runs")]
+    pub runs: PathBuf,
+    /// Serve it here; port 0 takes a free one
+    #[arg(long, value_name = "ADDR:PORT", default_value = "127.0.0.1:8080")]
+    pub listen: SocketAddr,
+}
+
 /// Arguments of `learner report`.
 #[derive(Debug, Args)]
 pub struct ReportArgs {
@@ -165,14 +197,6 @@ fn parse_preset(text: &str) -> Result<String, String> {
 
 fn parse_algorithm(text: &str) -> Result<String, String> {
     hyperparameters::algorithm(text).map(|known| known.name.to_owned()).map_err(|_| hyperparameters::unknown_hint(text))
-}
-
-/// Prints a result to stdout, where logs do not go. The reader may stop at any time, like `head` does.
-pub(crate) fn print(text: &str) -> anyhow::Result<()> {
-    match writeln!(std::io::stdout(), "{}", text.trim_end()) {
-        Err(error) if error.kind() == ErrorKind::BrokenPipe => Ok(()),
-        result => Ok(result?),
-    }
 }
 
 #[cfg(test)]

@@ -23,6 +23,9 @@ Examples:
   # QUAD without guidance, which is behaviour cloning.
   learner train --task hopper-demo --agent guidance=none --dataset data/hopper-demo.hdf5
 
+  # What will that be, and what will it take?
+  learner train --task hopper-demo --dataset data/hopper-demo.hdf5 --dry-run
+
   # Go on after a crash or Ctrl-C: the same command again.
 
 At Ctrl-C or SIGTERM the learner saves a checkpoint and ends with exit code 75; at a second one it ends at once. The same
@@ -59,6 +62,10 @@ pub struct TrainArgs {
     /// Begin anew: a run that is in the folder already is kept under another name
     #[arg(long)]
     pub fresh: bool,
+    /// Print every value of the run, and what it takes of time, memory and disk by a second's measurement; train nothing and
+    /// leave no folder. A dataset that is not there yet is fetched
+    #[arg(long)]
+    pub dry_run: bool,
     /// Listen for evaluators here, e.g. tcp/127.0.0.1:7447, or tls/0.0.0.0:7447 for other machines
     /// [default: tcp/127.0.0.1:7447, or tls/… with --certificates; any free port if that is taken, or with --eval-interval 0]
     #[arg(long, value_name = "ENDPOINT", value_parser = parse_endpoint, conflicts_with = "connect")]

@@ -1,22 +1,28 @@
 //! The learner's commands, from the command line to the exit. All of it runs on the main thread.
 
 mod doctor;
+mod dry_run;
 mod outside;
+mod page;
 mod sweep;
 mod train;
 
 use std::fmt::Alignment::{Left, Right};
 
+use clap::CommandFactory;
+use clap_complete::Shell;
 use quad_dataset::{DatasetError, environment};
-use quad_service::{Hint, hinted};
+use quad_service::{Hint, hinted, print};
 use tracing::{info, warn};
 
 use crate::algorithms::ALGORITHMS;
-use crate::cli::{Cli, Command, DatasetsCommand, DoctorArgs, InspectArgs, PresetsArgs, ReportArgs, VerifyArgs, print};
+use crate::cli::{
+    Cli, Command, DatasetsCommand, DoctorArgs, InspectArgs, ListArgs, PresetsArgs, ReportArgs, VerifyArgs,
+};
 use crate::config::hyperparameters::{self, Values};
 use crate::config::{Preset, tasks};
 use crate::data::{Source, cache};
-use crate::report::{Report, Style, Table, draw_all, runs_in, write_html};
+use crate::report::{Listing, Report, Style, Table, draw_all, runs_in, write_html};
 use crate::run::{RunDirError, verify};
 
 /// Does what the command line says.
@@ -31,7 +37,10 @@ pub fn run(cli: &Cli) -> anyhow::Result<()> {
         Command::Datasets(command) => datasets(command),
         Command::Report(args) => report(args),
         Command::Verify(args) => check_run(args),
+        Command::List(args) => list(args),
+        Command::Page(args) => page::show(args),
         Command::Doctor(args) => examine(args),
+        Command::Completions { shell } => completions(*shell),
     };
     done.map_err(|error| match error.downcast_ref().map(RunDirError::hint) {
         Some(hint) => hinted(error, hint),
@@ -99,6 +108,17 @@ fn check_run(args: &VerifyArgs) -> anyhow::Result<()> {
     }
     anyhow::ensure!(findings.iter().all(|(_, found)| found.all_held()), "not everything held");
     Ok(())
+}
+
+fn list(args: &ListArgs) -> anyhow::Result<()> {
+    let listing = Listing::read(&args.dirs);
+    print(&if args.json { serde_json::to_string_pretty(&listing.entries)? } else { listing.to_string() })
+}
+
+fn completions(shell: Shell) -> anyhow::Result<()> {
+    let mut script = Vec::new();
+    clap_complete::generate(shell, &mut Cli::command(), "learner", &mut script);
+    print(&String::from_utf8_lossy(&script))
 }
 
 fn examine(args: &DoctorArgs) -> anyhow::Result<()> {

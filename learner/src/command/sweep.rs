@@ -8,13 +8,13 @@ use std::path::{Path, PathBuf};
 use std::thread::available_parallelism;
 
 use anyhow::{Context, anyhow};
-use quad_service::{Hint, SessionError, hinted, open_router, stay_in_background, unfinished};
+use quad_service::{Hint, SessionError, hinted, open_router, print, stay_in_background, unfinished};
 use tracing::info;
 
-use crate::cli::{SweepArgs, print};
-use crate::report::{Style, Table};
+use crate::cli::SweepArgs;
+use crate::report::{State, Style, Table};
 use crate::service::LocalEvaluators;
-use crate::sweep::{Cost, Ended, PlannedRun, State, Study, Sweep};
+use crate::sweep::{Cost, Ended, PlannedRun, Study, Sweep};
 
 /// Runs, and how far each is.
 type Runs = Vec<(PlannedRun, State)>;
@@ -46,7 +46,7 @@ fn chosen(study: &Study, args: &SweepArgs, folder: &Path) -> anyhow::Result<Runs
     let is_chosen = |run: &&PlannedRun| {
         args.index.is_none_or(|index| run.index == index) && args.shard.is_none_or(|shard| shard.has(run.index))
     };
-    let with_state = |run: &PlannedRun| Ok((run.clone(), State::of(run, &folder.join(&run.name))?));
+    let with_state = |run: &PlannedRun| Ok((run.clone(), run.state(&folder.join(&run.name))?));
     study.runs.iter().filter(is_chosen).map(with_state).collect()
 }
 

@@ -1,23 +1,26 @@
 //! `learner train`, from the command line to the report.
 
 use std::path::{Path, PathBuf};
+use std::sync::Arc;
 use std::time::{Duration, SystemTime, UNIX_EPOCH};
 
 use anyhow::{Context, anyhow};
 use quad_dataset::{Transitions, environment};
 use quad_policy::Precision;
 use quad_protocol::Name;
-use quad_service::{Health, Hint, hinted, stay_in_background, unfinished};
+use quad_service::{Health, Hint, hinted, print, stay_in_background, unfinished};
 use tokio::sync::mpsc;
 use tracing::{debug, info, warn};
 
+use super::dry_run;
 use super::outside::Outside;
-use crate::cli::{TrainArgs, print};
+use crate::cli::TrainArgs;
 use crate::config::{DatasetInfo, Experiment, Preset, RunConfig, RunInfo, hyperparameters};
 use crate::data::{LocalDataset, Source, load};
+use crate::page;
 use crate::report::{RunReport, of_run};
 use crate::run::{self, Begun, Log, Past, RunDir};
-use crate::service::{Display, Ending, Life, MainLoop, Metrics, Run, STUCK, Threads};
+use crate::service::{Display, Ending, Life, Live, MainLoop, Metrics, Run, STUCK, Threads};
 
 /// How long a run that has failed may write its report.
 const REPORT_PATIENCE: Duration = Duration::from_secs(5);
@@ -61,6 +64,9 @@ pub fn train(args: &TrainArgs) -> anyhow::Result<()> {
         warn!("{}", Precision::UNAVAILABLE);
     }
     debug!("{config:?}");
+    if args.dry_run {
+        return dry_run::foretell(&path, &config, transitions);
+    }
 
     // Zenoh and the training thread have threads of their own; this runtime serves the metrics and the main loop.
     let mut runtime = tokio::runtime::Builder::new_multi_thread();
@@ -91,7 +97,11 @@ async fn run_to_its_end(
     let steps = config.experiment.steps;
     let (metrics, registry) = Metrics::new(&name, steps, config.experiment.definition()?.metrics)?;
     let health = Health::default();
-    let server = quad_service::serve_metrics(args.metrics, registry, health.clone()).await?;
+    let live = Live::new(name.clone(), steps, metrics.clone(), health.clone());
+    let telling = live.clone();
+    let page = page::routes(path.to_owned(), Some(Arc::new(move || telling.tell())))?;
+    let server = quad_service::serve_metrics(args.metrics, registry, health.clone(), page).await?;
+    info!("page: http://{}/", server.address);
     let opening = outside.open().await?;
     // From here on nothing outside can be wrong any more, so a refused start leaves no folder behind.
     let (run_dir, scores, past) = take_up(path, begun, args.fresh, config)?;
@@ -101,6 +111,7 @@ async fn run_to_its_end(
     let checkpoint_every = Duration::from_secs(args.checkpoint_seconds);
     let run = Run { life: life.clone(), config, dir: &run_dir, scores, past, checkpoint_every };
     let threads = Threads::start(run, transitions, &metrics, &health, &tell)?;
+    live.begun(&threads);
     let main_loop = MainLoop {
         life,
         run_dir: run_dir.clone(),

@@ -7,11 +7,10 @@ use std::time::Duration;
 
 use anyhow::{Error, anyhow};
 use quad_dataset::NamedDataset;
-use quad_service::{Hint, hinted};
+use quad_service::{Hint, Progress, hinted};
 use ureq::Agent;
 
 use super::partial::Partial;
-use super::progress::Progress;
 use super::transfer::{Failure, client, transfer};
 use super::verify::verify;
 
@@ -60,7 +59,7 @@ impl Fetcher {
         }
         fs::create_dir_all(folder).map_err(local)?;
         let mut partial = Partial::open(&path).map_err(local)?;
-        let progress = Progress::new();
+        let progress = Progress::of_bytes();
         let mut refusals = String::new();
         for address in self.addresses(dataset) {
             progress.say(&format!("fetching {} from {address}", dataset.name));

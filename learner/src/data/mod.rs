@@ -6,13 +6,12 @@
 //!
 //! In reading order: `source` is what `--dataset` means; `cache` is the folder; `fetch` gets a file of the catalogue into it,
 //! from one address after the other; `transfer` is one attempt at one address; `partial` is what has arrived so far; `verify`
-//! tells whether it is the right file; `progress` shows how far it is. `load` reads the file's transitions for a run.
+//! tells whether it is the right file. `load` reads the file's transitions for a run.
 
 pub(crate) mod cache;
 mod fetch;
 mod load;
 mod partial;
-mod progress;
 mod source;
 mod transfer;
 mod verify;

@@ -3,11 +3,11 @@
 use std::io::{self, Read};
 use std::time::Duration;
 
+use quad_service::Progress;
 use ureq::http::{Response, StatusCode};
 use ureq::{Agent, Body, Error};
 
 use super::partial::Partial;
-use super::progress::Progress;
 
 /// Read at a time.
 const CHUNK: usize = 1 << 16;

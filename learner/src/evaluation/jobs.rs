@@ -51,6 +51,11 @@ impl OpenJob {
         Ok(())
     }
 
+    /// How many of its episodes have ended, as the evaluator says.
+    pub fn episodes_done(&self) -> u32 {
+        self.done.1
+    }
+
     /// Extends the lease, until `longest` after the job was handed out.
     pub fn extend(&mut self, now: Instant, longest: Duration) {
         self.lease_until = self.lease_until.max((now + self.patience).min(self.handed_out + longest));

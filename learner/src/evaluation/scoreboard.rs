@@ -157,6 +157,11 @@ impl Scoreboard {
         })
     }
 
+    /// The job that an evaluator has: its step, how many of its episodes have ended, and how many there are.
+    pub fn job_of(&self, evaluator: &Name) -> Option<(u64, u32, usize)> {
+        self.jobs.of(evaluator).map(|(_, job)| (job.step, job.episodes_done(), job.seeds.len()))
+    }
+
     /// Extends the lease of the job that an evaluator is at, if the job is further than before.
     pub fn progress(&mut self, progress: &Progress, now: Instant) -> Result<(), Refusal> {
         require(progress.run == self.rules.run, Refusal::Run)?;

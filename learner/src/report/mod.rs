@@ -2,6 +2,8 @@
 //!
 //! Owns nothing: it reads run folders, which a learner may be writing, and gives text, JSON, HTML, SVG and PNG. It runs on the thread
 //! of its caller: `learner report`, and `learner train` at the end of a run, both on the main thread. It imports `config`, `run`
+//! Owns nothing: it reads run folders, which a learner may be writing, and gives text, JSON, SVG and PNG. It runs on the thread
+//! of its caller: `learner report` and `list`, and `learner train` at the end of a run, all on the main thread. It imports `config`, `run`
 //! and the list of algorithms.
 //!
 //! The protocol is the paper's (section 5.1 and appendix B): the score of a run is the mean of its last 5 evaluations, or of
@@ -13,12 +15,14 @@
 //! a run differs from what the paper ran, `lambda` what QUAD's λ was in a run; `paper` has the paper's tables with ours beside
 //! them; `summary` is the whole report; `figures` are its pictures, which `plot` draws; `html`
 //! is all of that in one file, with the commands of `remake`. `selection`, `spread` and `table` are
+//! them; `summary` is the whole report; `state` is how far a run is, `list` says so of all runs; `figures` are its pictures, which `plot` draws. `selection`, `spread` and `table` are
 //! small parts of these.
 
 mod departures;
 mod figures;
 mod html;
 mod lambda;
+mod list;
 mod paper;
 mod plot;
 mod published;
@@ -27,6 +31,7 @@ mod run;
 mod seeds;
 mod selection;
 mod spread;
+mod state;
 mod statistics;
 mod study;
 mod summary;
@@ -34,8 +39,10 @@ mod table;
 
 pub(crate) use figures::{draw_all, of_run};
 pub(crate) use html::write as write_html;
+pub(crate) use list::Listing;
 pub(crate) use run::RunReport;
 pub(crate) use selection::Select;
 pub(crate) use spread::Spread;
+pub(crate) use state::{Progress, State};
 pub(crate) use summary::{Report, runs_in};
 pub(crate) use table::{Style, Table};

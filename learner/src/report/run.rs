@@ -87,8 +87,9 @@ pub struct RunReport {
     own_score: bool,
     #[serde(skip)]
     pub(super) precisions: BTreeSet<String>,
+    /// Its configuration.
     #[serde(skip)]
-    pub(super) config: RunConfig,
+    pub config: RunConfig,
 }
 
 impl RunReport {
@@ -163,6 +164,11 @@ impl RunReport {
         }
     }
 
+    /// What it was asked to do.
+    pub fn config(&self) -> &RunConfig {
+        &self.config
+    }
+
     /// Whether every episode of every evaluation has its score.
     pub fn is_complete(&self) -> bool {
         self.missing.is_empty()
@@ -172,6 +178,11 @@ impl RunReport {
     pub fn best(&self) -> Option<&EvaluationReport> {
         let complete = self.evaluations.iter().filter(|evaluation| evaluation.complete);
         complete.max_by(|one, other| one.score.mean.total_cmp(&other.score.mean))
+    }
+
+    /// Its last complete evaluation.
+    pub fn newest(&self) -> Option<&EvaluationReport> {
+        self.evaluations.iter().rfind(|evaluation| evaluation.complete)
     }
 
     /// How many of the planned evaluations have all their scores.
@@ -185,8 +196,7 @@ impl RunReport {
 
     /// The step of the last complete evaluation of a run that is not complete.
     pub fn reached(&self) -> Option<u64> {
-        let last = self.evaluations.iter().rfind(|evaluation| evaluation.complete);
-        (!self.is_complete()).then_some(last.map_or(0, |evaluation| evaluation.step))
+        (!self.is_complete()).then_some(self.newest().map_or(0, |evaluation| evaluation.step))
     }
 
     /// How far a run has come that is not complete, in words.

@@ -10,8 +10,6 @@ use tracing::warn;
 use super::durable;
 use super::error::{RunDirError, io_error};
 
-/// How many are kept: the newest, and those that step in for it should it turn out to be damaged.
-const KEPT: usize = 3;
 const SUFFIX: &str = ".safetensors";
 
 /// The state after a gradient step.
@@ -21,6 +19,11 @@ pub(crate) struct Checkpoint {
     pub step: u64,
     /// A safetensors file, as `Agent::save` makes it.
     pub state: Vec<u8>,
+}
+
+impl Checkpoint {
+    /// How many a run keeps: the newest, and those that step in for it should it turn out to be damaged.
+    pub const KEPT: usize = 3;
 }
 
 /// The folder `checkpoints` of a run. A file's name has the step and the beginning of the BLAKE3 hash of its contents.
@@ -38,7 +41,7 @@ impl Checkpoints {
     pub fn save(&self, checkpoint: &Checkpoint) -> Result<(), RunDirError> {
         let target = self.folder.join(file_name(checkpoint));
         durable::replace(&target, &checkpoint.state)?;
-        for older in self.files()?.into_iter().skip(KEPT) {
+        for older in self.files()?.into_iter().skip(Checkpoint::KEPT) {
             // One file too many does no harm.
             fs::remove_file(older).ok();
         }

@@ -10,7 +10,7 @@
 //! report.json, learning_curve.svg    written at the end
 //! ```
 
-use std::fs;
+use std::fs::{self, File, TryLockError};
 use std::io;
 use std::path::{Path, PathBuf};
 
@@ -22,6 +22,9 @@ use super::error::{RunDirError, content, io_error};
 use super::lines::{RunEndpoints, ScoreLine};
 use super::log::Log;
 use crate::config::RunConfig;
+
+/// The file by which a sweep remembers that a run has failed.
+const FAILED: &str = "failed";
 
 /// The folder of one run.
 #[derive(Clone, Debug)]
@@ -62,6 +65,29 @@ impl RunDir {
     /// The folder, whatever is in it.
     pub fn at(path: &Path) -> Self {
         Self { path: path.to_owned() }
+    }
+
+    /// Whether a learner is at work in it, by its lock on `scores.jsonl`. Where files have no locks, none is.
+    pub fn is_in_use(&self) -> bool {
+        let log = File::open(self.path.join("scores.jsonl"));
+        log.is_ok_and(|log| matches!(log.try_lock_shared(), Err(TryLockError::WouldBlock)))
+    }
+
+    /// Remembers that a run of a sweep has failed, or forgets it.
+    pub fn mark_failed(&self, failed: bool) -> io::Result<()> {
+        let path = self.path.join(FAILED);
+        match failed {
+            true => fs::write(path, ""),
+            false => fs::remove_file(path).or_else(|error| match error.kind() {
+                io::ErrorKind::NotFound => Ok(()),
+                _ => Err(error),
+            }),
+        }
+    }
+
+    /// Whether it is remembered that it has.
+    pub fn has_failed(&self) -> bool {
+        self.path.join(FAILED).exists()
     }
 
     /// Renames the folder to one that says that it is older; gives the new path.
@@ -106,6 +132,13 @@ impl RunDir {
     /// Says where the learner can be reached.
     pub fn write_endpoints(&self, endpoints: &RunEndpoints) -> Result<(), RunDirError> {
         self.write_json("endpoints.json", endpoints)
+    }
+
+    /// Where the learner can be reached that wrote so last, at work or not.
+    pub fn read_endpoints(&self) -> Result<RunEndpoints, RunDirError> {
+        let path = self.path.join("endpoints.json");
+        let text = fs::read_to_string(&path).map_err(io_error("read", &path))?;
+        serde_json::from_str(&text).map_err(|error| content(&path, None, &error))
     }
 
     /// Forgets where an earlier learner could be reached.

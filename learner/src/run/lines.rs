@@ -4,12 +4,15 @@ use quad_protocol::{EpisodeScore, ScoreReport};
 use serde::{Deserialize, Serialize};
 
 /// Where a learner can be reached: `endpoints.json`.
-#[derive(Clone, Debug, Serialize)]
+#[derive(Clone, Debug, Serialize, Deserialize)]
 pub(crate) struct RunEndpoints {
     /// Zenoh endpoints that an evaluator can connect to.
     pub zenoh: Vec<String>,
     /// Address of `/metrics`.
     pub metrics: String,
+    /// The page that shows the run to a browser; older runs have none.
+    #[serde(default)]
+    pub page: String,
 }
 
 /// A line of `scores.jsonl`.

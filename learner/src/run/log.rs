@@ -3,12 +3,17 @@
 use std::fs::{File, OpenOptions, TryLockError};
 use std::io::{self, Read, Seek, SeekFrom, Write};
 use std::path::PathBuf;
+use std::thread::sleep;
+use std::time::Duration;
 
 use serde::Serialize;
 use tracing::warn;
 
 use super::durable::synchronise_folder;
 use super::error::{RunDirError, content, io_error};
+
+/// A lock that another process has is tried again after this time.
+const GLANCE: Duration = Duration::from_millis(10);
 
 /// A file of JSON lines, opened for appending. No other process has it open for that.
 #[derive(Debug)]
@@ -30,7 +35,12 @@ impl Log {
     pub(super) fn open(path: PathBuf, synchronise: bool) -> Result<Self, RunDirError> {
         let opened = OpenOptions::new().create(true).read(true).append(true).open(&path);
         let mut file = opened.map_err(io_error("open", &path))?;
-        match file.try_lock() {
+        // `learner list` takes the lock for microseconds, to see whether a learner has it.
+        let again = |_| {
+            sleep(GLANCE);
+            file.try_lock()
+        };
+        match file.try_lock().or_else(again) {
             Ok(()) => {}
             Err(TryLockError::WouldBlock) => {
                 return Err(RunDirError::InUse(path.parent().unwrap_or(&path).to_owned()));

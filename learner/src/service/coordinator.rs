@@ -12,6 +12,7 @@ use tracing::{debug, warn};
 
 use super::evaluators::Evaluators;
 use super::events::{Event, Events};
+use super::live::{EvaluatorAtWork, JobAtWork};
 use super::metrics::Metrics;
 use super::rejection::Rejection;
 use crate::evaluation::{
@@ -80,6 +81,19 @@ impl Coordinator {
     /// Whether an evaluator is connected that has this environment.
     pub fn any_fits(&self) -> bool {
         self.lock().evaluators.any_fits()
+    }
+
+    /// Each evaluator that is connected, and what it does, as the page shows it.
+    pub fn evaluators(&self) -> Vec<EvaluatorAtWork> {
+        let state = self.lock();
+        let present = state.evaluators.present();
+        let at_work = present.map(|(evaluator, fits, seen)| EvaluatorAtWork {
+            name: evaluator.to_string(),
+            fits,
+            seconds_ago: seen.map(|seen| seen.elapsed().as_secs_f64()),
+            job: state.scoreboard.job_of(evaluator).map(|(step, done, episodes)| JobAtWork { step, done, episodes }),
+        });
+        at_work.collect()
     }
 
     // A thread that panicked here ends the run.

@@ -1,7 +1,6 @@
 //! What a person sees while the learner works: a bar with the figures on a terminal, plain log lines otherwise.
 
 use std::collections::VecDeque;
-use std::io::IsTerminal;
 use std::time::{Duration, Instant};
 
 use indicatif::{HumanDuration, ProgressBar, ProgressDrawTarget, ProgressStyle};
@@ -24,7 +23,7 @@ const SCORES_SHOWN: usize = 3;
 pub(crate) struct Display {
     metrics: Metrics,
     steps: u64,
-    /// `None` where stderr is no terminal.
+    /// `None` where stderr is no terminal, or one that cannot draw (`TERM=dumb`).
     bar: Option<ProgressBar>,
     samples: VecDeque<(Instant, u64)>,
     /// Newest last: gradient step and mean score.
@@ -37,18 +36,15 @@ pub(crate) struct Display {
 impl Display {
     /// Starts it, for so many gradient steps.
     pub fn start(metrics: Metrics, steps: u64) -> Self {
-        let bar = std::io::stderr().is_terminal().then(|| {
-            let bar = ProgressBar::with_draw_target(Some(steps), ProgressDrawTarget::stderr());
-            // Without a style of ours the bar still works, with less beside it.
-            if let Ok(style) = ProgressStyle::with_template("{bar:40} {pos}/{len} gradient steps\n{msg}") {
-                bar.set_style(style);
-            }
-            bar
-        });
+        let bar = ProgressBar::with_draw_target(Some(steps), ProgressDrawTarget::stderr());
+        // Without a style of ours the bar still works, with less beside it.
+        if let Ok(style) = ProgressStyle::with_template("{bar:40} {pos}/{len} gradient steps\n{msg}") {
+            bar.set_style(style);
+        }
         Self {
             metrics,
             steps,
-            bar,
+            bar: Some(bar).filter(|bar| !bar.is_hidden()),
             samples: VecDeque::new(),
             scores: VecDeque::new(),
             last_line: Instant::now(),

@@ -44,6 +44,12 @@ impl Evaluators {
         !self.fitting.is_empty()
     }
 
+    /// Those that are connected: whether each has the run's environment, and when it was last heard of.
+    pub fn present(&self) -> impl Iterator<Item = (&Name, bool, Option<Instant>)> {
+        let seen = |evaluator: &Name| self.last_seen.get(evaluator).copied();
+        self.present.iter().map(move |evaluator| (evaluator, self.fitting.contains(evaluator), seen(evaluator)))
+    }
+
     /// One asked for a job, and has the run's environment.
     pub fn fits(&mut self, evaluator: &Name) {
         if self.present.contains(evaluator) && !self.fitting.contains(evaluator) {

@@ -13,7 +13,8 @@
 //!   writes scores down. A query until it is answered is one of the `requests`.
 //! - `coordinator` is the state that they share: the scoreboard and the `evaluators`. `rejection` says why a message is not
 //!   accepted.
-//! - `metrics` are for Prometheus, `disk` is what is told of a disk that refuses something, `display` what a person sees.
+//! - `metrics` are for Prometheus, `disk` is what is told of a disk that refuses something, `display` what a person sees on a
+//!   terminal, `live` what the page shows.
 
 mod coordinator;
 mod disk;
@@ -21,6 +22,7 @@ mod display;
 mod duplicate;
 mod evaluators;
 mod events;
+mod live;
 mod local_evaluators;
 mod main_loop;
 mod metrics;
@@ -42,6 +44,7 @@ mod wire;
 
 pub(crate) use display::Display;
 pub(crate) use duplicate::Life;
+pub(crate) use live::Live;
 pub(crate) use local_evaluators::{LocalEvaluators, spawn_logged};
 pub(crate) use main_loop::{Ending, MainLoop};
 pub(crate) use metrics::Metrics;

@@ -56,7 +56,11 @@ pub(super) async fn go_online(
     };
     let reachable_at = quad_service::reachable_at(&session, &endpoints).await?;
     let wire = Wire::declare(session, &life, &services).await?;
-    tokio::spawn(write_endpoints(run_dir, RunEndpoints { zenoh: reachable_at.clone(), metrics: metrics_address }));
+    let page = format!("http://{metrics_address}/");
+    tokio::spawn(write_endpoints(
+        run_dir,
+        RunEndpoints { zenoh: reachable_at.clone(), metrics: metrics_address, page },
+    ));
     Ok(Online { wire, reachable_at })
 }
 

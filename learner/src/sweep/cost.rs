@@ -2,38 +2,19 @@
 
 use std::collections::BTreeMap;
 use std::path::Path;
-use std::sync::Arc;
-use std::time::{Duration, Instant};
+use std::time::Duration;
 
-use anyhow::Context as _;
+use anyhow::Context;
 use indicatif::{HumanBytes, HumanDuration};
-use quad_dataset::{BatchSampler, Transitions};
-use quad_protocol::Origin;
 
-use super::state::State;
 use super::study::PlannedRun;
-use crate::algorithms::Context;
-use crate::config::{Device, Experiment, settings};
+use crate::config::{Device, settings};
 use crate::data::load;
-use crate::train::agent::Agent;
+use crate::report::State;
+use crate::train::Price;
 
-/// How long each configuration is measured.
-const MEASURED: Duration = Duration::from_secs(1);
 /// Most configurations that are; further ones are taken to cost as much as these on average.
 const MOST_MEASURED: usize = 20;
-/// Checkpoints that a run keeps.
-const CHECKPOINTS: u64 = 3;
-
-/// What one configuration takes.
-#[derive(Clone, Copy)]
-struct Price {
-    /// Seconds of one gradient step, on one thread.
-    step: f64,
-    /// Bytes of a snapshot.
-    snapshot: u64,
-    /// Bytes of a checkpoint.
-    checkpoint: u64,
-}
 
 /// What runs will cost.
 pub(crate) struct Cost {
@@ -57,11 +38,12 @@ impl Cost {
         dataset: impl Fn(&PlannedRun) -> &'a Path,
     ) -> anyhow::Result<Self> {
         let mut prices: BTreeMap<String, Price> = BTreeMap::new();
+        let one_thread = rayon::ThreadPoolBuilder::new().num_threads(1).build()?;
         for (run, _) in runs {
             let key = configuration(run);
             if prices.len() < MOST_MEASURED && !prices.contains_key(&key) {
                 let transitions = load(dataset(run), &run.experiment)?;
-                let price = price(&run.experiment, transitions);
+                let price = one_thread.install(|| Price::measure(&run.experiment, Device::Cpu, transitions));
                 prices.insert(key, price.with_context(|| format!("the run {} cannot begin", run.name))?);
             }
         }
@@ -75,11 +57,10 @@ impl Cost {
         let mut cost = Self { step_seconds: BTreeMap::new(), seconds: 0.0, bytes: 0, measured };
         for (run, state) in runs {
             let price = prices.get(&configuration(run)).copied().unwrap_or(other);
-            let Experiment { steps, .. } = run.experiment;
-            let snapshots = run.experiment.schedule().evaluated_steps().count().max(1) as u64;
+            let steps = run.experiment.steps;
             cost.step_seconds.insert(run.index, price.step);
             cost.seconds += price.step * (steps - state.step(steps).min(steps)) as f64;
-            cost.bytes += snapshots * price.snapshot + CHECKPOINTS * price.checkpoint;
+            cost.bytes += price.bytes(&run.experiment);
         }
         Ok(cost)
     }
@@ -101,39 +82,4 @@ fn configuration(run: &PlannedRun) -> String {
     let mut settings = settings::of_experiment(&run.experiment);
     settings.remove("seed");
     format!("{settings:?} {:?}", run.source)
-}
-
-fn price(experiment: &Experiment, transitions: Transitions) -> anyhow::Result<Price> {
-    let batch_size = experiment.batch_size as usize;
-    let context = Context {
-        transitions: Arc::new(transitions),
-        batch_size,
-        total_steps: experiment.steps,
-        seed: experiment.seed,
-        precision: experiment.precision,
-        device: Device::Cpu.open()?,
-    };
-    let mut agent = Agent::new(experiment.definition()?, &experiment.agent, context)?;
-    let mut sampler = BatchSampler::new(agent.items(), batch_size, experiment.seed, 0);
-    let origin = Origin {
-        environment: experiment.environment.clone(),
-        seed: experiment.seed,
-        step: 0,
-        episodes: experiment.episodes,
-    };
-    let one_thread = rayon::ThreadPoolBuilder::new().num_threads(1).build()?;
-    one_thread.install(|| {
-        // The first step makes what later ones use again.
-        agent.update(sampler.next_items())?;
-        let (begin, mut steps) = (Instant::now(), 0);
-        while begin.elapsed() < MEASURED {
-            agent.update(sampler.next_items())?;
-            steps += 1;
-        }
-        Ok(Price {
-            step: begin.elapsed().as_secs_f64() / f64::from(steps),
-            snapshot: agent.policy(&origin)?.len() as u64,
-            checkpoint: agent.save()?.len() as u64,
-        })
-    })
 }

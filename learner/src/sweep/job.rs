@@ -7,9 +7,10 @@ use std::process::{Child, Command};
 use anyhow::Context;
 use rustix::process::{Pid, Signal, kill_process};
 
-use super::state::{State, mark_failed};
 use super::study::PlannedRun;
 use crate::config::tables;
+use crate::report::State;
+use crate::run::RunDir;
 use crate::service::spawn_logged;
 
 /// What a learner says by its exit code: the run is not complete, and the same command goes on.
@@ -46,7 +47,7 @@ impl Job {
     pub fn start(run: PlannedRun, state: State, dir: PathBuf, endpoint: &str, threads: usize) -> anyhow::Result<Self> {
         let from = state.step(run.experiment.steps);
         fs::create_dir_all(&dir)
-            .and_then(|()| mark_failed(&dir, false))
+            .and_then(|()| RunDir::at(&dir).mark_failed(false))
             .with_context(|| format!("cannot write to {}", dir.display()))?;
         let mut command = Command::new(std::env::current_exe()?);
         command.args(["train", "--preset", &run.preset, "--connect", endpoint, "--run-dir"]).arg(&dir);
@@ -66,7 +67,7 @@ impl Job {
             Some(UNFINISHED) => End::Unfinished,
             _ => {
                 // On a disk that takes nothing, `--list` calls it begun.
-                mark_failed(&self.dir, true).ok();
+                RunDir::at(&self.dir).mark_failed(true).ok();
                 let log = log(&self.dir);
                 let reason = reason(&log).unwrap_or_else(|| format!("the learner ended by {status}"));
                 End::Failed(format!("{}: {reason} ({})", self.run.name, log.display()))

@@ -6,7 +6,7 @@
 //! [`train`](crate::train) to measure how long steps take.
 //!
 //! In reading order: `study` is the file, `axes` are its lists of values, `rules` say which combinations, `names` what runs are
-//! called; `state` is how far a run is; `cost` is foretold; `work` runs the learners, each a `job`, and
+//! called; `cost` is foretold; `work` runs the learners, each a `job`, and
 //! `display` shows them.
 
 mod axes;
@@ -15,11 +15,9 @@ mod display;
 mod job;
 mod names;
 mod rules;
-mod state;
 mod study;
 mod work;
 
 pub(crate) use cost::Cost;
-pub(crate) use state::State;
 pub(crate) use study::{PlannedRun, Study};
 pub(crate) use work::{Ended, Sweep};

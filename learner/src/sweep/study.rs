@@ -12,8 +12,10 @@ use toml::{Table, Value};
 use super::axes::{Combination, axes, combinations};
 use super::names;
 use super::rules::Rules;
-use crate::config::{Experiment, Preset, did_you_mean, tables};
+use crate::config::{Experiment, Preset, did_you_mean, settings, tables};
 use crate::data::Source;
+use crate::report::{RunReport, State};
+use crate::run::RunDir;
 
 /// Keys that are no keys of an experiment: the first two say what a run begins from, the third names a table of changes.
 const BEGIN: [&str; 2] = ["task", "preset"];
@@ -80,6 +82,31 @@ pub(crate) struct PlannedRun {
     pub experiment: Experiment,
     /// What it learns from.
     pub source: Source,
+}
+
+impl PlannedRun {
+    /// How far the run in a folder is.
+    ///
+    /// # Errors
+    /// A run with other settings is there, or a file is not what a learner writes.
+    pub fn state(&self, dir: &Path) -> anyhow::Result<State> {
+        if !RunDir::is_occupied(dir) {
+            return Ok(if RunDir::at(dir).has_failed() { State::Failed(0) } else { State::NotBegun });
+        }
+        let report = RunReport::scored(dir)?;
+        let (there, planned) = (&report.config.experiment, &self.experiment);
+        let (old, new) = (settings::of_experiment(there), settings::of_experiment(planned));
+        let mut differences: Vec<_> = settings::differences(&old, &new).map(String::as_str).collect();
+        if there.dataset != planned.dataset {
+            differences.push("dataset");
+        }
+        if !differences.is_empty() {
+            let (path, keys) = (dir.display(), differences.join(", "));
+            let hint = "give the study's file another name, choose another --runs, or move that folder away";
+            return Err(hinted(anyhow!("{path} has a run of other settings than the study's: {keys}"), hint));
+        }
+        Ok(State::of(&report)?)
+    }
 }
 
 impl Study {

@@ -10,8 +10,8 @@ use tokio::time::interval;
 
 use super::display::Display;
 use super::job::{End, Job};
-use super::state::{Progress, State};
 use super::study::PlannedRun;
+use crate::report::{Progress, State};
 use crate::service::LocalEvaluators;
 
 /// How often it looks whether a learner has ended.

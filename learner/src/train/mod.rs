@@ -5,13 +5,15 @@
 //! thread `snapshots` takes it. The room `service` starts it.
 //!
 //! In reading order: `training` (the thread's work), `steps` (the loop), `agent` (an algorithm at work, saved and loaded),
-//! `device` (where it computes), `pool` (rayon's threads kept awake), `results`, `outbox`, `metrics`.
+//! `device` (where it computes), `pool` (rayon's threads kept awake), `results`, `outbox`, `metrics`. Beside them, `price`
+//! foretells what a run costs, on the thread of its caller.
 
 pub mod agent;
 mod device;
 mod metrics;
 mod outbox;
 mod pool;
+mod price;
 mod results;
 mod steps;
 #[cfg(test)]
@@ -21,5 +23,6 @@ mod training;
 
 pub(crate) use metrics::{Registrar, TrainingMetrics};
 pub(crate) use outbox::{Outbox, Work};
+pub(crate) use price::Price;
 pub(crate) use results::{Outcome, TrainedPolicy};
 pub(crate) use training::Training;

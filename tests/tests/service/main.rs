@@ -9,5 +9,6 @@ mod leaving;
 mod local_evaluators;
 mod names;
 mod pace;
+mod page;
 mod runs;
 mod sweep;

@@ -1,11 +1,11 @@
 //! Episodes of a search's policies, from its first to its last, mixed into one dataset.
 
 use quad_dataset::{D4rlWriter, EnvironmentSpec, Row};
+use quad_service::Progress;
 use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 use rand_distr::{Distribution, StandardNormal};
 use rayon::prelude::*;
-use tracing::info;
 
 use super::error::CollectError;
 use super::linear::LinearPolicy;
@@ -40,7 +40,9 @@ pub fn record(
     let mixture = recipe.mixture;
     let mut room: Vec<f64> = mixture.iter().map(|(_, share)| share * transitions as f64).collect();
     let mut scores = Vec::new();
-    let (mut simulated, mut announced) = (0, 0);
+    let mut simulated = 0;
+    let progress = Progress::of("transitions recorded");
+    progress.start(0, transitions as u64);
     loop {
         // Past the end of the highest band with room, an episode is of no use.
         let patient = simulated <= PATIENCE * transitions;
@@ -66,11 +68,7 @@ pub fn record(
                 return Ok(scores);
             }
         }
-        let percent = 100 * writer.rows() / transitions;
-        if percent >= announced + 10 {
-            announced = percent;
-            info!("recording: {percent} % of the transitions, {} episodes", scores.len());
-        }
+        progress.advance(writer.rows() as u64);
     }
 }
 

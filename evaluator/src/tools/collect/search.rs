@@ -6,11 +6,11 @@
 //! being alive is left out of what is maximised, or standing still is a local optimum.
 
 use quad_dataset::EnvironmentSpec;
+use quad_service::Progress;
 use rand::Rng;
 use rand_chacha::ChaCha8Rng;
 use rand_distr::{Distribution, StandardNormal};
 use rayon::prelude::*;
-use tracing::info;
 
 use super::linear::{LinearPolicy, Moments};
 use super::recipe::Recipe;
@@ -36,12 +36,16 @@ pub fn train(
     random: impl Fn(u64) -> ChaCha8Rng,
 ) -> Result<Vec<LinearPolicy>, EnvironmentError> {
     let mut policies = Vec::new();
+    let progress = Progress::of("steps of training");
+    let of_each = recipe.search_steps(transitions) / recipe.searches;
+    progress.start(0, recipe.searches * of_each);
     for index in 0..recipe.searches {
         let mut search = Search::new(spec, random(index))?;
-        search.run(recipe.search_steps(transitions) / recipe.searches);
+        search.run(of_each, |steps| progress.advance(index * of_each + steps));
         let score = spec.normalised_score(search.recent_return());
         let steps = search.environment_steps;
-        info!("training, search {} of {}: normalised score {score:.1} after {steps} steps", index + 1, recipe.searches);
+        let number = format!("search {} of {}", index + 1, recipe.searches);
+        progress.say(&format!("training, {number}: normalised score {score:.1} after {steps} steps"));
         policies.extend(search.policies);
     }
     Ok(policies)
@@ -98,10 +102,11 @@ impl Search {
         })
     }
 
-    /// Iterates until `environment_steps` have been taken, to the end of the last iteration.
-    fn run(&mut self, environment_steps: u64) {
+    /// Iterates until `environment_steps` have been taken, to the end of the last iteration; `advance` is told how many have.
+    fn run(&mut self, environment_steps: u64, advance: impl Fn(u64)) {
         while self.environment_steps < environment_steps {
             self.iterate();
+            advance(self.environment_steps);
         }
     }
 

@@ -1,21 +1,15 @@
 //! How far a run is, by its folder alone.
 
 use std::fmt;
-use std::fs::{self, File};
+use std::fs::File;
 use std::io::{self, Read, Seek, SeekFrom};
-use std::path::{Path, PathBuf};
+use std::path::Path;
 
-use anyhow::anyhow;
-use quad_service::hinted;
 use serde::Deserialize;
 
-use super::study::PlannedRun;
-use crate::config::settings;
-use crate::report::RunReport;
-use crate::run::RunDir;
+use super::run::RunReport;
+use crate::run::{RunDir, RunDirError};
 
-/// The file by which a sweep remembers that a run has failed.
-const FAILED: &str = "failed";
 /// The last two lines of `metrics.jsonl` are in its last bytes, so many.
 const TAIL: u64 = 8192;
 
@@ -33,30 +27,15 @@ pub(crate) enum State {
 }
 
 impl State {
-    /// That of the run in a folder.
+    /// That of a run whose report was read.
     ///
     /// # Errors
-    /// A run with other settings is there, or a file is not what a learner writes.
-    pub fn of(run: &PlannedRun, dir: &Path) -> anyhow::Result<Self> {
-        let failed = dir.join(FAILED).exists();
-        if !RunDir::is_occupied(dir) {
-            return Ok(if failed { Self::Failed(0) } else { Self::NotBegun });
-        }
-        let (folder, config) = RunDir::open(dir)?;
-        let (old, new) = (settings::of_experiment(&config.experiment), settings::of_experiment(&run.experiment));
-        let mut differences: Vec<_> = settings::differences(&old, &new).map(String::as_str).collect();
-        if config.experiment.dataset != run.experiment.dataset {
-            differences.push("dataset");
-        }
-        if !differences.is_empty() {
-            let (path, keys) = (dir.display(), differences.join(", "));
-            let hint = "give the study's file another name, choose another --runs, or move that folder away";
-            return Err(hinted(anyhow!("{path} has a run of other settings than the study's: {keys}"), hint));
-        }
-        let scored = RunReport::scored(dir)?.is_complete();
-        let trained = run.experiment.eval_interval > 0 || folder.snapshots()?.last() == Some(&run.experiment.steps);
-        let step = || rows(dir).last().map_or(0, |row| row.step);
-        Ok(match (scored && trained, failed) {
+    /// The folder of its snapshots cannot be read.
+    pub fn of(report: &RunReport) -> Result<Self, RunDirError> {
+        let (dir, experiment) = (RunDir::at(&report.dir), &report.config.experiment);
+        let trained = experiment.eval_interval > 0 || dir.snapshots()?.last() == Some(&experiment.steps);
+        let step = || rows(dir.path()).last().map_or(0, |row| row.step);
+        Ok(match (report.is_complete() && trained, dir.has_failed()) {
             (true, _) => Self::Complete,
             (false, true) => Self::Failed(step()),
             (false, false) => Self::Begun(step()),
@@ -84,21 +63,9 @@ impl State {
     }
 }
 
-/// Remembers that a run has failed, or forgets it.
-pub(super) fn mark_failed(dir: &Path, failed: bool) -> io::Result<()> {
-    let path: PathBuf = dir.join(FAILED);
-    match failed {
-        true => fs::write(path, ""),
-        false => fs::remove_file(path).or_else(|error| match error.kind() {
-            io::ErrorKind::NotFound => Ok(()),
-            _ => Err(error),
-        }),
-    }
-}
-
 /// What a run at work is seen to do.
 #[derive(Default)]
-pub(super) struct Progress {
+pub(crate) struct Progress {
     /// Gradient steps done.
     pub step: u64,
     /// In a second.
@@ -118,8 +85,7 @@ impl Progress {
             _ => 0.0,
         };
         let report = RunReport::scored(dir).ok();
-        let newest = report.iter().flat_map(|report| &report.evaluations).rfind(|evaluation| evaluation.complete);
-        let score = newest.map(|evaluation| (evaluation.step, evaluation.score.mean));
+        let score = report.as_ref().and_then(RunReport::newest).map(|newest| (newest.step, newest.score.mean));
         Self { step: rows.last().map_or(0, |row| row.step), rate, score }
     }
 }

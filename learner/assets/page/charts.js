@@ -1,0 +1,98 @@
+// Charts of lines over gradient steps, with bands where points have a spread. They are kept and changed as data comes, so that
+// a view that was chosen stays.
+
+// Colours that stay apart for most colour-blind readers (Okabe and Ito); the last one suits dark and light.
+const COLOURS = ["#0072b2", "#d55e00", "#009e73", "#cc79a7", "#56b4e9", "#e69f00", "#888888"];
+const charts = new Map();
+const dark = matchMedia("(prefers-color-scheme: dark)");
+
+export function element(tag, text = "", attributes = {}) {
+  const made = document.createElement(tag);
+  made.textContent = text;
+  for (const [name, value] of Object.entries(attributes)) made.setAttribute(name, value);
+  return made;
+}
+
+export function number(value) {
+  if (value === null || value === undefined || !Number.isFinite(value)) return "–";
+  const size = Math.abs(value);
+  return size !== 0 && (size < 1e-3 || size >= 1e6) ? value.toExponential(2) : String(Number(value.toPrecision(4)));
+}
+
+function short(step) {
+  if (step >= 1e6) return `${number(step / 1e6)} M`;
+  return step >= 1e4 ? `${number(step / 1e3)} k` : number(step);
+}
+
+// A line's colour is part of its style, which the page's policy lets scripts set.
+function legend({ series, x }) {
+  const lines = document.createDocumentFragment();
+  for (const { label, color, y } of series.filter((one) => one.isVisible)) {
+    const line = element("span");
+    const mark = element("i");
+    mark.style.background = color;
+    line.append(mark, label);
+    if (x !== undefined && y !== undefined) line.append(` ${number(y)}`);
+    lines.append(line);
+  }
+  if (x !== undefined) lines.append(element("span", `step ${x}`));
+  return lines;
+}
+
+function colours() {
+  const [axis, grid] = dark.matches ? ["#a3adb8", "#2c333b"] : ["#57606a", "#e4e7eb"];
+  return { axisLineColor: axis, gridLineColor: grid };
+}
+dark.addEventListener("change", () => charts.forEach(({ graph }) => graph.updateOptions(colours())));
+
+// Points of several lines as rows: x, and [value, spread] of each line.
+function rows(lines) {
+  const byStep = new Map();
+  lines.forEach(({ points }, index) => {
+    for (const [step, value, spread] of points) {
+      if (!byStep.has(step)) byStep.set(step, Array.from(lines, () => [null, null]));
+      byStep.get(step)[index] = [value, spread ?? 0];
+    }
+  });
+  return [...byStep].sort(([one], [other]) => one - other).map(([step, values]) => [step, ...values]);
+}
+
+// Shows lines, each { label, points: [[step, value, spread]] }, in a chart that `key` names.
+export function chart(parent, key, title, about, lines) {
+  const file = rows(lines);
+  const labels = ["step", ...lines.map(({ label }) => label)];
+  const last = lines.map(({ label, points }) => `${label} ${number(points.at(-1)?.[1])}`).join(", ");
+  if (!charts.has(key)) {
+    const figure = element("figure");
+    const caption = element("figcaption", title);
+    caption.append(element("p", about, { class: "quiet" }));
+    const [place, names] = [element("div", "", { class: "chart", role: "img" }), element("div", "", { class: "legend" })];
+    figure.append(caption, place, names);
+    parent.append(figure);
+    const graph = new Dygraph(place, file, {
+      labels, errorBars: true, sigma: 1, fillAlpha: 0.15, connectSeparatedPoints: true, strokeWidth: 2, colors: COLOURS,
+      legend: "always", labelsDiv: names, legendFormatter: legend, includeZero: key === "score",
+      drawPoints: file.length < 60, pointSize: 3, ...colours(),
+      axes: { x: { drawGrid: false, axisLabelFormatter: short }, y: { axisLabelWidth: 56, axisLabelFormatter: number } },
+    });
+    charts.set(key, { graph, figure, place, shown: "" });
+  }
+  const known = charts.get(key);
+  const shown = JSON.stringify([labels, file.length, file.at(-1)]);
+  if (shown !== known.shown) {
+    known.shown = shown;
+    known.graph.updateOptions({ file, labels, drawPoints: file.length < 60 });
+    known.place.setAttribute("aria-label", `${title}, newest values: ${last}`);
+  }
+  return key;
+}
+
+// Takes away the charts that are not among those.
+export function keep(keys) {
+  for (const [key, { graph, figure }] of charts) {
+    if (keys.has(key)) continue;
+    graph.destroy();
+    figure.remove();
+    charts.delete(key);
+  }
+}

@@ -1,0 +1,138 @@
+//! The metrics of a run that may be going on, thinned to what a picture can show.
+
+use std::collections::BTreeMap;
+use std::fs::File;
+use std::io::{self, BufRead, BufReader, Seek, SeekFrom};
+use std::path::PathBuf;
+
+use serde::{Serialize, Serializer};
+
+/// Most rows that are kept: more than a chart has pixels for. Even, so that pairs of rows can become one.
+const MOST_ROWS: usize = 500;
+/// Significant digits that are sent.
+const DIGITS: i32 = 5;
+
+/// What `metrics.jsonl` says. Of a long run each row is the mean of as many lines as it takes to keep the rows few.
+#[derive(Debug, Serialize)]
+pub(super) struct History {
+    #[serde(skip)]
+    path: PathBuf,
+    /// Bytes of the file that are taken in.
+    #[serde(skip)]
+    read: u64,
+    /// Lines of the file behind a whole row.
+    #[serde(skip)]
+    stride: usize,
+    /// Lines behind the last row.
+    #[serde(skip)]
+    lines: usize,
+    names: Vec<String>,
+    rows: Vec<Row>,
+}
+
+/// Means of each metric over some steps.
+#[derive(Debug)]
+struct Row {
+    /// The last of these steps.
+    step: f64,
+    /// Seconds of training up to it.
+    seconds: f64,
+    values: Vec<f64>,
+}
+
+impl History {
+    /// That of the file, of which nothing is read yet.
+    pub fn of(path: PathBuf) -> Self {
+        Self { path, read: 0, stride: 1, lines: 0, names: Vec::new(), rows: Vec::new() }
+    }
+
+    /// Takes in the lines that the file has now. A file that does not go on where it was, as of a learner that went back to its checkpoint, is
+    /// read from its beginning.
+    ///
+    /// # Errors
+    /// The file cannot be read. That there is none is no error.
+    pub fn refresh(&mut self) -> io::Result<()> {
+        let mut file = match File::open(&self.path) {
+            Err(error) if error.kind() == io::ErrorKind::NotFound => return Ok(()),
+            opened => opened?,
+        };
+        if file.metadata()?.len() < self.read {
+            *self = Self::of(self.path.clone());
+        }
+        file.seek(SeekFrom::Start(self.read))?;
+        let mut file = BufReader::new(file);
+        let mut line = Vec::new();
+        loop {
+            line.clear();
+            let length = file.read_until(b'\n', &mut line)?;
+            // The last line may not be whole yet.
+            if line.last() != Some(&b'\n') {
+                return Ok(());
+            }
+            self.read += length as u64;
+            let Ok(line) = serde_json::from_slice::<BTreeMap<String, f64>>(&line) else { continue };
+            let [step, seconds] = ["step", "seconds"].map(|name| line.get(name).copied().unwrap_or_default());
+            if self.rows.last().is_some_and(|last| step <= last.step) {
+                *self = Self::of(self.path.clone());
+                return self.refresh();
+            }
+            if self.names.is_empty() {
+                self.names =
+                    line.keys().filter(|name| !["step", "seconds"].contains(&name.as_str())).cloned().collect();
+            }
+            let value = |name: &String| line.get(name).copied().unwrap_or(f64::NAN);
+            self.push(Row { step, seconds, values: self.names.iter().map(value).collect() });
+        }
+    }
+
+    fn push(&mut self, line: Row) {
+        if self.lines < self.stride
+            && let Some(last) = self.rows.last_mut()
+        {
+            self.lines += 1;
+            last.join(&line, 1.0 / self.lines as f64);
+            return;
+        }
+        if self.rows.len() == MOST_ROWS {
+            let mut pairs = std::mem::take(&mut self.rows).into_iter();
+            while let (Some(mut first), Some(second)) = (pairs.next(), pairs.next()) {
+                first.join(&second, 0.5);
+                self.rows.push(first);
+            }
+            self.stride *= 2;
+        }
+        self.rows.push(line);
+        self.lines = 1;
+    }
+}
+
+impl Row {
+    /// Also covers what follows, which has this share of the whole.
+    fn join(&mut self, next: &Self, share: f64) {
+        (self.step, self.seconds) = (next.step, next.seconds);
+        for (mean, value) in self.values.iter_mut().zip(&next.values) {
+            *mean += (value - *mean) * share;
+        }
+    }
+}
+
+/// As `[step, seconds, value …]`.
+impl Serialize for Row {
+    fn serialize<S: Serializer>(&self, serializer: S) -> Result<S::Ok, S::Error> {
+        serializer.collect_seq([self.step, self.seconds].iter().chain(&self.values).map(|value| rounded(*value)))
+    }
+}
+
+/// The number with few digits; nothing if it is not finite.
+fn rounded(value: f64) -> Option<f64> {
+    let digits = DIGITS - 1 - value.abs().log10().floor().clamp(-300.0, 300.0) as i32;
+    let scale = 10f64.powi(digits);
+    match (value * scale).round() / scale {
+        _ if value == 0.0 || digits <= 0 => value.is_finite().then_some(value.round()),
+        rounded => rounded.is_finite().then_some(rounded),
+    }
+}
+
+#[cfg(test)]
+#[path = "../../tests/unit/page/history.rs"]
+mod tests;

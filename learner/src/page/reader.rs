@@ -1,0 +1,156 @@
+//! The thread that reads run folders for the page. A disk that hangs holds up this thread and no other.
+
+use std::collections::HashMap;
+use std::path::{Path, PathBuf};
+use std::sync::mpsc::Receiver;
+use std::time::{Duration, Instant};
+
+use axum::body::Bytes;
+use quad_service::stay_in_background;
+use serde_json::{Value, json};
+use tokio::sync::oneshot;
+
+use super::history::History;
+use crate::algorithms::Metric;
+use crate::report::{Listing, RunReport};
+use crate::run::RunDir;
+
+/// However often browsers ask, a run is read no more often than this.
+const RUN_EVERY: Duration = Duration::from_secs(1);
+/// And the list of runs.
+const LIST_EVERY: Duration = Duration::from_secs(5);
+/// Most runs whose history is kept in memory.
+const MOST_KEPT: usize = 64;
+/// Episodes that are shown.
+const EPISODES: usize = 20;
+
+/// What a browser asks for.
+pub(super) enum Question {
+    /// All runs.
+    Runs,
+    /// The run of this name in the list.
+    Run(String),
+}
+
+/// A question, and where its answer goes: JSON, or nothing if there is no such run.
+pub(super) type Asked = (Question, oneshot::Sender<Option<Bytes>>);
+
+/// The runs in or below a folder.
+pub(super) struct Reader {
+    root: PathBuf,
+    list: Kept,
+    /// By the name in the list.
+    dirs: HashMap<String, PathBuf>,
+    runs: HashMap<String, (RunPage, Kept)>,
+}
+
+/// The newest answer to a question, and when it was made.
+#[derive(Default)]
+struct Kept(Option<(Instant, Bytes)>);
+
+impl Kept {
+    fn get(&self, every: Duration) -> Option<Bytes> {
+        self.0.as_ref().filter(|(made, _)| made.elapsed() < every).map(|(_, answer)| answer.clone())
+    }
+
+    fn set(&mut self, answer: &Value) -> Bytes {
+        let answer = Bytes::from(answer.to_string());
+        self.0 = Some((Instant::now(), answer.clone()));
+        answer
+    }
+}
+
+impl Reader {
+    pub fn new(root: PathBuf) -> Self {
+        Self { root, list: Kept::default(), dirs: HashMap::new(), runs: HashMap::new() }
+    }
+
+    /// Answers until there is nobody left to ask.
+    pub fn run(mut self, questions: &Receiver<Asked>) {
+        stay_in_background();
+        while let Ok((question, answer)) = questions.recv() {
+            let found = match question {
+                Question::Runs => Some(self.list()),
+                Question::Run(name) => self.of_run(name),
+            };
+            answer.send(found).ok();
+        }
+    }
+
+    fn list(&mut self) -> Bytes {
+        self.list.get(LIST_EVERY).unwrap_or_else(|| {
+            let listing = Listing::read(std::slice::from_ref(&self.root));
+            self.dirs = listing.entries.iter().map(|entry| (entry.name.clone(), entry.dir.clone())).collect();
+            let shown = listing.entries.iter().map(|entry| {
+                let mut shown = json!(entry);
+                if shown["at_work"] == true {
+                    shown["page"] = json!(RunDir::at(&entry.dir).read_endpoints().ok().map(|endpoints| endpoints.page));
+                }
+                shown
+            });
+            self.list.set(&shown.collect())
+        })
+    }
+
+    fn of_run(&mut self, name: String) -> Option<Bytes> {
+        if !self.dirs.contains_key(&name) {
+            self.list();
+        }
+        let dir = self.dirs.get(&name)?;
+        if self.runs.len() >= MOST_KEPT && !self.runs.contains_key(&name) {
+            self.runs.clear();
+        }
+        let (run, kept) = self.runs.entry(name).or_insert_with(|| (RunPage::of(dir), Kept::default()));
+        let answer = kept.get(RUN_EVERY);
+        Some(answer.unwrap_or_else(|| {
+            let answer = run.read().unwrap_or_else(|error| json!({ "error": format!("{error:#}") }));
+            kept.set(&answer)
+        }))
+    }
+}
+
+/// What the page shows of a run.
+struct RunPage {
+    dir: PathBuf,
+    history: History,
+}
+
+impl RunPage {
+    fn of(dir: &Path) -> Self {
+        Self { dir: dir.to_owned(), history: History::of(dir.join("metrics.jsonl")) }
+    }
+
+    fn read(&mut self) -> anyhow::Result<Value> {
+        self.history.refresh()?;
+        let report = RunReport::scored(&self.dir)?;
+        let config = report.config();
+        let metric = |metric: &Metric| json!({ "name": metric.name, "help": metric.help });
+        let metrics: Value = config.experiment.definition()?.metrics.iter().map(metric).collect();
+        let evaluations = report.evaluations.iter().map(|evaluation| {
+            json!([
+                evaluation.step,
+                evaluation.score.mean,
+                evaluation.score.std,
+                evaluation.episodes,
+                evaluation.complete
+            ])
+        });
+        let scores = RunDir::at(&self.dir).read_scores()?;
+        let newest = &scores[scores.len().saturating_sub(EPISODES)..];
+        Ok(json!({
+            "run": report.run,
+            "task": report.task,
+            "agent": report.agent,
+            "seed": report.seed,
+            "steps": report.steps,
+            "measure": report.measure(),
+            "dataset_score": report.dataset_score,
+            "dataset": config.dataset.summary(),
+            "settings": toml::to_string(config)?,
+            "metrics": metrics,
+            "history": &self.history,
+            "evaluations": Value::from_iter(evaluations),
+            "episodes": newest,
+        }))
+    }
+}

@@ -1,0 +1,80 @@
+//! Tests of `page/history.rs`.
+
+use std::fs;
+use std::io::Write;
+
+use serde_json::{Value, json};
+
+use super::*;
+
+/// A line of each of these hundreds of steps.
+fn lines(numbers: impl IntoIterator<Item = u64>) -> String {
+    let line =
+        |n| json!({ "step": 100 * n, "seconds": 2 * n, "loss": 1.0 / n as f64, "eta": n % 2 }).to_string() + "\n";
+    numbers.into_iter().map(line).collect()
+}
+
+fn shown(history: &History) -> Value {
+    serde_json::to_value(history).unwrap()
+}
+
+#[test]
+fn new_lines_are_added_and_half_a_line_waits() {
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("metrics.jsonl");
+    let mut history = History::of(path.clone());
+    history.refresh().unwrap();
+    assert_eq!(shown(&history)["rows"], json!([]));
+    let (first, second) = (lines(1..=3), lines([4]));
+    fs::write(&path, first + &second[..9]).unwrap();
+    history.refresh().unwrap();
+    let expected = json!([[100.0, 2.0, 1.0, 1.0], [200.0, 4.0, 0.0, 0.5], [300.0, 6.0, 1.0, 0.33333]]);
+    assert_eq!((&shown(&history)["names"], &shown(&history)["rows"]), (&json!(["eta", "loss"]), &expected));
+    let mut file = fs::OpenOptions::new().append(true).open(&path).unwrap();
+    file.write_all(&second.as_bytes()[9..]).unwrap();
+    history.refresh().unwrap();
+    assert_eq!(shown(&history)["rows"][3], json!([400.0, 8.0, 0.0, 0.25]));
+}
+
+/// Whether the file is shorter then, or has grown beyond where it was.
+#[test]
+fn a_run_that_went_back_to_its_checkpoint_is_shown_as_it_went_on() {
+    for longer in [3, 30] {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("metrics.jsonl");
+        let mut history = History::of(path.clone());
+        fs::write(&path, lines(1..=20)).unwrap();
+        history.refresh().unwrap();
+        fs::write(&path, lines((1..=5).chain(6..5 + longer))).unwrap();
+        history.refresh().unwrap();
+        let steps: Vec<u64> = history.rows.iter().map(|row| row.step as u64).collect();
+        assert_eq!(steps, Vec::from_iter((1..5 + longer).map(|n| 100 * n)));
+    }
+}
+
+#[test]
+fn a_long_run_is_thinned_and_not_cut() {
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("metrics.jsonl");
+    fs::write(&path, lines(1..=20_000)).unwrap();
+    let mut history = History::of(path);
+    history.refresh().unwrap();
+    let rows = &history.rows;
+    assert!((MOST_ROWS / 2..=MOST_ROWS).contains(&rows.len()), "{}", rows.len());
+    assert_eq!(rows.last().unwrap().step, 2_000_000.0);
+    // Means: each step counts once, and η is 0 and 1 in turn.
+    assert!(rows.iter().all(|row| row.values[0] == 0.5), "{:?}", rows.first());
+    let (first, mean) = (rows[0].step as u64 / 100, rows[0].values[1]);
+    let expected = (1..=first).map(|n| 1.0 / n as f64).sum::<f64>() / first as f64;
+    assert!((mean - expected).abs() < 1e-9, "{mean} is not {expected}, of {first} lines");
+    assert!(shown(&history).to_string().len() < 50_000);
+}
+
+#[test]
+fn numbers_have_five_digits() {
+    let numbers = [0.0, 1.0, -2.718_281_828, 12_345_678.9, 1.234_567_8e-20, 3.0e-320, f64::NAN, f64::INFINITY];
+    let expected = [Some(0.0), Some(1.0), Some(-2.7183), Some(12_345_679.0), Some(1.2346e-20)];
+    assert_eq!(numbers[..5].iter().map(|number| rounded(*number)).collect::<Vec<_>>(), expected);
+    assert!(rounded(numbers[5]).is_none_or(|tiny| tiny.abs() < 1e-300));
+    assert_eq!((rounded(numbers[6]), rounded(numbers[7])), (None, None));
+}

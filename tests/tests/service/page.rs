@@ -1,0 +1,92 @@
+//! The page in a browser: Debian's Chromium, without a screen.
+
+use std::process::Command;
+use std::time::{Duration, Instant};
+
+use quad_tests::PATIENCE;
+use quad_tests::http::get;
+use quad_tests::learner::Learner;
+use quad_tests::peers::has_chromium;
+use quad_tests::process::{Process, binary};
+use quad_tests::setting::{ENDLESS, SHORT};
+use quad_tests::system::Scratch;
+
+/// The page as the browser has it after some seconds of its own clock.
+fn shown(address: &str, more: &[&str]) -> String {
+    let flags = ["--headless=new", "--no-sandbox", "--disable-gpu", "--virtual-time-budget=8000", "--dump-dom"];
+    let output = Command::new("chromium").args(flags).args(more).arg(address).output().unwrap();
+    assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
+    String::from_utf8(output.stdout).unwrap()
+}
+
+fn assert_has(page: &str, words: &[&str]) {
+    words.iter().for_each(|words| assert!(page.contains(words), "{words} is missing in\n{page}"));
+}
+
+#[test]
+fn a_browser_shows_a_run_at_work() {
+    if !has_chromium() {
+        return;
+    }
+    let scratch = Scratch::new();
+    let flags = ["--listen", "tcp/127.0.0.1:0", "--evaluators", "2"];
+    let learner = scratch.learner_with("run", ENDLESS, &flags);
+    learner.wait_for_scores(4 * ENDLESS.episodes as usize);
+    let page = shown(&format!("http://{}/", learner.metrics()), &[]);
+    assert_has(&page, &["<title>run</title>", "all is well", "evaluator-1", "evaluator-2", "steps per second"]);
+    // A chart of each metric, with its newest value for those who do not see it.
+    assert_has(&page, &["aria-label=\"critic_loss, newest values: critic_loss ", "aria-label=\"lambda_fifth, newest values: 1 "]);
+    assert_has(&page, &["Last episodes", "episodes = 6"]);
+}
+
+#[test]
+fn a_browser_compares_finished_runs() {
+    if !has_chromium() {
+        return;
+    }
+    let scratch = Scratch::new();
+    for name in ["one", "other"] {
+        let flags = ["--listen", "tcp/127.0.0.1:0", "--evaluators", "1"];
+        scratch.learner_with(&format!("runs/{name}"), SHORT, &flags).assert_completes(&SHORT, PATIENCE);
+    }
+    // What a folder is called is text.
+    let runs = scratch.path().join("runs");
+    std::fs::rename(runs.join("other"), runs.join("<img src=x onerror=alert(1)>")).unwrap();
+    let mut command = Command::new(binary("learner"));
+    command.args(["page", "--listen", "127.0.0.1:0", "--runs"]).arg(runs);
+    let mut server = Process::start("page", scratch.path(), command);
+    let line = server.wait_for_log("page: http://", PATIENCE);
+    let address = line.split_whitespace().find(|word| word.starts_with("http://")).unwrap();
+    let ticked = shown(&format!("{address}#%5B%22one%22%2C%22%3Cimg%20src%3Dx%20onerror%3Dalert(1)%3E%22%5D"), &[]);
+    assert_has(&ticked, &["<title>2 runs</title>", "&lt;img src=x onerror=alert(1)&gt;", "aria-label=\"score, newest values: one ", ", other "]);
+    assert!(!ticked.contains("<img"), "{ticked}");
+    assert_has(&ticked, &["aria-label=\"critic_loss, newest values: one critic_loss "]);
+    let none = shown(address, &[]);
+    assert!(none.contains("Tick runs") && !none.contains("newest values"), "{none}");
+    server.terminate(PATIENCE);
+}
+
+#[test]
+fn browsers_that_ask_without_end_cost_training_little() {
+    let scratch = Scratch::new();
+    let learner = scratch.learner_with("run", ENDLESS, &["--listen", "tcp/127.0.0.1:0"]);
+    let address = learner.metrics();
+    let steps_in_a_second = || {
+        let steps = || learner.metric("gradient_steps_total", "").unwrap();
+        let (before, start) = (steps(), Instant::now());
+        std::thread::sleep(Duration::from_secs(1));
+        (steps() - before) / start.elapsed().as_secs_f64()
+    };
+    learner.wait_for_metric("gradient_steps_total", "", |steps| steps > 100.0);
+    let alone = steps_in_a_second();
+    let end = Instant::now() + Duration::from_secs(3);
+    let asking = std::thread::spawn(move || {
+        let mut answers = 0;
+        while Instant::now() < end {
+            answers += u32::from(["/api/runs", "/api/live", "/"].iter().all(|path| get(&address, path).is_some_and(|(status, _)| status == 200)));
+        }
+        answers
+    });
+    let asked = steps_in_a_second();
+    assert!(asking.join().unwrap() > 20 && asked > 0.5 * alone, "{asked} steps/s, {alone} alone");
+}
