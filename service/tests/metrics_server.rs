@@ -12,7 +12,7 @@ use quad_service::{Health, MetricsServer, serve_metrics};
 const ANY_PORT: SocketAddr = SocketAddr::new(std::net::IpAddr::V4(std::net::Ipv4Addr::LOCALHOST), 0);
 
 async fn server() -> (MetricsServer, IntGauge) {
-    server_with(Health::default(), Router::new()).await
+    server_with(Health::default()).await
 }
 
 async fn server_with(health: Health) -> (MetricsServer, IntGauge) {

@@ -220,7 +220,7 @@ fn a_page_holds_all_that_is_shown_and_takes_nothing_for_html() {
     small(4, 1.0).write(&folder.path().join("b"));
     fs::write(path("a/film.gif"), "GIF89a of a run").unwrap();
     printed(&["report", &path("a"), &path("b"), "--html", &path("page.html")]);
-    let page = fs::read_to_string(path("page.html")).unwrap();
+    let page = fs::read_to_string(path("page.html")).unwrap().replace("&#x2f;", "/");
     assert!(!page.contains("<script") && page.contains("&lt;script&gt;alert(1)"), "{page}");
     // Nothing is fetched: neither scripts nor pictures have addresses.
     assert!(!page.contains("href=\"http") && !page.contains("src=\"/") && !page.contains("url("), "{page}");

@@ -5,7 +5,6 @@ use std::time::{Duration, Instant};
 
 use quad_tests::PATIENCE;
 use quad_tests::http::get;
-use quad_tests::learner::Learner;
 use quad_tests::peers::has_chromium;
 use quad_tests::process::{Process, binary};
 use quad_tests::setting::{ENDLESS, SHORT};
@@ -35,7 +34,10 @@ fn a_browser_shows_a_run_at_work() {
     let page = shown(&format!("http://{}/", learner.metrics()), &[]);
     assert_has(&page, &["<title>run</title>", "all is well", "evaluator-1", "evaluator-2", "steps per second"]);
     // A chart of each metric, with its newest value for those who do not see it.
-    assert_has(&page, &["aria-label=\"critic_loss, newest values: critic_loss ", "aria-label=\"lambda_fifth, newest values: 1 "]);
+    assert_has(
+        &page,
+        &["aria-label=\"critic_loss, newest values: critic_loss ", "aria-label=\"lambda_fifth, newest values: 1 "],
+    );
     assert_has(&page, &["Last episodes", "episodes = 6"]);
 }
 
@@ -58,9 +60,17 @@ fn a_browser_compares_finished_runs() {
     let line = server.wait_for_log("page: http://", PATIENCE);
     let address = line.split_whitespace().find(|word| word.starts_with("http://")).unwrap();
     let ticked = shown(&format!("{address}#%5B%22one%22%2C%22%3Cimg%20src%3Dx%20onerror%3Dalert(1)%3E%22%5D"), &[]);
-    assert_has(&ticked, &["<title>2 runs</title>", "&lt;img src=x onerror=alert(1)&gt;", "aria-label=\"score, newest values: one ", ", other "]);
+    assert_has(
+        &ticked,
+        &[
+            "<title>2 runs</title>",
+            "&lt;img src=x onerror=alert(1)&gt;",
+            "aria-label=\"score, newest values: one ",
+            ", other ",
+        ],
+    );
     assert!(!ticked.contains("<img"), "{ticked}");
-    assert_has(&ticked, &["aria-label=\"critic_loss, newest values: one critic_loss "]);
+    assert_has(&ticked, &["aria-label=\"critic_loss, newest values: one "]);
     let none = shown(address, &[]);
     assert!(none.contains("Tick runs") && !none.contains("newest values"), "{none}");
     server.terminate(PATIENCE);
@@ -83,7 +93,11 @@ fn browsers_that_ask_without_end_cost_training_little() {
     let asking = std::thread::spawn(move || {
         let mut answers = 0;
         while Instant::now() < end {
-            answers += u32::from(["/api/runs", "/api/live", "/"].iter().all(|path| get(&address, path).is_some_and(|(status, _)| status == 200)));
+            answers += u32::from(
+                ["/api/runs", "/api/live", "/"]
+                    .iter()
+                    .all(|path| get(&address, path).is_some_and(|(status, _)| status == 200)),
+            );
         }
         answers
     });

@@ -76,7 +76,10 @@ async fn runs_are_listed_and_each_tells_its_scores_metrics_and_settings() {
         serde_json::json!([[2000, 11.0, 2f64.sqrt(), 2, true], [4000, 5.0, null, 1, false]])
     );
     assert_eq!((&run["history"]["names"][0], &run["history"]["rows"][0][2]), (&"bc_loss".into(), &0.5.into()));
-    assert_eq!(run["metrics"].as_array().unwrap().len(), config("run", 1).experiment.definition().unwrap().metrics.len());
+    assert_eq!(
+        run["metrics"].as_array().unwrap().len(),
+        config("run", 1).experiment.definition().unwrap().metrics.len()
+    );
     assert!(run["settings"].as_str().unwrap().contains("[experiment.agent]"));
     assert!(answers[2..].iter().all(|(head, _)| head.starts_with("HTTP/1.1 404")), "{answers:?}");
 }
