@@ -16,7 +16,7 @@ use crate::cli::{Cli, Command, DatasetsCommand, DoctorArgs, InspectArgs, Presets
 use crate::config::hyperparameters::{self, Values};
 use crate::config::{Preset, tasks};
 use crate::data::{Source, cache};
-use crate::report::{Report, Style, Table, draw_all, runs_in};
+use crate::report::{Report, Style, Table, draw_all, export_all, runs_in};
 use crate::run::{RunDirError, verify};
 
 /// Does what the command line says.
@@ -75,6 +75,10 @@ fn report(args: &ReportArgs) -> anyhow::Result<()> {
     if let Some(folder) = &args.figures {
         draw_all(folder, &report)?;
         info!("figures: {}", folder.display());
+    }
+    if let Some(folder) = &args.tensorboard {
+        export_all(&report.runs, folder)?;
+        info!("to look at them: tensorboard --logdir {}", folder.display());
     }
     let style = match (args.markdown, args.latex, args.csv) {
         (true, ..) => Style::Markdown,

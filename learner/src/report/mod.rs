@@ -1,7 +1,8 @@
 //! What runs achieved: their evaluations, summaries over seeds, what is published for the same tasks, and pictures.
 //!
-//! Owns nothing: it reads run folders, which a learner may be writing, and gives text, JSON, SVG and PNG. It runs on the thread
-//! of its caller: `learner report`, and `learner train` at the end of a run, both on the main thread. It imports `config`, `run`
+//! Owns nothing: it reads run folders, which a learner may be writing, and gives text, JSON, SVG, PNG and event files. It runs
+//! on the thread of its caller: `learner report`, and `learner train` at the end of a run, both on the main thread; and
+//! `tensorboard` during a run. It imports `config`, `run`
 //! and the list of algorithms.
 //!
 //! The protocol is the paper's (section 5.1 and appendix B): the score of a run is the mean of its last 5 evaluations, or of
@@ -12,7 +13,7 @@
 //! definitions, which `study` applies to methods over tasks and seeds; `published` are the paper's figures, `departures` is how
 //! a run differs from what the paper ran, `lambda` what QUAD's λ was in a run; `paper` has the paper's tables with ours beside
 //! them; `summary` is the whole report; `figures` are its pictures, which `plot` draws. `selection`, `spread` and `table` are
-//! small parts of these.
+//! small parts of these. `tensorboard` copies a run to an event file.
 
 mod departures;
 mod figures;
@@ -28,6 +29,7 @@ mod statistics;
 mod study;
 mod summary;
 mod table;
+mod tensorboard;
 
 pub(crate) use figures::{draw_all, of_run};
 pub(crate) use run::RunReport;
@@ -35,3 +37,4 @@ pub(crate) use selection::Select;
 pub(crate) use spread::Spread;
 pub(crate) use summary::{Report, runs_in};
 pub(crate) use table::{Style, Table};
+pub(crate) use tensorboard::{Exporter, export_all};
