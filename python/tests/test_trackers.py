@@ -20,7 +20,8 @@ def series(run):
     """The values of a run's files by name and step, and the seconds of each step."""
     found, seconds = {}, {}
     for line in map(json.loads, (run / "metrics.jsonl").read_text().splitlines()):
-        step, seconds[line["step"]] = line.pop("step"), line.pop("seconds")
+        step = line.pop("step")
+        seconds[step] = line.pop("seconds")
         for name, value in line.items():
             found.setdefault(f"train/{name}", {})[step] = value
     by_step = {}
@@ -119,7 +120,10 @@ def history(path):
 
 def test_weights_and_biases_has_each_value(hopper_runs, tmp_path, monkeypatch):
     monkeypatch.setenv("WANDB_MODE", "offline")
+    import wandb
+
     run_example("wandb", hopper_runs / "seed0", tmp_path, monkeypatch)
+    wandb.teardown()  # The end of a run does not wait for its file.
     [file] = tmp_path.glob("wandb/offline-run-*/*.wandb")
     rows = list(history(file))
     assert [row["_step"] for row in rows] == [row["step"] for row in rows] == [10, 20]
@@ -129,7 +133,7 @@ def test_weights_and_biases_has_each_value(hopper_runs, tmp_path, monkeypatch):
 def test_mlflow_has_each_value(hopper_runs, tmp_path, monkeypatch):
     # Without this, MLflow wants a database, for which its small package has no code.
     monkeypatch.setenv("MLFLOW_ALLOW_FILE_STORE", "true")
-    monkeypatch.setenv("MLFLOW_TRACKING_URI", tmp_path.as_uri())
+    monkeypatch.setenv("MLFLOW_TRACKING_URI", (tmp_path / "store").as_uri())
     import mlflow
 
     run_example("mlflow", hopper_runs / "seed0", tmp_path, monkeypatch)
