@@ -66,19 +66,25 @@ def test_tensorboard_reads_what_a_learner_writes_while_it_trains(data, tmp_path)
     check_events(accumulator(tmp_path / "logs/mine"), tmp_path / "mine")
 
 
-def test_tensorboard_reads_reports_of_runs_and_forgets_an_earlier_one(hopper_runs, tmp_path):
-    runs = [hopper_runs / "seed0", hopper_runs / "seed1"]
+def test_tensorboard_reads_reports_of_runs_and_forgets_what_a_run_has_repeated(hopper_runs, tmp_path):
+    runs = [tmp_path / "seed0", tmp_path / "seed1"]
 
     def report():
-        subprocess.run(["learner", "report", *runs, "--tensorboard", tmp_path], check=True, capture_output=True, timeout=20)
+        subprocess.run(["learner", "report", *runs, "--tensorboard", tmp_path / "logs"], check=True, capture_output=True, timeout=20)
 
+    for run in runs:
+        shutil.copytree(hopper_runs / run.name, run)
+    true = (runs[0] / "metrics.jsonl").read_text()
+    # What a run had, of two steps that it does not come to again and one that it does, before it was killed.
+    (runs[0] / "metrics.jsonl").write_text("".join(true.replace('"step":20', f'"step":{step}') for step in (7, 20, 30)))
     report()
-    open_since_before = [accumulator(tmp_path / run.name) for run in runs]
+    opened = [accumulator(tmp_path / "logs" / run.name) for run in runs]
+    check_events(opened[0], runs[0])
+    (runs[0] / "metrics.jsonl").write_text(true)
     report()
-    for run, events in zip(runs, open_since_before):
-        check_events(events, run)
+    for run, events in zip(runs, opened):
         check_events(events.Reload(), run)
-        check_events(accumulator(tmp_path / run.name), run)
+        check_events(accumulator(tmp_path / "logs" / run.name), run)
         assert list(series(run)[0]["evaluation/score"]) == [10, 20]
 
 

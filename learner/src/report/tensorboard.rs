@@ -10,8 +10,10 @@ use anyhow::{Context, bail};
 
 use super::run::{EvaluationReport, RunReport};
 
-/// What the names of our event files begin with, as TensorBoard asks for, and end with.
-const NAME: [&str; 2] = ["events.out.tfevents.", ".quad"];
+/// What the name of an event file begins with, by which TensorBoard finds it.
+const PREFIX: &str = "events.out.tfevents.";
+/// What it ends with, if it is ours.
+const SUFFIX: &str = ".quad";
 
 /// Writes an event file of each run.
 ///
@@ -43,7 +45,7 @@ impl Exporter {
         Self { run: run.to_owned(), folder: folder.to_owned(), file: None }
     }
 
-    /// Appends what the run has written since the last call. The first call begins a file and removes those of earlier
+    /// Appends what the run has written since the last call. The first call begins a file, in place of those of earlier
     /// exporters.
     ///
     /// # Errors
@@ -52,10 +54,10 @@ impl Exporter {
         let report = RunReport::scored(&self.run)?;
         let complete: Vec<_> = report.evaluations.iter().filter(|evaluation| evaluation.complete).collect();
         // TensorBoard drops what it has of later steps when an earlier one follows, so an evaluation that is complete after
-        // a later one needs a file from the start; so does a file that is gone.
+        // a later one needs a file from the start.
         let goes_on = |file: &EventFile| {
             let steps = complete.iter().map(|evaluation| evaluation.step).take(file.evaluated.len());
-            steps.eq(file.evaluated.iter().copied()) && file.path.exists()
+            steps.eq(file.evaluated.iter().copied()) && file.is_intact()
         };
         let mut file = match self.file.take().filter(goes_on) {
             Some(file) => file,
@@ -63,7 +65,7 @@ impl Exporter {
         };
         let mut records = file.rows(&self.run.join("metrics.jsonl"))?;
         records.extend(file.evaluations(&complete));
-        file.file.write_all(&records).with_context(|| cannot("write", &file.path))?;
+        file.write(&records)?;
         self.file = Some(file);
         Ok(())
     }
@@ -73,6 +75,8 @@ impl Exporter {
 struct EventFile {
     path: PathBuf,
     file: File,
+    /// Bytes written.
+    length: u64,
     /// When the run began, in seconds since 1970.
     started: f64,
     /// So many bytes of `metrics.jsonl`.
@@ -84,20 +88,38 @@ struct EventFile {
 }
 
 impl EventFile {
-    /// Begins a file in a folder, and removes earlier ones from it. `started` is in milliseconds since 1970.
+    /// Begins a file in a folder, in place of earlier ones. `started` is in milliseconds since 1970.
     fn begin(folder: &Path, started: u64) -> anyhow::Result<Self> {
         fs::create_dir_all(folder).with_context(|| cannot("create", folder))?;
         let now = SystemTime::now().duration_since(UNIX_EPOCH)?;
-        let [first, last] = NAME;
         // TensorBoard goes on to the file whose name is the larger one.
-        let path = folder.join(format!("{first}{}.{:03}{last}", now.as_secs(), now.subsec_millis()));
-        remove_event_files(folder).with_context(|| cannot("remove an event file of", folder))?;
+        let path = folder.join(format!("{PREFIX}{}.{:03}{SUFFIX}", now.as_secs(), now.subsec_millis()));
+        let mut earlier = event_files(folder).with_context(|| cannot("read", folder))?;
         let started = Duration::from_millis(started).as_secs_f64();
         // The format's version; then a start at step 0, at which a TensorBoard that is open forgets an earlier file.
         let begin = [field(0x1a, b"brain.Event:2"), field(0x3a, &[0x08, 1])].map(|fields| event(started, 0, &fields));
-        let mut file = File::create(&path).with_context(|| cannot("create", &path))?;
-        file.write_all(&begin.concat()).with_context(|| cannot("write", &path))?;
-        Ok(Self { path, file, started, read: 0, seconds: BTreeMap::new(), evaluated: Vec::new() })
+        let file = File::create(&path).with_context(|| cannot("create", &path))?;
+        let mut begun =
+            Self { path, file, length: 0, started, read: 0, seconds: BTreeMap::new(), evaluated: Vec::new() };
+        begun.write(&begin.concat())?;
+        // A TensorBoard that is open reads the newest one, and goes on to this one only while that is there.
+        if let Some(newest) = earlier.pop() {
+            File::create(&newest).with_context(|| cannot("empty", &newest))?;
+        }
+        for old in earlier {
+            fs::remove_file(&old).with_context(|| cannot("remove", &old))?;
+        }
+        Ok(begun)
+    }
+
+    /// Whether it is as it was written: it may have been removed, or another exporter may have begun another one.
+    fn is_intact(&self) -> bool {
+        fs::metadata(&self.path).is_ok_and(|found| found.len() == self.length)
+    }
+
+    fn write(&mut self, records: &[u8]) -> anyhow::Result<()> {
+        self.length += records.len() as u64;
+        self.file.write_all(records).with_context(|| cannot("write", &self.path))
     }
 
     /// The records of the whole lines of `metrics.jsonl` that are not in the file yet.
@@ -137,14 +159,13 @@ fn cannot(what: &str, path: &Path) -> String {
     format!("cannot {what} {}", path.display())
 }
 
-fn remove_event_files(folder: &Path) -> io::Result<()> {
-    for entry in fs::read_dir(folder)? {
-        let (entry, [first, last]) = (entry?, NAME);
-        if entry.file_name().to_str().is_some_and(|name| name.starts_with(first) && name.ends_with(last)) {
-            fs::remove_file(entry.path())?;
-        }
-    }
-    Ok(())
+/// Our event files in a folder, the newest last.
+fn event_files(folder: &Path) -> io::Result<Vec<PathBuf>> {
+    let mut files = fs::read_dir(folder)?.map(|entry| Ok(entry?.path())).collect::<io::Result<Vec<_>>>()?;
+    let name = |path: &Path| path.file_name().unwrap_or_default().to_string_lossy().into_owned();
+    files.retain(|path| name(path).starts_with(PREFIX) && name(path).ends_with(SUFFIX));
+    files.sort();
+    Ok(files)
 }
 
 /// What a file has from a position on; nothing if it is not there.
