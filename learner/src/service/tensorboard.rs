@@ -56,3 +56,7 @@ impl TensorBoard {
         }
     }
 }
+
+#[cfg(test)]
+#[path = "../../tests/unit/service/tensorboard.rs"]
+mod tests;
