@@ -6,7 +6,8 @@ use std::io::{self, ErrorKind, Read, Seek, SeekFrom, Write};
 use std::path::{Path, PathBuf};
 use std::time::{Duration, SystemTime, UNIX_EPOCH};
 
-use anyhow::{Context, bail};
+use anyhow::{Context, anyhow};
+use quad_service::hinted;
 
 use super::run::{EvaluationReport, RunReport};
 
@@ -24,7 +25,8 @@ pub(crate) fn export_all(runs: &[RunReport], folder: &Path) -> anyhow::Result<()
     for run in runs {
         if let Some(other) = named.insert(&run.run, &run.dir) {
             let (other, dir) = (other.display(), run.dir.display());
-            bail!("{other} and {dir} both have a run named {}: export them to different folders", run.run);
+            let error = anyhow!("{other} and {dir} both have a run named {}", run.run);
+            return Err(hinted(error, "export them one at a time, into different folders"));
         }
         Exporter::new(&run.dir, folder).append()?;
     }

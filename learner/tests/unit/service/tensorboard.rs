@@ -22,7 +22,7 @@ fn the_end_of_a_run_copies_what_is_new() {
 #[test]
 fn a_disk_that_hangs_holds_up_the_end_for_a_few_seconds() {
     let folder = tempfile::tempdir().unwrap();
-    // Reading it waits for a writer, who never comes.
+    // Reading it waits for a writer, and none comes.
     assert!(Command::new("mkfifo").arg(folder.path().join("config.toml")).status().unwrap().success());
     let begin = Instant::now();
     TensorBoard::start(Exporter::new(folder.path(), folder.path())).unwrap().end();
