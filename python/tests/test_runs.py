@@ -48,6 +48,7 @@ dataset = quad_rl.Dataset.from_episodes([{"rewards": [1.0]}])
 dataset.save("y")
 problems = dataset.inspect()["problems"]
 rows: list[dict[str, object]] = [dict(row) for row in quad_rl.runs("z")]
+value: float = quad_rl.metrics("z")[0]["train/q_mean"]
 """
 WRONG = """
 import quad_rl
@@ -55,6 +56,7 @@ quad_rl.Policy.load(3)
 quad_rl.Policy.load("x").act([0.0], 3)
 quad_rl.Dataset.from_arrays(observations=[])
 quad_rl.runs(5)
+quad_rl.metrics(["z"])
 """
 
 
@@ -67,7 +69,7 @@ def test_a_type_checker_accepts_right_calls_and_no_others(tmp_path):
         return [line for line in checked.stdout.splitlines() if ": error: " in line]
 
     assert errors(SAMPLE) == []
-    assert {line.split(":")[1] for line in errors(WRONG)} == {"3", "4", "5", "6"}
+    assert {line.split(":")[1] for line in errors(WRONG)} == {"3", "4", "5", "6", "7"}
 
 
 def test_everything_public_says_what_it_takes(tmp_path):
@@ -77,7 +79,7 @@ def test_everything_public_says_what_it_takes(tmp_path):
         for member in dir(getattr(quad_rl, name)):
             documented = member.startswith("_") or getattr(getattr(quad_rl, name), member).__doc__
             assert documented, f"{name}.{member}"
-    assert quad_rl.runs.__doc__
+    assert quad_rl.runs.__doc__ and quad_rl.metrics.__doc__
     checked = subprocess.run([sys.executable, "-m", "mypy", "--strict", "--cache-dir", str(tmp_path), "-p", "quad_rl"],
                              capture_output=True, text=True, timeout=100)
     assert checked.returncode == 0, checked.stdout

@@ -22,7 +22,7 @@ use crate::cli::{
 use crate::config::hyperparameters::{self, Values};
 use crate::config::{Preset, tasks};
 use crate::data::{Source, cache};
-use crate::report::{Listing, Report, Style, Table, draw_all, runs_in, write_html};
+use crate::report::{Listing, Report, Style, Table, draw_all, export_all, runs_in, write_html};
 use crate::run::{RunDirError, verify};
 
 /// Does what the command line says.
@@ -88,6 +88,10 @@ fn report(args: &ReportArgs) -> anyhow::Result<()> {
     if let Some(path) = &args.html {
         write_html(path, &report)?;
         info!("report: {}", path.display());
+    }
+    if let Some(folder) = &args.tensorboard {
+        export_all(&report.runs, folder)?;
+        info!("to look at them: tensorboard --logdir {}", folder.display());
     }
     let style = match (args.markdown, args.latex, args.csv) {
         (true, ..) => Style::Markdown,

@@ -109,7 +109,8 @@ async fn run_to_its_end(
     // A later start has a larger number; the low bits tell two apart that start in the same millisecond.
     let life = Life { run: name, incarnation: now()? << 16 | u64::from(rand::random::<u16>()) };
     let checkpoint_every = Duration::from_secs(args.checkpoint_seconds);
-    let run = Run { life: life.clone(), config, dir: &run_dir, scores, past, checkpoint_every };
+    let tensorboard = args.tensorboard.as_deref();
+    let run = Run { life: life.clone(), config, dir: &run_dir, scores, past, checkpoint_every, tensorboard };
     let threads = Threads::start(run, transitions, &metrics, &health, &tell)?;
     live.begun(&threads);
     let main_loop = MainLoop {

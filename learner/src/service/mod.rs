@@ -13,8 +13,8 @@
 //!   writes scores down. A query until it is answered is one of the `requests`.
 //! - `coordinator` is the state that they share: the scoreboard and the `evaluators`. `rejection` says why a message is not
 //!   accepted.
-//! - `metrics` are for Prometheus, `disk` is what is told of a disk that refuses something, `display` what a person sees on a
-//!   terminal, `live` what the page shows.
+//! - `metrics` are for Prometheus, `tensorboard` is the thread that copies the run to an event file, `disk` is what is told of a
+//!   disk that refuses something, `display` what a person sees on a terminal, `live` what the page shows.
 
 mod coordinator;
 mod disk;
@@ -35,6 +35,7 @@ mod scores;
 mod services;
 mod snapshots;
 mod spawn;
+mod tensorboard;
 #[cfg(test)]
 #[path = "../../tests/unit/service/mod.rs"]
 mod tests;

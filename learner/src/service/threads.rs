@@ -1,6 +1,7 @@
 //! The threads of a run, started together and ended in order.
 
 use std::collections::BTreeMap;
+use std::path::Path;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::thread::JoinHandle;
@@ -18,9 +19,11 @@ use super::scores::Scores;
 use super::services::Services;
 use super::snapshots::Snapshots;
 use super::spawn::spawn_alive;
+use super::tensorboard::TensorBoard;
 use super::weights::Weights;
 use crate::config::{Experiment, RunConfig};
 use crate::evaluation::{Earlier, Rules};
+use crate::report::Exporter;
 use crate::run::{Log, Past, RunDir};
 use crate::train::{Outbox, Training};
 
@@ -45,6 +48,8 @@ pub(crate) struct Run<'a> {
     pub past: Past,
     /// Least time between two checkpoints.
     pub checkpoint_every: Duration,
+    /// Where TensorBoard's event files go, if there are to be any.
+    pub tensorboard: Option<&'a Path>,
 }
 
 /// The running threads.
@@ -55,6 +60,7 @@ pub(crate) struct Threads {
     training: JoinHandle<()>,
     snapshots: JoinHandle<()>,
     scores: JoinHandle<()>,
+    tensorboard: Option<TensorBoard>,
 }
 
 impl Threads {
@@ -66,7 +72,7 @@ impl Threads {
         health: &Health,
         events: &Events,
     ) -> anyhow::Result<Self> {
-        let Run { life, config, dir, scores, past, checkpoint_every } = run;
+        let Run { life, config, dir, scores, past, checkpoint_every, tensorboard } = run;
         let Past { checkpoint, snapshots: known, scores: earlier } = past;
         let experiment = &config.experiment;
         let task = Task::new(&experiment.environment, transitions.observation_dim(), transitions.action_dim());
@@ -86,6 +92,9 @@ impl Threads {
         let step = checkpoint.as_ref().map_or(0, |checkpoint| checkpoint.step);
         metrics.training.gradient_steps.inc_by(step);
         let (rows, seconds_before) = dir.metrics_log(step)?;
+        // What training will repeat is cut off now, so the event file will not have it.
+        let tensorboard =
+            tensorboard.map(|folder| TensorBoard::start(Exporter::new(dir.path(), folder))).transpose()?;
         let outbox = Outbox::default();
         let snapshots = Snapshots {
             outbox: outbox.clone(),
@@ -114,7 +123,7 @@ impl Threads {
         };
         let training =
             spawn_alive("training", events, health.part("training", TRAINING_STUCK), move |beat| training.run(beat))?;
-        Ok(Self { services, outbox, stop, training, snapshots, scores })
+        Ok(Self { services, outbox, stop, training, snapshots, scores, tensorboard })
     }
 
     /// Asks training to end after its current step.
@@ -130,6 +139,9 @@ impl Threads {
         self.snapshots.join().ok();
         self.services.deliveries.send(None).ok();
         self.scores.join().ok();
+        if let Some(tensorboard) = self.tensorboard {
+            tensorboard.end();
+        }
     }
 }
 

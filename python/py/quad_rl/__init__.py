@@ -3,6 +3,6 @@
 from quad_rl._dataset import Dataset
 from quad_rl._evaluate import Evaluators, evaluate
 from quad_rl._quad_rl import Episodes, Policy
-from quad_rl._runs import runs
+from quad_rl._runs import metrics, runs
 
-__all__ = ["Dataset", "Episodes", "Evaluators", "Policy", "evaluate", "runs"]
+__all__ = ["Dataset", "Episodes", "Evaluators", "Policy", "evaluate", "metrics", "runs"]

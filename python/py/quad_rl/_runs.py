@@ -35,8 +35,37 @@ def runs(folders: str | PathLike[str] | Iterable[str | PathLike[str]] = "runs/*"
     found = [path for path in found if Path(path, "config.toml").is_file()]
     if not found:
         return []
-    report = json.loads(_learner("report", "--json", *found))
-    return [row for run in report["runs"] for row in _rows(run)]
+    return [row for run in _report(found) for row in _rows(run)]
+
+
+def metrics(folder: str | PathLike[str]) -> list[dict[str, float]]:
+    """What a run has measured, as experiment trackers take it: a dictionary for each step at which there is something.
+
+    folder: a run folder.
+
+    Each dictionary has `step`. Where the run's metrics.jsonl has that step, it has `seconds` (of training) and each metric, as
+    `train/NAME`. Where all episodes of an evaluation of that step are scored, it has `evaluation/score`,
+    `evaluation/score_std` (if there are several episodes), `evaluation/return` and `evaluation/length`. Steps ascend. These are
+    the names that `learner report --tensorboard` gives.
+
+    A learner may be writing the folder. Raises FileNotFoundError if it holds no metrics.jsonl, else as `runs` does.
+    """
+    lines = Path(folder, "metrics.jsonl").read_text().split("\n")[:-1]  # What follows the last end of a line is half a line.
+    rows: dict[int, dict[str, float]] = {}
+    for line in map(json.loads, lines):
+        named = {name if name in ("step", "seconds") else f"train/{name}": value for name, value in line.items()}
+        rows[line["step"]] = named
+    for scored in _rows(_report([os.fspath(folder)])[0]):
+        if scored["complete"]:
+            row = rows.setdefault(scored["step"], {"step": scored["step"]})
+            values = {name: scored[name] for name in ("score", "score_std", "return", "length")}
+            row |= {f"evaluation/{name}": value for name, value in values.items() if value is not None}
+    return [rows[step] for step in sorted(rows)]
+
+
+def _report(folders: list[str]) -> list[dict[str, Any]]:
+    runs: list[dict[str, Any]] = json.loads(_learner("report", "--json", *folders))["runs"]
+    return runs
 
 
 def _rows(run: dict[str, Any]) -> list[dict[str, Any]]:
