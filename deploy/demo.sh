@@ -2,7 +2,7 @@
 # The demonstration: from a file of mediocre Hopper data to a policy that hops, by a learner and two evaluators over Zenoh.
 #
 # Sets up what is missing, builds, records the dataset if it is not there, trains, and ends with the run's table, its learning
-# curve and, where OpenGL is installed, a film of its best snapshot. Run again, it skips what is done: a run that was interrupted
+# curve, where OpenGL is installed a film of its best snapshot, and a report of all that as one HTML file. Run again, it skips what is done: a run that was interrupted
 # goes on where it was. Ctrl-C stops everything.
 #
 #   deploy/demo.sh [--fresh]        --fresh: begin another run; the one that is there is kept under another name
@@ -26,7 +26,7 @@ if [ ! -e "$DATASET" ]; then
 fi
 
 if [ -e "$RUN/complete" ] && [ $# -eq 0 ]; then
-  $BIN/learner report "$RUN"
+  $BIN/learner report "$RUN" --html "$RUN/report.html"
   echo "learning curve: $RUN/learning_curve.svg"
   echo "run folder: $RUN"
   say "this run is complete; for another one: deploy/demo.sh --fresh"
@@ -42,3 +42,5 @@ fi
 touch "$RUN/complete"
 # Where this machine draws no pictures, the evaluator says what to install.
 $BIN/evaluator film "$RUN" --out "$RUN/film.gif" || say "the run is complete, but there is no film of it"
+# All of it in one file, for a browser.
+$BIN/learner report "$RUN" --html "$RUN/report.html" >/dev/null
