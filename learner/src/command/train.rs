@@ -7,7 +7,7 @@ use anyhow::{Context, anyhow};
 use quad_dataset::{Transitions, environment};
 use quad_policy::Precision;
 use quad_protocol::Name;
-use quad_service::{Health, Hint, hinted, print, stay_in_background, unfinished};
+use quad_service::{BindError, Health, Hint, hinted, print, stay_in_background, unfinished};
 use tokio::sync::mpsc;
 use tracing::{debug, info, warn};
 
@@ -76,11 +76,14 @@ pub fn train(args: &TrainArgs) -> anyhow::Result<()> {
     concluded
 }
 
-fn record_hint(experiment: &Experiment) -> String {
-    format!(
-        "give a file by --dataset FILE; `evaluator collect --env {} --out FILE` records one",
-        experiment.environment
-    )
+/// What to do where there is no dataset.
+pub(super) fn record_hint(Experiment { environment: name, .. }: &Experiment) -> String {
+    let is_recorded = environment::find(name).is_ok_and(|spec| spec.goal.is_none());
+    let other = match is_recorded {
+        true => format!("`evaluator collect --env {name} --out FILE` records one"),
+        false => "docs/data.md says what it may be".to_owned(),
+    };
+    format!("name a file as `dataset`, on the command line by --dataset FILE; {other}")
 }
 
 async fn run_to_its_end(
@@ -95,7 +98,7 @@ async fn run_to_its_end(
     let steps = config.experiment.steps;
     let (metrics, registry) = Metrics::new(&name, steps, config.experiment.definition()?.metrics)?;
     let health = Health::default();
-    let server = quad_service::serve_metrics(args.metrics, registry, health.clone()).await?;
+    let server = quad_service::serve_metrics(args.metrics, registry, health.clone()).await.hint_of(BindError::hint)?;
     let opening = outside.open().await?;
     // From here on nothing outside can be wrong any more, so a refused start leaves no folder behind.
     let (run_dir, scores, past) = take_up(path, begun, args.fresh, config)?;
