@@ -72,7 +72,7 @@ fn places_that_cannot_be_written_or_listened_at() {
     let (snapshot, folder) = (learner.snapshot(SHORT.steps), scratch.path().to_str().unwrap());
     for (program, arguments, sentence, hint) in [
         ("evaluator", &["film", snapshot.to_str().unwrap(), "--out", "/proc/film.gif"][..], "/proc/film.gif", "--out"),
-        ("evaluator", &["collect", "--env", "hopper", "--out", folder], "Is a directory", "--out"),
+        ("evaluator", &["collect", "--env", "hopper", "--out", folder], "is a directory", "--out"),
         ("learner", &["report", good, "--figures", "/proc/figures"], "/proc/figures", "--figures"),
     ] {
         let output = Command::new(binary(program)).args(arguments).output().unwrap();
