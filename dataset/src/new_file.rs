@@ -1,6 +1,7 @@
 //! An HDF5 file that is being written, and its arrays, which grow by rows: gzip 4, chunked, booleans as h5py writes them.
 
 use std::fs;
+use std::io;
 use std::path::{Path, PathBuf};
 
 use hdf5::{H5Type, Hyperslab, SliceOrIndex};
@@ -34,6 +35,9 @@ impl NewFile {
         let partial = PathBuf::from(partial);
         if let Some(folder) = path.parent() {
             fs::create_dir_all(folder).map_err(|source| DatasetError::new(path, Problem::Io(source)))?;
+        }
+        if path.is_dir() {
+            return Err(DatasetError::new(path, Problem::Io(io::ErrorKind::IsADirectory.into())));
         }
         let hdf5 = hdf5::File::create(&partial);
         let hdf5 = hdf5.map_err(|source| DatasetError::new(path, Problem::Write(source)))?;

@@ -3,9 +3,8 @@
 use std::fmt;
 use std::io::{self, Write};
 use std::process::ExitCode;
-use std::sync::mpsc::channel;
-use std::thread;
-use std::time::Duration;
+
+use rustix::event::{PollFd, PollFlags, Timespec, poll};
 
 use crate::logging::Logging;
 
@@ -79,7 +78,9 @@ impl std::error::Error for Hinted {
 /// `sysexits.h`, so that a scheduler can tell it from a failure.
 const UNFINISHED: u8 = 75;
 /// How long the last words wait for stderr to be read.
-const LAST_WORDS: Duration = Duration::from_secs(1);
+const LAST_WORDS: Timespec = Timespec { tv_sec: 1, tv_nsec: 0 };
+/// What a pipe that has room takes without waiting, bytes.
+const PIPE: usize = 4096;
 
 /// Prints a command's result to stdout, where logs do not go. The reader may stop at any time, like `head` does.
 ///
@@ -101,20 +102,26 @@ pub fn run_main(logging: Logging, main: impl FnOnce() -> anyhow::Result<()>) -> 
     drop(logging);
     let Err(error) = result else { return ExitCode::SUCCESS };
     let unfinished = error.chain().filter_map(|cause| cause.downcast_ref::<Hinted>()).any(|hinted| hinted.unfinished);
-    let (tell, told) = channel();
-    thread::spawn(move || {
-        // With stderr closed, the exit code is all that can be said.
-        show(&error, &mut io::stderr().lock()).ok();
-        tell.send(()).ok();
-    });
-    told.recv_timeout(LAST_WORDS).ok();
+    let mut text = Vec::new();
+    // With stderr closed, the exit code is all that can be said.
+    show(&error, &mut text).and_then(|()| say(&text)).ok();
     if unfinished { UNFINISHED.into() } else { ExitCode::FAILURE }
+}
+
+/// Writes to stderr as long as that takes it. Not by [`io::Stderr`], which a log line that waits for a reader may have locked;
+/// nor on another thread, which takes longer to start than a reader may where too many processes share the processors.
+fn say(mut text: &[u8]) -> io::Result<()> {
+    let stderr = io::stderr();
+    while !text.is_empty() && poll(&mut [PollFd::new(&stderr, PollFlags::OUT)], Some(&LAST_WORDS))? > 0 {
+        text = &text[rustix::io::write(&stderr, &text[..text.len().min(PIPE)])?..];
+    }
+    Ok(())
 }
 
 fn show(error: &anyhow::Error, to: &mut impl Write) -> io::Result<()> {
     let mut last = String::new();
     for (depth, cause) in error.chain().enumerate() {
-        let text = cause.to_string();
+        let text = cause.to_string().trim_end().to_owned();
         // Some errors quote their cause.
         if depth == 0 {
             writeln!(to, "error: {text}")?;

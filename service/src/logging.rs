@@ -32,7 +32,7 @@ pub struct Logging {
     _writer: WorkerGuard,
 }
 
-/// Sends log lines to stderr, coloured on a terminal without NO_COLOR; the environment variable RUST_LOG chooses which. Only a thread of the
+/// Sends log lines to stderr, coloured on a terminal that has colours, unless NO_COLOR is set; the environment variable RUST_LOG chooses which. Only a thread of the
 /// log's own waits when stderr is not read.
 ///
 /// To be called once, first thing in `main`; further calls do nothing.
@@ -40,7 +40,8 @@ pub fn init_logging() -> Logging {
     let writer = NonBlockingBuilder::default().buffered_lines_limit(MOST_WAITING).thread_name("log");
     let (lines, guard) = writer.finish(std::io::stderr());
     let filter = EnvFilter::try_from_default_env().unwrap_or_else(|_| EnvFilter::new(DEFAULT_FILTER));
-    let colours = std::io::stderr().is_terminal() && env::var_os("NO_COLOR").is_none_or(|value| value.is_empty());
+    let variable = |name| env::var_os(name).unwrap_or_default();
+    let colours = std::io::stderr().is_terminal() && variable("NO_COLOR").is_empty() && variable("TERM") != "dumb";
     subscriber(lines, filter, colours).try_init().ok();
     Logging { _writer: guard }
 }

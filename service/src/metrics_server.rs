@@ -50,6 +50,13 @@ pub struct BindError {
     pub source: io::Error,
 }
 
+impl BindError {
+    /// What to do about it.
+    pub fn hint(&self) -> &'static str {
+        "choose another address or port for --metrics, or port 0 for a free one"
+    }
+}
+
 /// Serves over HTTP at `address`: at `/metrics` what `registry` gathers, in Prometheus's text format; at `/healthz` `ok`,
 /// or status 503 and a line for each problem; and the `pages` of the program's own.
 ///

@@ -38,7 +38,8 @@ use clap::Args;
 use quad_policy::Precision;
 use quad_protocol::Name;
 use quad_service::{
-    Certificates, CertificatesError, Endpoints, Health, Hint, Role, SessionError, default_endpoint, parse_endpoint,
+    BindError, Certificates, CertificatesError, Endpoints, Health, Hint, Role, SessionError, default_endpoint,
+    parse_endpoint,
 };
 use rand::Rng;
 use tracing::{info, warn};
@@ -125,7 +126,7 @@ async fn serve_until_stopped(args: ServeArgs, environments: Arc<dyn Environments
             let server =
                 quad_service::serve_metrics(address, metrics.registry.clone(), health.clone(), Default::default())
                     .await
-                    .hint("choose another address or port for --metrics, or port 0 for a free one")?;
+                    .hint_of(BindError::hint)?;
             info!("metrics at http://{}/metrics", server.address);
             Some(server)
         }

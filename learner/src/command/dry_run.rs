@@ -29,7 +29,7 @@ pub fn foretell(path: &Path, config: &RunConfig, transitions: Transitions) -> an
     let memory = peak_memory().map_or("an unknown amount".to_owned(), |bytes| HumanBytes(bytes).to_string());
     print(&format!(
         "# folder: {}\n# data: {}\n# time: {:.1} ms for a gradient step, measured over a second; {time} for {} of them\n\
-         # memory: {memory}\n# disk: {} for snapshots and checkpoints\n\n{}",
+         # memory: {memory}, without evaluators\n# disk: {} for snapshots and checkpoints\n\n{}",
         path.display(),
         config.dataset.summary(),
         price.step * 1000.0,

@@ -11,6 +11,7 @@ use anyhow::{Context, anyhow};
 use quad_service::{Hint, SessionError, hinted, open_router, print, stay_in_background, unfinished};
 use tracing::info;
 
+use super::train::record_hint;
 use crate::cli::SweepArgs;
 use crate::report::{State, Style, Table};
 use crate::service::LocalEvaluators;
@@ -88,7 +89,7 @@ fn work(args: &SweepArgs, folder: &Path, left: Runs) -> anyhow::Result<Ended> {
     for (run, _) in &left {
         let dataset = &run.experiment.dataset;
         if !datasets.contains_key(dataset) {
-            datasets.insert(dataset.clone(), run.source.obtain()?.path);
+            datasets.insert(dataset.clone(), run.source.obtain().hint(record_hint(&run.experiment))?.path);
         }
     }
     let mut step_seconds = BTreeMap::new();

@@ -8,7 +8,7 @@ use anyhow::{Context, anyhow};
 use quad_dataset::{Transitions, environment};
 use quad_policy::Precision;
 use quad_protocol::Name;
-use quad_service::{Health, Hint, hinted, print, stay_in_background, unfinished};
+use quad_service::{BindError, Health, Hint, hinted, print, stay_in_background, unfinished};
 use tokio::sync::mpsc;
 use tracing::{debug, info, warn};
 
@@ -78,11 +78,14 @@ pub fn train(args: &TrainArgs) -> anyhow::Result<()> {
     concluded
 }
 
-fn record_hint(experiment: &Experiment) -> String {
-    format!(
-        "give a file by --dataset FILE; `evaluator collect --env {} --out FILE` records one",
-        experiment.environment
-    )
+/// What to do where there is no dataset.
+pub(super) fn record_hint(Experiment { environment: name, .. }: &Experiment) -> String {
+    let is_recorded = environment::find(name).is_ok_and(|spec| spec.goal.is_none());
+    let other = match is_recorded {
+        true => format!("`evaluator collect --env {name} --out FILE` records one"),
+        false => "docs/data.md says what it may be".to_owned(),
+    };
+    format!("name a file as `dataset`, on the command line by --dataset FILE; {other}")
 }
 
 async fn run_to_its_end(
@@ -100,7 +103,8 @@ async fn run_to_its_end(
     let live = Live::new(name.clone(), steps, metrics.clone(), health.clone());
     let telling = live.clone();
     let page = page::routes(path.to_owned(), Some(Arc::new(move || telling.tell())))?;
-    let server = quad_service::serve_metrics(args.metrics, registry, health.clone(), page).await?;
+    let server = quad_service::serve_metrics(args.metrics, registry, health.clone(), page).await;
+    let server = server.hint_of(BindError::hint)?;
     info!("page: http://{}/", server.address);
     let opening = outside.open().await?;
     // From here on nothing outside can be wrong any more, so a refused start leaves no folder behind.

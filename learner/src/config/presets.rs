@@ -16,6 +16,8 @@ use super::tables::merge;
 use super::tasks::{self, Task};
 use crate::algorithms::{ALGORITHMS, Definition};
 
+const PRINT: &str = "`learner presets TASK` prints what such a file may have";
+
 /// A task, or a file that may change one.
 pub struct Preset {
     /// What it is called in the names of runs: the task's name, or the file's without its folder and ending.
@@ -36,8 +38,9 @@ impl Preset {
             let task = tasks::named(preset)?;
             return Ok(Self { label: task.name.clone(), task: Some(task), own: Table::new() });
         }
-        let text = std::fs::read_to_string(preset).with_context(|| format!("cannot read the preset {preset}"))?;
-        let mut own: Table = text.parse().with_context(|| format!("preset {preset} is not TOML"))?;
+        let text =
+            std::fs::read_to_string(preset).with_context(|| format!("cannot read the preset {preset}")).hint(PRINT)?;
+        let mut own: Table = text.parse().with_context(|| format!("preset {preset} is not TOML")).hint(PRINT)?;
         let task = own.remove("task").map(|name| tasks::named(&word(&name))).transpose();
         let stem = Path::new(preset).file_stem().and_then(|stem| stem.to_str());
         Ok(Self {

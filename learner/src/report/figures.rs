@@ -4,6 +4,7 @@ use std::collections::BTreeMap;
 use std::path::Path;
 
 use anyhow::Context;
+use quad_service::Hint;
 
 use super::plot::{Line, Picture};
 use super::run::RunReport;
@@ -13,12 +14,13 @@ use super::study::MethodReport;
 use super::summary::Report;
 use crate::config::settings::{self, Settings};
 
+const FOLDER: &str = "--figures names a folder that you may write in";
 const TAU: &str = "agent.tau";
 const BAND: &str = "mean over seeds, with its 95 % interval";
 
 /// Draws all pictures of a report into a folder, each as SVG and as PNG. The folder is made if it is not there.
 pub fn draw_all(folder: &Path, report: &Report) -> anyhow::Result<()> {
-    std::fs::create_dir_all(folder).with_context(|| format!("cannot make {}", folder.display()))?;
+    std::fs::create_dir_all(folder).with_context(|| format!("cannot make {}", folder.display())).hint(FOLDER)?;
     for (name, picture) in all(report) {
         picture.write_svg(&folder.join(format!("{name}.svg")))?;
         picture.write_png(&folder.join(format!("{name}.png")))?;

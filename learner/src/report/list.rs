@@ -105,7 +105,8 @@ impl fmt::Display for Listing {
                 Found::Unreadable { error } => unreadable += &format!("{name}: {error}\n"),
             }
         }
-        write!(f, "{}{unreadable}", table.render(Style::Text))
+        let runs = if table.is_empty() { "no runs\n".to_owned() } else { table.render(Style::Text) };
+        write!(f, "{runs}{unreadable}")
     }
 }
 

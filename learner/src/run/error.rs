@@ -50,9 +50,9 @@ impl RunDirError {
             }
             Self::Io { action: "create", .. } => "choose a folder that you may write to with --run-dir DIR",
             Self::Io { source, .. } => match source.kind() {
-                ErrorKind::NotFound => "is it a folder that `learner train` has written?",
+                ErrorKind::NotFound | ErrorKind::NotADirectory => "is it a folder that `learner train` has written?",
                 ErrorKind::PermissionDenied | ErrorKind::ReadOnlyFilesystem => {
-                    "see to it that you may write there, or choose another folder by --run-dir"
+                    "see to it that you may read and write there, or choose another folder by --run-dir"
                 }
                 ErrorKind::StorageFull | ErrorKind::QuotaExceeded => "make room on that disk (docs/operations.md)",
                 _ => "`learner doctor --run-dir DIR` looks at the disk",

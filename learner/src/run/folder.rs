@@ -116,7 +116,10 @@ impl RunDir {
     pub fn read_config(&self) -> Result<RunConfig, RunDirError> {
         let source = self.path.join("config.toml");
         let text = fs::read_to_string(&source).map_err(io_error("read", &source))?;
-        toml::from_str(&text).map_err(|error| content(&source, None, &error))
+        toml::from_str(&text).map_err(|error: toml::de::Error| {
+            let line = error.span().and_then(|at| text.get(..at.start)).map(|before| before.matches('\n').count() + 1);
+            content(&source, line, &error.message())
+        })
     }
 
     /// The folder's path.

@@ -7,7 +7,7 @@ use std::path::{Path, PathBuf};
 use std::process::{Child, Command, Stdio};
 use std::time::{Duration, Instant};
 
-use anyhow::Context;
+use anyhow::{Context, anyhow};
 use quad_service::Hint;
 use rustix::process::{Pid, Signal, kill_process, set_parent_process_death_signal};
 
@@ -63,10 +63,14 @@ impl LocalEvaluators {
         }
         let beside = std::env::current_exe().ok().map(|own| own.with_file_name(EVALUATOR)).filter(|path| path.exists());
         let program = beside.unwrap_or_else(|| EVALUATOR.into());
-        let tried = Command::new(&program).arg("--version").stdout(Stdio::null()).stderr(Stdio::null()).status();
-        match tried {
-            Ok(status) if status.success() => {}
-            Ok(status) => anyhow::bail!("{} --version ended with {status}", program.display()),
+        match Command::new(&program).arg("--version").output() {
+            Ok(output) if output.status.success() => {}
+            Ok(output) => {
+                let (program, status, said) =
+                    (program.display(), output.status, String::from_utf8_lossy(&output.stderr));
+                return Err(anyhow!("{program} cannot be started ({status}): {}", said.trim()))
+                    .hint("if it lacks libmujoco: deploy/setup.sh installs that");
+            }
             Err(error) => {
                 let hint = "build it with `cargo build --release --package quad-evaluator`, or leave --evaluators out and start \
                             some by hand";

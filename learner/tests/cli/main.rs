@@ -1,6 +1,8 @@
-//! `learner presets`, `learner report` and `learner verify`, as a user calls them on files that a test has made up.
+//! `learner presets`, `list`, `report`, `verify` and `train --dry-run`, as a user calls them on files that a test has made up.
 #![allow(clippy::unwrap_used, clippy::expect_used)]
 
+mod dry_run;
+mod list;
 mod online;
 mod presets;
 mod published;

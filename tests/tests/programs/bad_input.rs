@@ -1,10 +1,13 @@
 //! Data that training must not touch, and places where nothing can be written: one sentence, a hint, exit code 1, and no
 //! folder left behind. What can be wrong with a file is tested beside the reader.
 
-use std::fs;
+use std::fs::{self, Permissions};
+use std::net::TcpListener;
+use std::os::unix::fs::PermissionsExt;
 use std::path::{Path, PathBuf};
 use std::process::{Command, Output};
 
+use quad_tests::PATIENCE;
 use quad_tests::process::{assert_refused, binary};
 use quad_tests::setting::SHORT;
 use quad_tests::system::Scratch;
@@ -50,6 +53,65 @@ fn a_run_folder_that_cannot_be_made() {
     for run_dir in [file.join("run"), PathBuf::from("/proc/run")] {
         let output = train(&scratch, &scratch.dataset(), &run_dir, &[]);
         assert_refused(&output, run_dir.to_str().unwrap(), "--run-dir");
+    }
+}
+
+#[test]
+fn places_that_cannot_be_written_or_listened_at() {
+    let scratch = Scratch::new();
+    let run_dir = scratch.path().join("run");
+    let taken = TcpListener::bind("127.0.0.1:0").unwrap().local_addr().unwrap();
+    let _taken = TcpListener::bind(taken).unwrap();
+    let output = train(&scratch, &scratch.dataset(), &run_dir, &["--metrics", &taken.to_string()]);
+    assert_refused(&output, &format!("cannot serve metrics at {taken}"), "port 0");
+    assert!(!run_dir.exists());
+
+    let mut learner = scratch.learner_with("good", SHORT, &["--eval-interval", "0"]);
+    learner.process.assert_succeeds(PATIENCE);
+    let good = learner.run_dir.to_str().unwrap();
+    let (snapshot, folder) = (learner.snapshot(SHORT.steps), scratch.path().to_str().unwrap());
+    for (program, arguments, sentence, hint) in [
+        ("evaluator", &["film", snapshot.to_str().unwrap(), "--out", "/proc/film.gif"][..], "/proc/film.gif", "--out"),
+        ("evaluator", &["collect", "--env", "hopper", "--out", folder], "is a directory", "--out"),
+        ("learner", &["report", good, "--figures", "/proc/figures"], "/proc/figures", "--figures"),
+    ] {
+        let output = Command::new(binary(program)).args(arguments).output().unwrap();
+        assert_refused(&output, sentence, hint);
+        assert!(!String::from_utf8_lossy(&output.stderr).contains("search 1 of"), "refused before minutes of work");
+    }
+}
+
+#[test]
+fn an_evaluator_that_cannot_start_says_why() {
+    let scratch = Scratch::new();
+    let programs = scratch.path().join("programs");
+    fs::create_dir(&programs).unwrap();
+    fs::copy(binary("learner"), programs.join("learner")).unwrap();
+    let evaluator = programs.join("evaluator");
+    fs::write(&evaluator, "#!/bin/sh\necho libmujoco.so: cannot open shared object file >&2; exit 127\n").unwrap();
+    fs::set_permissions(&evaluator, Permissions::from_mode(0o755)).unwrap();
+    let mut command = Command::new(programs.join("learner"));
+    command.args(["train", "--task", "hopper-demo", "--evaluators", "1", "--dataset"]).arg(scratch.dataset());
+    assert_refused(&command.output().unwrap(), "libmujoco.so: cannot open", "deploy/setup.sh");
+}
+
+#[test]
+fn files_that_are_no_runs_or_presets() {
+    let scratch = Scratch::new();
+    let path = |name: &str| scratch.path().join(name).to_str().unwrap().to_owned();
+    fs::create_dir(path("run")).unwrap();
+    fs::write(path("run/config.toml"), "name = 'x'\nlist = [\n").unwrap();
+    fs::write(path("mine.toml"), "list = [\n").unwrap();
+    let wrong = format!("error: {}, line 2, is not what a learner writes: ", path("run/config.toml"));
+    for (arguments, sentence, hint) in [
+        (["report", &path("run")], &*wrong, "put a copy"),
+        (["report", &path("mine.toml")], "cannot read", "that `learner train` has written"),
+        (["presets", &path("mine.toml")], "mine.toml is not TOML", "`learner presets TASK`"),
+        (["presets", &path("missing.toml")], "missing.toml", "`learner presets TASK`"),
+    ] {
+        let output = Command::new(binary("learner")).args(arguments).output().unwrap();
+        assert_refused(&output, sentence, hint);
+        assert_eq!(String::from_utf8_lossy(&output.stderr).matches("\n\n").count(), 0, "{arguments:?}");
     }
 }
 

@@ -74,8 +74,51 @@ fn a_wrong_name_is_answered_with_the_right_ones() {
 #[test]
 fn what_is_missing_is_said() {
     refused(&["--task", "hopper-demo"], 1, &["hint:", "hopper-demo names no dataset", "--dataset FILE"]);
+    refused(&["--task", "own-data"], 1, &["hint:", "own-data names no dataset", "docs/data.md"]);
     let missing = ["--task", "hopper-demo", "--dataset", "/tmp/missing.hdf5", "--run-dir", "/tmp/missing-run"];
     refused(&missing, 1, &["hint:", "/tmp/missing.hdf5"]);
+}
+
+/// What a command writes in a shell.
+fn shell(command: &[&str]) -> String {
+    let path = binary("learner").parent().unwrap().display().to_string() + ":" + &std::env::var("PATH").unwrap();
+    let output = Command::new(command[0]).args(&command[1..]).env("PATH", path).output().unwrap();
+    assert!(output.status.success(), "{command:?}: {}", String::from_utf8_lossy(&output.stderr));
+    String::from_utf8(output.stdout).unwrap()
+}
+
+#[test]
+fn bash_completes_commands_and_arguments() {
+    for (program, typed, completed) in [
+        ("learner", "rep", "report"),
+        ("learner", "train --dr", "--dry-run"),
+        ("learner", "report --select la", "last"),
+        ("evaluator", "film --comp", "--compare"),
+    ] {
+        // As bash calls it: the command, the word that is completed, and the one before it.
+        let script = format!(
+            r#"eval "$({program} completions bash)"; complete -p {program} >&2
+            COMP_WORDS=({program} {typed}); COMP_CWORD=$((${{#COMP_WORDS[@]}} - 1))
+            _{program} {program} "${{COMP_WORDS[COMP_CWORD]}}" "${{COMP_WORDS[COMP_CWORD - 1]}}"; echo "${{COMPREPLY[@]}}""#
+        );
+        assert_eq!(shell(&["bash", "--norc", "-euc", &script]).trim(), completed, "{program} {typed}");
+    }
+}
+
+#[test]
+fn a_terminal_is_coloured_unless_its_user_does_not_want_it() {
+    let scratch = Scratch::new();
+    let [data, run] = [scratch.dataset(), scratch.path().join("run")];
+    let flags = "--task hopper-demo --set batch_size=8 --dry-run";
+    let train = format!("learner train {flags} --dataset {} --run-dir {}", data.display(), run.display());
+    for (setting, coloured) in
+        [("NO_COLOR= TERM=xterm", true), ("NO_COLOR=1 TERM=xterm", false), ("NO_COLOR= TERM=dumb", false)]
+    {
+        let text = shell(&["script", "--quiet", "--command", &format!("{setting} {train}"), "/dev/null"]);
+        assert!(text.contains(" INFO"), "{text}");
+        assert_eq!(text.contains("\u{1b}["), coloured, "{setting}: {text:?}");
+    }
+    assert!(!shell(&["sh", "-c", &format!("{train} 2>&1")]).contains('\u{1b}'), "a pipe has no colours");
 }
 
 #[test]

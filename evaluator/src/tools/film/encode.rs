@@ -35,6 +35,7 @@ pub fn write(
         Format::Png => strip(path, pictures),
     }
     .with_context(|| format!("cannot write {}", path.display()))
+    .hint("--out names a file in a folder that you may write in")
 }
 
 fn strip(path: &Path, pictures: impl Iterator<Item = anyhow::Result<Picture>>) -> anyhow::Result<()> {

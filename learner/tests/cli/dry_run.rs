@@ -1,0 +1,25 @@
+//! `learner train --dry-run`: what a run would be, and what it would take.
+
+use toml::Table;
+
+use crate::{printed, write_dataset};
+
+#[test]
+fn a_dry_run_prints_the_run_and_its_cost_and_leaves_nothing() {
+    let folder = tempfile::tempdir().unwrap();
+    let [data, run] = ["data.hdf5", "run"].map(|name| folder.path().join(name).display().to_string());
+    write_dataset(data.as_ref());
+    let changes = ["--seed", "7", "--set", "batch_size=8", "--set", "agent.actor.hidden=[8]", "--steps", "50"];
+    let asked = ["train", "--task", "hopper-demo", "--dataset", &data, "--run-dir", &run, "--dry-run"];
+    let text = printed(&[&asked[..], &changes].concat());
+    for words in ["# folder: ", "# data: 9", " ms for a gradient step", "for 50 of them", "# memory: ", "# disk: "] {
+        assert!(text.contains(words), "`{words}` is not in {text}");
+    }
+    // What is printed is a preset of one's own, which resolves to itself.
+    let own = folder.path().join("own.toml");
+    std::fs::write(&own, &text).unwrap();
+    let printed: Table = printed(&["presets", own.to_str().unwrap()]).parse().unwrap();
+    assert_eq!(printed, text.parse().unwrap());
+    assert_eq!((printed["seed"].as_integer(), printed["batch_size"].as_integer()), (Some(7), Some(8)));
+    assert!(!std::path::Path::new(&run).exists());
+}
