@@ -108,8 +108,8 @@ pub fn run_main(logging: Logging, main: impl FnOnce() -> anyhow::Result<()>) -> 
     if unfinished { UNFINISHED.into() } else { ExitCode::FAILURE }
 }
 
-/// Writes to stderr as long as that takes it. Not by [`io::Stderr`], which a log line that waits for a reader may have locked;
-/// nor on another thread, which takes longer to start than a reader may where too many processes share the processors.
+/// Writes to stderr for as long as that takes it. Not by [`io::Stderr`], which a log line that waits for a reader may have
+/// locked; nor on another thread, which may take seconds to start where many processes share the processors.
 fn say(mut text: &[u8]) -> io::Result<()> {
     let stderr = io::stderr();
     while !text.is_empty() && poll(&mut [PollFd::new(&stderr, PollFlags::OUT)], Some(&LAST_WORDS))? > 0 {

@@ -50,7 +50,7 @@ function showRuns(runs) {
   list = newest;
   const focused = document.activeElement?.dataset?.run;
   $("runs").replaceChildren(...runs.map((run) => {
-    if (run.error) return row("", run.name, element("td", run.error, { class: "bad", colspan: 5 }));
+    if (run.error) return row("", run.name, element("td", run.error, { class: "bad", colspan: 4 }));
     const tick = element("input", "", { type: "checkbox", "data-run": run.name, "aria-label": `show ${run.name}` });
     tick.checked = shown.has(run.name);
     tick.addEventListener("change", () => {
@@ -62,9 +62,8 @@ function showRuns(runs) {
     box.append(tick);
     const local = run.page && ["localhost", "127.0.0.1"].includes(location.hostname);
     name.append(local ? element("a", run.name, { href: run.page }) : run.name);
-    const method = run.algorithm === run.variant ? run.variant : `${run.algorithm}, ${run.variant}`;
     const score = run.score === null ? "–" : `${run.score.toFixed(1)} @${run.score_step}`;
-    return row(box, name, run.task, method, String(run.seed), run.state + (run.at_work ? ", at work" : ""), right(score));
+    return row(box, name, run.task, run.method, run.state + (run.at_work ? ", at work" : ""), right(score));
   }));
   [...$("runs").querySelectorAll("input")].find((tick) => tick.dataset.run === focused)?.focus();
 }

@@ -22,7 +22,7 @@ use crate::cli::{
 use crate::config::hyperparameters::{self, Values};
 use crate::config::{Preset, tasks};
 use crate::data::{Source, cache};
-use crate::report::{Listing, Report, Style, Table, draw_all, export_all, runs_in, write_html};
+use crate::report::{Report, Style, Table, draw_all, export_all, list, runs_in, write_html};
 use crate::run::{RunDirError, verify};
 
 /// Does what the command line says.
@@ -37,7 +37,7 @@ pub fn run(cli: &Cli) -> anyhow::Result<()> {
         Command::Datasets(command) => datasets(command),
         Command::Report(args) => report(args),
         Command::Verify(args) => check_run(args),
-        Command::List(args) => list(args),
+        Command::List(args) => list_runs(args),
         Command::Page(args) => page::show(args),
         Command::Doctor(args) => examine(args),
         Command::Completions { shell } => completions(*shell),
@@ -114,9 +114,9 @@ fn check_run(args: &VerifyArgs) -> anyhow::Result<()> {
     Ok(())
 }
 
-fn list(args: &ListArgs) -> anyhow::Result<()> {
-    let listing = Listing::read(&args.dirs);
-    print(&if args.json { serde_json::to_string_pretty(&listing.entries)? } else { listing.to_string() })
+fn list_runs(args: &ListArgs) -> anyhow::Result<()> {
+    let entries = list::list(&args.dirs);
+    print(&if args.json { serde_json::to_string_pretty(&entries)? } else { list::table(&entries) })
 }
 
 fn completions(shell: Shell) -> anyhow::Result<()> {

@@ -12,7 +12,7 @@ use tokio::sync::oneshot;
 
 use super::history::History;
 use crate::algorithms::Metric;
-use crate::report::{Listing, RunReport};
+use crate::report::{RunReport, list};
 use crate::run::RunDir;
 
 /// However often browsers ask, a run is read no more often than this.
@@ -79,9 +79,9 @@ impl Reader {
 
     fn list(&mut self) -> Bytes {
         self.list.get(LIST_EVERY).unwrap_or_else(|| {
-            let listing = Listing::read(std::slice::from_ref(&self.root));
-            self.dirs = listing.entries.iter().map(|entry| (entry.name.clone(), entry.dir.clone())).collect();
-            let shown = listing.entries.iter().map(|entry| {
+            let entries = list::list(std::slice::from_ref(&self.root));
+            self.dirs = entries.iter().map(|entry| (entry.name.clone(), entry.dir.clone())).collect();
+            let shown = entries.iter().map(|entry| {
                 let mut shown = json!(entry);
                 if shown["at_work"] == true {
                     shown["page"] = json!(RunDir::at(&entry.dir).read_endpoints().ok().map(|endpoints| endpoints.page));

@@ -1,8 +1,7 @@
 //! All runs below some folders, a line each.
 
-use std::fmt;
 use std::fmt::Alignment::{Left, Right};
-use std::fs;
+use std::fs::{self, DirEntry};
 use std::path::{Path, PathBuf};
 
 use indicatif::HumanBytes;
@@ -14,13 +13,7 @@ use super::summary::walk;
 use super::table::{Style, Table};
 use crate::run::RunDir;
 
-/// What is listed.
-pub struct Listing {
-    /// Runs and what cannot be read, in the order of their folders.
-    pub entries: Vec<Entry>,
-}
-
-/// A folder.
+/// A folder: a run, or what keeps it from being read.
 #[derive(Serialize)]
 pub struct Entry {
     /// Its path below the folder that was asked for, or its whole path if several were.
@@ -28,33 +21,21 @@ pub struct Entry {
     /// The folder.
     pub dir: PathBuf,
     #[serde(flatten)]
-    found: Found,
+    run: Option<Listed>,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    error: Option<String>,
 }
 
-#[derive(Serialize)]
-#[serde(untagged)]
-enum Found {
-    Run(Box<Listed>),
-    Unreadable {
-        /// Why, in one line.
-        error: String,
-    },
-}
-
-/// A run.
 #[derive(Serialize)]
 struct Listed {
     task: String,
-    algorithm: String,
-    /// As in [`RunReport::variant`].
-    variant: String,
-    seed: u64,
+    /// The algorithm, and its variant if it has several.
+    method: String,
     /// Gradient steps done, of so many.
     step: u64,
     steps: u64,
     /// How far it is, in words.
     state: String,
-    complete: bool,
     /// Whether a learner has it open.
     at_work: bool,
     /// The last complete evaluation: its gradient step and mean score.
@@ -64,94 +45,63 @@ struct Listed {
     bytes: u64,
 }
 
-impl Listing {
-    /// Reads all runs in and below these folders.
-    pub fn read(dirs: &[PathBuf]) -> Self {
-        let mut entries = Vec::new();
-        for dir in dirs {
-            let entry = |path: &Path, found: anyhow::Result<Listed>| {
-                let below = path.strip_prefix(dir).ok().filter(|below| dirs.len() == 1 && *below != Path::new(""));
-                let found = found.map_or_else(
-                    |error| Found::Unreadable { error: format!("{error:#}").replace('\n', " ") },
-                    |listed| Found::Run(Box::new(listed)),
-                );
-                Entry { name: below.unwrap_or(path).display().to_string(), dir: path.to_owned(), found }
-            };
-            let mut unreadable = Vec::new();
-            let runs = walk(dir, &mut |path, error| unreadable.push(entry(path, Err(error.into()))));
-            entries.extend(runs.iter().map(|path| entry(path, Listed::read(path))));
-            entries.extend(unreadable);
-        }
-        Self { entries }
+/// All runs in and below these folders.
+pub fn list(dirs: &[PathBuf]) -> Vec<Entry> {
+    let mut entries = Vec::new();
+    for asked in dirs {
+        let mut add = |dir: &Path, found: anyhow::Result<Listed>| {
+            let below = dir.strip_prefix(asked).ok().filter(|below| dirs.len() == 1 && *below != Path::new(""));
+            let error = found.as_ref().err().map(|error| format!("{error:#}").replace('\n', " "));
+            let name = below.unwrap_or(dir).display().to_string();
+            entries.push(Entry { name, dir: dir.to_owned(), run: found.ok(), error });
+        };
+        let runs = walk(asked, &mut |dir, error| add(dir, Err(error.into())));
+        runs.iter().for_each(|dir| add(dir, Listed::read(dir)));
     }
+    entries
 }
 
-impl fmt::Display for Listing {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        let header =
-            [("run", Left), ("task", Left), ("method", Left), ("state", Left), ("last score", Right), ("size", Right)];
-        let mut table = Table::new(&header);
-        let mut unreadable = String::new();
-        for Entry { name, found, .. } in &self.entries {
-            match found {
-                Found::Run(run) => table.push([
-                    name.clone(),
-                    run.task.clone(),
-                    run.method(),
-                    run.state(),
-                    run.score(),
-                    HumanBytes(run.bytes).to_string(),
-                ]),
-                Found::Unreadable { error } => unreadable += &format!("{name}: {error}\n"),
-            }
-        }
-        let runs = if table.is_empty() { "no runs\n".to_owned() } else { table.render(Style::Text) };
-        write!(f, "{runs}{unreadable}")
+/// The runs as a table for people; below it what cannot be read.
+pub fn table(entries: &[Entry]) -> String {
+    let texts = ["run", "task", "method", "state"].map(|name| (name, Left));
+    let mut table = Table::new(&[&texts[..], &[("last score", Right), ("size", Right)]].concat());
+    let mut errors = String::new();
+    for Entry { name, run, error, .. } in entries {
+        errors.extend(error.as_ref().map(|error| format!("{name}: {error}\n")));
+        let Some(run) = run else { continue };
+        let state = format!("{}{}", run.state, if run.at_work { ", at work" } else { "" });
+        let score = run.score.zip(run.score_step);
+        let score = score.map_or("-".to_owned(), |(score, step)| format!("{score:.1} @{step}"));
+        let size = HumanBytes(run.bytes).to_string();
+        table.push([name.clone(), run.task.clone(), run.method.clone(), state, score, size]);
     }
+    table.render(Style::Text) + &errors
 }
 
 impl Listed {
-    fn read(path: &Path) -> anyhow::Result<Self> {
-        let report = RunReport::scored(path)?;
-        let state = State::of(&report)?;
-        let newest = report.newest();
+    fn read(dir: &Path) -> anyhow::Result<Self> {
+        let report = RunReport::scored(dir)?;
+        let (state, newest) = (State::of(&report)?, report.newest());
+        let variant = Some(&report.variant).filter(|variant| **variant != report.algorithm);
         Ok(Self {
+            method: report.algorithm.clone() + &variant.map(|variant| format!(", {variant}")).unwrap_or_default(),
             step: state.step(report.steps),
             steps: report.steps,
             state: state.text(report.steps),
-            complete: state == State::Complete,
-            at_work: RunDir::at(path).is_in_use(),
+            at_work: RunDir::at(dir).is_in_use(),
             score_step: newest.map(|newest| newest.step),
             score: newest.map(|newest| newest.score.mean),
-            bytes: size(path),
+            bytes: size(dir),
             task: report.task,
-            algorithm: report.algorithm,
-            variant: report.variant,
-            seed: report.seed,
         })
-    }
-
-    fn method(&self) -> String {
-        let Self { algorithm, variant, .. } = self;
-        if algorithm == variant { algorithm.clone() } else { format!("{algorithm}, {variant}") }
-    }
-
-    fn state(&self) -> String {
-        format!("{}{}", self.state, if self.at_work { ", at work" } else { "" })
-    }
-
-    fn score(&self) -> String {
-        let score = self.score.zip(self.score_step);
-        score.map_or("-".to_owned(), |(score, step)| format!("{score:.1} @{step}"))
     }
 }
 
 /// Bytes of all files in a folder.
-fn size(path: &Path) -> u64 {
-    let entries = fs::read_dir(path).into_iter().flatten().flatten();
-    let of = |entry: fs::DirEntry| {
-        let metadata = entry.metadata().ok()?;
-        Some(if metadata.is_dir() { size(&entry.path()) } else { metadata.len() })
+fn size(dir: &Path) -> u64 {
+    let of = |entry: DirEntry| match entry.metadata() {
+        Ok(metadata) if metadata.is_dir() => size(&entry.path()),
+        metadata => metadata.map_or(0, |metadata| metadata.len()),
     };
-    entries.filter_map(of).sum()
+    fs::read_dir(dir).into_iter().flatten().flatten().map(of).sum()
 }

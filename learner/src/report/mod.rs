@@ -20,7 +20,7 @@ mod departures;
 mod figures;
 mod html;
 mod lambda;
-mod list;
+pub(crate) mod list;
 mod paper;
 mod plot;
 mod published;
@@ -38,7 +38,6 @@ mod tensorboard;
 
 pub(crate) use figures::{draw_all, of_run};
 pub(crate) use html::write as write_html;
-pub(crate) use list::Listing;
 pub(crate) use run::RunReport;
 pub(crate) use selection::Select;
 pub(crate) use spread::Spread;

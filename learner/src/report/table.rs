@@ -55,11 +55,6 @@ impl Table {
         self.rows.push(row.into());
     }
 
-    /// Whether it has no row but the header.
-    pub fn is_empty(&self) -> bool {
-        self.rows.len() == 1
-    }
-
     pub fn render(&self, style: Style) -> String {
         match style {
             Style::Text => self.lines(|cells| format!("{}\n", cells.join("  ").trim_end())).concat(),
