@@ -1,5 +1,6 @@
 //! The Grafana dashboard: what its panels ask Prometheus.
 
+use std::collections::BTreeSet;
 use std::fs;
 use std::path::Path;
 use std::time::Duration;
@@ -18,6 +19,16 @@ pub fn assert_every_panel_shows_data(prometheus: &Prometheus, patience: Duration
         let what = format!("panel {panel:?} has data for {expression}");
         eventually(&what, patience, || prometheus.query(&expression).filter(|values| !values.is_empty()));
     }
+}
+
+/// The metrics that training measures, as the panels call them: by their names, without the number at the end.
+pub fn metrics() -> BTreeSet<String> {
+    let is_name = |name: &str| name.chars().all(|c| c.is_ascii_lowercase() || c == '_' || c.is_ascii_digit());
+    let titles = queries().into_iter().map(|(title, _)| title);
+    titles
+        .flat_map(|title| title.split(", ").map(str::to_owned).collect::<Vec<_>>())
+        .filter(|name| is_name(name))
+        .collect()
 }
 
 /// The panels' titles and queries.

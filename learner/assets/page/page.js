@@ -75,11 +75,12 @@ function showCharts(runs) {
   if (scores.some(({ points }) => points.length)) {
     const data = runs.length === 1 ? `; the data's own episodes have ${number(runs[0].dataset_score)}` : "";
     const about = `Mean over an evaluation's episodes, ± their standard deviation${data}.`;
-    kept.add(chart($("score"), "score", runs.length === 1 ? runs[0].measure : "score", about, scores));
+    const measure = runs.every((run) => run.measure === "return") ? "Return" : "Score";
+    kept.add(chart($("score"), "score", measure, about, scores));
   }
   const rates = runs.map((run) => ({ label: named(run, "") || "steps/s", points: rate(run.history.rows) }));
   if (rates.some(({ points }) => points.length)) {
-    kept.add(chart($("metrics"), "rate", "gradient steps per second", "", rates));
+    kept.add(chart($("metrics"), "rate", "Gradient steps per second", "", rates));
   }
   // Metrics whose names differ in a number at their end share a chart.
   const groups = new Map();
