@@ -11,6 +11,8 @@ use std::arch::x86_64::{
 };
 use std::cell::RefCell;
 
+use crate::level::Level;
+
 /// Lanes of a register.
 const LANES: usize = 16;
 /// Columns of the result that are worked on together: two registers.
@@ -20,7 +22,7 @@ const ROWS: usize = 12;
 
 /// Whether this CPU can, and results of this many columns are whole blocks.
 pub(crate) fn serves(columns: usize) -> bool {
-    columns.is_multiple_of(COLUMNS) && is_x86_feature_detected!("avx512f")
+    columns.is_multiple_of(COLUMNS) && Level::in_use() == Level::Avx512
 }
 
 /// What a register holds, where one cache line holds it: other addresses take two for each register.
@@ -41,9 +43,7 @@ type Pair = i32;
 
 /// Whether this CPU has AVX512-BF16.
 fn has_bf16() -> bool {
-    is_x86_feature_detected!("avx512f")
-        && is_x86_feature_detected!("avx512bw")
-        && is_x86_feature_detected!("avx512bf16")
+    Level::in_use() == Level::Avx512 && is_x86_feature_detected!("avx512bf16")
 }
 
 thread_local! {

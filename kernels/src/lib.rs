@@ -7,8 +7,9 @@
 //! - [`activation`]: Mish and its derivative; [`narrow`]: the first and last layer of a network, fused with it.
 //! - [`optimiser`]: Adam and EMA over whole parameter vectors.
 //! - [`scaling`]: between a user's units and those of networks.
+//! - [`Level`] (`level`): which of the CPU's instructions are used.
 //! - [`Buffer`] (`buffer`): memory that is used again and again, aligned to cache lines.
-//! - `vectorised`: the macro that the loops of the two above are written with.
+//! - `vectorised`: the macro that loops are written with.
 //!
 //! Matrices are row-major `f32` slices; a name's shape is given as `rows × columns`. What a CPU can do is found out at
 //! run time.
@@ -17,6 +18,7 @@ pub mod activation;
 #[cfg(target_arch = "x86_64")]
 mod avx512;
 mod buffer;
+mod level;
 pub mod narrow;
 pub mod optimiser;
 pub mod product;
@@ -24,3 +26,4 @@ pub mod scaling;
 mod vectorised;
 
 pub use buffer::Buffer;
+pub use level::Level;

@@ -1,7 +1,8 @@
 //! Adam (Kingma and Ba 2015) and EMA over flat parameter vectors, in parallel.
 
-use multiversion::multiversion;
 use rayon::prelude::*;
+
+use crate::vectorised::vectorised;
 
 /// Numbers per task: a few arrays of them fit into a core's own cache.
 const CHUNK: usize = 1 << 14;
@@ -13,17 +14,18 @@ pub const BETA2: f64 = 0.999;
 /// What Adam adds to the root of the second moment, ε.
 pub const EPSILON: f32 = 1e-8;
 
-#[multiversion(targets("x86_64+avx512f+avx512dq+avx512vl+avx512bw+avx2+fma", "x86_64+avx2+fma"))]
-fn sum_of_squares(x: &[f32]) -> f32 {
-    let mut lanes = [0.0_f32; 16];
-    let chunks = x.chunks_exact(16);
-    let rest: f32 = chunks.remainder().iter().map(|x| x * x).sum();
-    for x in chunks {
-        for l in 0..16 {
-            lanes[l] = x[l].mul_add(x[l], lanes[l]);
+vectorised! {
+    fn sum_of_squares(x: &[f32]) -> f32 {
+        let mut lanes = [0.0_f32; 16];
+        let chunks = x.chunks_exact(16);
+        let rest: f32 = chunks.remainder().iter().map(|x| x * x).sum();
+        for x in chunks {
+            for l in 0..16 {
+                lanes[l] = x[l].mul_add(x[l], lanes[l]);
+            }
         }
+        lanes.iter().sum::<f32>() + rest
     }
-    lanes.iter().sum::<f32>() + rest
 }
 
 /// Coefficients of Adam's element-wise update.
@@ -39,24 +41,26 @@ struct Update {
     correction: f32,
 }
 
-#[multiversion(targets("x86_64+avx512f+avx512dq+avx512vl+avx512bw+avx2+fma", "x86_64+avx2+fma"))]
-fn adam_chunk(update: Update, parameters: &mut [f32], first: &mut [f32], second: &mut [f32], gradient: &[f32]) {
-    // Of the new gradient: rounded from f64, since 1 - 0.999 in f32 would be off by a part in 20,000.
-    const NEW: [f32; 2] = [(1.0 - BETA1) as f32, (1.0 - BETA2) as f32];
-    const OLD: [f32; 2] = [BETA1 as f32, BETA2 as f32];
-    for (((p, m), v), g) in parameters.iter_mut().zip(first).zip(second).zip(gradient) {
-        let g = g * update.scale;
-        *m = OLD[0] * *m + NEW[0] * g;
-        *v = OLD[1] * *v + NEW[1] * g * g;
-        // In one subtraction: a decay by itself would be too small a part of the parameter to change it.
-        *p -= update.rate * *m / (v.sqrt() * update.correction + EPSILON) + update.decay * *p;
+vectorised! {
+    fn adam_chunk(update: Update, parameters: &mut [f32], first: &mut [f32], second: &mut [f32], gradient: &[f32]) {
+        // Of the new gradient: rounded from f64, since 1 - 0.999 in f32 would be off by a part in 20,000.
+        const NEW: [f32; 2] = [(1.0 - BETA1) as f32, (1.0 - BETA2) as f32];
+        const OLD: [f32; 2] = [BETA1 as f32, BETA2 as f32];
+        for (((p, m), v), g) in parameters.iter_mut().zip(first).zip(second).zip(gradient) {
+            let g = g * update.scale;
+            *m = OLD[0] * *m + NEW[0] * g;
+            *v = OLD[1] * *v + NEW[1] * g * g;
+            // In one subtraction: a decay by itself would be too small a part of the parameter to change it.
+            *p -= update.rate * *m / (v.sqrt() * update.correction + EPSILON) + update.decay * *p;
+        }
     }
 }
 
-#[multiversion(targets("x86_64+avx512f+avx512dq+avx512vl+avx512bw+avx2+fma", "x86_64+avx2+fma"))]
-fn ema_chunk(target: &mut [f32], online: &[f32], rate: f32) {
-    for (target, online) in target.iter_mut().zip(online) {
-        *target += rate * (online - *target);
+vectorised! {
+    fn ema_chunk(target: &mut [f32], online: &[f32], rate: f32) {
+        for (target, online) in target.iter_mut().zip(online) {
+            *target += rate * (online - *target);
+        }
     }
 }
 

@@ -3,17 +3,30 @@
 //! The callers split work into tiles that run in parallel, so a single product never does.
 
 use gemm::{Parallelism, gemm};
+#[cfg(target_arch = "x86_64")]
+use gemm_common::{
+    gemm::gemm_basic_generic,
+    simd::{MixedSimd, V3},
+};
 
 #[cfg(target_arch = "x86_64")]
 use crate::avx512;
 #[cfg(target_arch = "x86_64")]
 pub use crate::avx512::bf16::Rounded;
+use crate::level::Level;
 
 /// A row-major matrix or its transpose, as `gemm` wants it: first element, column stride, row stride.
 type Operand = (*const f32, isize, isize);
 
 fn multiply(m: usize, n: usize, k: usize, out: &mut [f32], a: Operand, b: Operand) {
     assert_eq!(out.len(), m * n, "the product's shape");
+    #[cfg(target_arch = "x86_64")]
+    if Level::in_use() == Level::Avx2
+        && let Some(avx2) = <V3 as MixedSimd<f32, f32, f32, f32>>::try_new()
+    {
+        // SAFETY: as below.
+        return unsafe { multiply_by_avx2(avx2, [m, n, k], out, a, b) };
+    }
     // SAFETY: the three callers below check that `a` spans m × k and `b` k × n elements with these strides, and
     // `out` is an exclusive slice of m × n.
     unsafe {
@@ -37,6 +50,47 @@ fn multiply(m: usize, n: usize, k: usize, out: &mut [f32], a: Operand, b: Operan
             false,
             false,
             Parallelism::None,
+        );
+    }
+}
+
+/// What `gemm` does on a CPU that has no more than AVX2. On a wider one it would not.
+///
+/// # Safety
+/// The matrices must span that many elements.
+#[cfg(target_arch = "x86_64")]
+unsafe fn multiply_by_avx2(avx2: V3, [m, n, k]: [usize; 3], out: &mut [f32], a: Operand, b: Operand) {
+    use gemm_f32::microkernel::fma::f32::{H_M, H_N, H_UKR, MR_DIV_N, NR, UKR};
+    const LANES: usize = 8;
+    let (no, one) = (false, Parallelism::None);
+    let out = out.as_mut_ptr();
+    // SAFETY: the caller's. Its kernels write columns, so it is given the transposed matrices.
+    unsafe {
+        gemm_basic_generic::<_, f32, LANES, { MR_DIV_N * LANES }, NR, MR_DIV_N, H_M, H_N>(
+            avx2,
+            n,
+            m,
+            k,
+            out,
+            n as isize,
+            1,
+            no,
+            b.0,
+            b.2,
+            b.1,
+            a.0,
+            a.2,
+            a.1,
+            0.0,
+            1.0,
+            no,
+            no,
+            no,
+            |a, b, c| a * b + c,
+            &UKR,
+            &H_UKR,
+            no,
+            one,
         );
     }
 }
@@ -66,14 +120,9 @@ pub fn rounding_is_faster() -> bool {
 /// so to other last bits.
 pub fn instructions(rounded: bool) -> &'static str {
     #[cfg(target_arch = "x86_64")]
-    let names = match rounded {
-        true => avx512::bf16::instructions(),
-        false if is_x86_feature_detected!("avx512f") => "avx512",
-        false if is_x86_feature_detected!("avx2") && is_x86_feature_detected!("fma") => "avx2",
-        false => "x86",
-    };
+    let names = if rounded { avx512::bf16::instructions() } else { Level::in_use().name() };
     #[cfg(not(target_arch = "x86_64"))]
-    let names = if rounded { "none" } else { std::env::consts::ARCH };
+    let names = if rounded { "none" } else { Level::in_use().name() };
     names
 }
 

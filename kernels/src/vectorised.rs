@@ -1,13 +1,29 @@
-//! Loops that are compiled for several instruction sets, of which the best is chosen at run time.
+//! Loops that are compiled for several instruction sets, of which the one in use is chosen at run time.
 
 macro_rules! vectorised {
-    ($(#[$meta:meta])* $vis:vis fn $name:ident($($arg:ident: $ty:ty),* $(,)?) $body:block) => {
+    ($(#[$meta:meta])* $vis:vis fn $name:ident($($arg:ident: $ty:ty),* $(,)?) $(-> $result:ty)? $body:block) => {
         $(#[$meta])*
-        #[multiversion::multiversion(targets(
-            "x86_64+avx512f+avx512dq+avx512vl+avx512bw+avx2+fma+bmi1+bmi2",
-            "x86_64+avx2+fma+bmi1+bmi2",
-        ))]
-        $vis fn $name($($arg: $ty),*) $body
+        $vis fn $name($($arg: $ty),*) $(-> $result)? {
+            #[cfg(target_arch = "x86_64")]
+            {
+                #[target_feature(enable = "avx512f,avx512dq,avx512vl,avx512bw,avx2,fma,bmi1,bmi2")]
+                fn avx512($($arg: $ty),*) $(-> $result)? $body
+
+                #[target_feature(enable = "avx2,fma,bmi1,bmi2")]
+                fn avx2($($arg: $ty),*) $(-> $result)? $body
+
+                use crate::level::Level;
+                match Level::in_use() {
+                    // SAFETY: the CPU has what is in use.
+                    Level::Avx512 => return unsafe { avx512($($arg),*) },
+                    // SAFETY: likewise.
+                    Level::Avx2 => return unsafe { avx2($($arg),*) },
+                    Level::Plain => {}
+                }
+            }
+            fn plain($($arg: $ty),*) $(-> $result)? $body
+            plain($($arg),*)
+        }
     };
 }
 

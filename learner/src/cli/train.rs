@@ -1,6 +1,7 @@
 //! The arguments of `learner train`.
 
 use std::net::SocketAddr;
+use std::num::NonZero;
 use std::path::PathBuf;
 
 use clap::{Args, value_parser};
@@ -76,6 +77,9 @@ pub struct TrainArgs {
     /// Start so many evaluators on this machine, which end with the learner; they log to DIR/evaluator-1.log and so on
     #[arg(long, value_name = "N", default_value_t = 0, conflicts_with = "certificates")]
     pub evaluators: usize,
+    /// Threads that train; while they do, each keeps a core busy [default: RAYON_NUM_THREADS, or one a core, but 16 at most]
+    #[arg(long, value_name = "N")]
+    pub threads: Option<NonZero<usize>>,
     /// Folder with ca.pem, cert.pem and key.pem: evaluators must show a certificate of the same authority, and endpoints
     /// are tls/HOST:PORT (docs/security.md)
     #[arg(long, value_name = "DIR", env = "QUAD_CERTIFICATES")]

@@ -1,5 +1,6 @@
 //! `learner train`, from the command line to the report.
 
+use std::num::NonZero;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::time::{Duration, SystemTime, UNIX_EPOCH};
@@ -22,8 +23,12 @@ use crate::report::{RunReport, of_run};
 use crate::run::{self, Begun, Log, Past, RunDir};
 use crate::service::{Display, Ending, Life, Live, MainLoop, Metrics, Run, STUCK, Threads};
 
+/// Most threads that train unless more are asked for: a gradient step of the paper is cut into tiles, twenty with one next action a
+/// state, and threads that wait for one keep their cores busy.
+const MOST_THREADS: usize = 16;
 /// How long a run that has failed may write its report.
 const REPORT_PATIENCE: Duration = Duration::from_secs(5);
+
 /// Does it; an error is a run that did not come to its end.
 pub fn train(args: &TrainArgs) -> anyhow::Result<()> {
     let preset = Preset::read(args.preset())?;
@@ -42,6 +47,7 @@ pub fn train(args: &TrainArgs) -> anyhow::Result<()> {
     args.device.check(experiment.precision)?;
     let dataset = source.obtain().hint(record_hint(&experiment))?;
 
+    start_pool(args.threads)?;
     let transitions = load(&dataset.path, &experiment)?;
     let config = run_config(args, &name, preset.task_name(), experiment, dataset, &transitions)?;
     if let Some(begun) = &begun {
@@ -76,6 +82,15 @@ pub fn train(args: &TrainArgs) -> anyhow::Result<()> {
     // Without waiting for a thread that waits for a broken disk.
     runtime.shutdown_background();
     concluded
+}
+
+/// Starts the threads that train.
+fn start_pool(asked: Option<NonZero<usize>>) -> anyhow::Result<()> {
+    let cores = std::thread::available_parallelism().map_or(1, NonZero::get);
+    // Of 0, rayon looks into RAYON_NUM_THREADS.
+    let usual = if std::env::var_os("RAYON_NUM_THREADS").is_some() { 0 } else { cores.min(MOST_THREADS) };
+    let pool = rayon::ThreadPoolBuilder::new().thread_name(|_| "training".to_owned());
+    Ok(pool.num_threads(asked.map_or(usual, NonZero::get)).build_global()?)
 }
 
 /// What to do where there is no dataset.

@@ -1,0 +1,58 @@
+//! Which of the CPU's vector instructions are used: the widest that it has, or fewer where a developer asks for it, to test and
+//! to measure what other CPUs run.
+
+use std::sync::LazyLock;
+
+/// Sets of instructions, each with all of those before.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
+pub enum Level {
+    /// What every CPU of its architecture has.
+    Plain,
+    /// AVX2 and FMA: 8 numbers at a time.
+    Avx2,
+    /// AVX-512 (F, DQ, VL, BW): 16 numbers at a time.
+    Avx512,
+}
+
+impl Level {
+    /// As it is called in `scores.jsonl` and in the environment variable.
+    pub fn name(self) -> &'static str {
+        match self {
+            Self::Plain if cfg!(target_arch = "x86_64") => "x86",
+            Self::Plain => std::env::consts::ARCH,
+            Self::Avx2 => "avx2",
+            Self::Avx512 => "avx512",
+        }
+    }
+
+    /// The widest that this CPU has.
+    pub fn available() -> Self {
+        #[cfg(target_arch = "x86_64")]
+        {
+            let has_avx2 = is_x86_feature_detected!("avx2")
+                && is_x86_feature_detected!("fma")
+                && is_x86_feature_detected!("bmi1")
+                && is_x86_feature_detected!("bmi2");
+            let has_avx512 = is_x86_feature_detected!("avx512f")
+                && is_x86_feature_detected!("avx512dq")
+                && is_x86_feature_detected!("avx512vl")
+                && is_x86_feature_detected!("avx512bw");
+            match (has_avx2, has_avx512) {
+                (true, true) => Self::Avx512,
+                (true, false) => Self::Avx2,
+                (false, _) => Self::Plain,
+            }
+        }
+        #[cfg(not(target_arch = "x86_64"))]
+        Self::Plain
+    }
+
+    /// That of this process: the widest, but no wider than AVX2 where the environment has `QUAD_INSTRUCTIONS=avx2`.
+    pub fn in_use() -> Self {
+        static IN_USE: LazyLock<Level> = LazyLock::new(|| {
+            let only_avx2 = std::env::var("QUAD_INSTRUCTIONS").is_ok_and(|asked| asked == Level::Avx2.name());
+            Level::available().min(if only_avx2 { Level::Avx2 } else { Level::Avx512 })
+        });
+        *IN_USE
+    }
+}
