@@ -28,6 +28,13 @@ fn end_with_parent(command: &mut Command) {
     }
 }
 
+/// Keeps the user's certificates from a program that connects to an endpoint without encryption, which would refuse them.
+pub(crate) fn not_encrypted(command: &mut Command, endpoint: &str) {
+    if endpoint.starts_with("tcp/") {
+        command.env_remove("QUAD_CERTIFICATES");
+    }
+}
+
 /// Starts a process that ends with this thread, with all that it says at the end of a file.
 pub(crate) fn spawn_logged(command: &mut Command, log: &Path) -> io::Result<Child> {
     end_with_parent(command);
@@ -102,6 +109,9 @@ impl LocalEvaluators {
     fn command(&self, reachable_at: &[String], number: usize) -> Command {
         let mut command = Command::new(&self.program);
         command.args(["serve", "--name", &format!("{EVALUATOR}-{number}"), "--connect"]).args(reachable_at.first());
+        if let Some(endpoint) = reachable_at.first() {
+            not_encrypted(&mut command, endpoint);
+        }
         if std::env::var_os("RAYON_NUM_THREADS").is_none() {
             command.env("RAYON_NUM_THREADS", self.cores.div_ceil(self.count).to_string());
         }

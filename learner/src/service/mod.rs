@@ -46,7 +46,7 @@ mod wire;
 pub(crate) use display::Display;
 pub(crate) use duplicate::Life;
 pub(crate) use live::Live;
-pub(crate) use local_evaluators::{LocalEvaluators, spawn_logged};
+pub(crate) use local_evaluators::{LocalEvaluators, not_encrypted, spawn_logged};
 pub(crate) use main_loop::{Ending, MainLoop};
 pub(crate) use metrics::Metrics;
 pub(crate) use network::{Opening, open_network};

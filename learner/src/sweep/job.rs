@@ -11,7 +11,7 @@ use super::study::PlannedRun;
 use crate::config::tables;
 use crate::report::State;
 use crate::run::RunDir;
-use crate::service::spawn_logged;
+use crate::service::{not_encrypted, spawn_logged};
 
 /// What a learner says by its exit code: the run is not complete, and the same command goes on.
 const UNFINISHED: i32 = 75;
@@ -55,6 +55,7 @@ impl Job {
             command.args(["--set", &format!("{key}={value}")]);
         }
         command.env("RAYON_NUM_THREADS", threads.to_string());
+        not_encrypted(&mut command, endpoint);
         let process = spawn_logged(&mut command, &log(&dir)).with_context(|| format!("cannot start {command:?}"))?;
         Ok(Self { run, dir, from, process })
     }
