@@ -1,11 +1,12 @@
 //! The metrics of a run that may be going on, thinned to what a picture can show.
 
 use std::collections::BTreeMap;
-use std::fs::File;
-use std::io::{self, BufRead, BufReader, Seek, SeekFrom};
+use std::io;
 use std::path::PathBuf;
 
 use serde::{Serialize, Serializer};
+
+use crate::run::new_lines;
 
 /// Most rows that are kept: more than a chart has pixels for. Even, so that pairs of rows can become one.
 const MOST_ROWS: usize = 500;
@@ -46,43 +47,26 @@ impl History {
         Self { path, read: 0, stride: 1, lines: 0, names: Vec::new(), rows: Vec::new() }
     }
 
-    /// Takes in the lines that the file has now. A file that does not go on where it was, as of a learner that went back to its checkpoint, is
-    /// read from its beginning.
+    /// Takes in the lines that the file has more than before. A learner that went back to its checkpoint writes steps again:
+    /// what was known of them is forgotten.
     ///
     /// # Errors
     /// The file cannot be read. That there is none is no error.
     pub fn refresh(&mut self) -> io::Result<()> {
-        let mut file = match File::open(&self.path) {
-            Err(error) if error.kind() == io::ErrorKind::NotFound => return Ok(()),
-            opened => opened?,
-        };
-        if file.metadata()?.len() < self.read {
-            *self = Self::of(self.path.clone());
-        }
-        file.seek(SeekFrom::Start(self.read))?;
-        let mut file = BufReader::new(file);
-        let mut line = Vec::new();
-        loop {
-            line.clear();
-            let length = file.read_until(b'\n', &mut line)?;
-            // The last line may not be whole yet.
-            if line.last() != Some(&b'\n') {
-                return Ok(());
-            }
-            self.read += length as u64;
-            let Ok(line) = serde_json::from_slice::<BTreeMap<String, f64>>(&line) else { continue };
-            let [step, seconds] = ["step", "seconds"].map(|name| line.get(name).copied().unwrap_or_default());
-            if self.rows.last().is_some_and(|last| step <= last.step) {
-                *self = Self::of(self.path.clone());
-                return self.refresh();
+        let lines = new_lines(&self.path, &mut self.read)?;
+        let lines = lines.split(|byte| *byte == b'\n').filter_map(|line| serde_json::from_slice(line).ok());
+        for mut line in lines.collect::<Vec<BTreeMap<String, f64>>>() {
+            let [step, seconds] = ["step", "seconds"].map(|name| line.remove(name).unwrap_or_default());
+            while self.rows.pop_if(|last| last.step >= step).is_some() {
+                self.lines = self.stride;
             }
             if self.names.is_empty() {
-                self.names =
-                    line.keys().filter(|name| !["step", "seconds"].contains(&name.as_str())).cloned().collect();
+                self.names = line.keys().cloned().collect();
             }
             let value = |name: &String| line.get(name).copied().unwrap_or(f64::NAN);
             self.push(Row { step, seconds, values: self.names.iter().map(value).collect() });
         }
+        Ok(())
     }
 
     fn push(&mut self, line: Row) {

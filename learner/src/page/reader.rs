@@ -65,7 +65,7 @@ impl Reader {
         Self { root, list: Kept::default(), dirs: HashMap::new(), runs: HashMap::new() }
     }
 
-    /// Answers until there is nobody left to ask.
+    /// Answers until the web server is gone.
     pub fn run(mut self, questions: &Receiver<Asked>) {
         stay_in_background();
         while let Ok((question, answer)) = questions.recv() {
@@ -122,8 +122,8 @@ impl RunPage {
 
     fn read(&mut self) -> anyhow::Result<Value> {
         self.history.refresh()?;
-        let report = RunReport::scored(&self.dir)?;
-        let config = report.config();
+        let (report, scores) = RunReport::with_scores(&self.dir)?;
+        let config = &report.config;
         let metric = |metric: &Metric| json!({ "name": metric.name, "help": metric.help });
         let metrics: Value = config.experiment.definition()?.metrics.iter().map(metric).collect();
         let evaluations = report.evaluations.iter().map(|evaluation| {
@@ -135,7 +135,6 @@ impl RunPage {
                 evaluation.complete
             ])
         });
-        let scores = RunDir::at(&self.dir).read_scores()?;
         let newest = &scores[scores.len().saturating_sub(EPISODES)..];
         Ok(json!({
             "run": report.run,

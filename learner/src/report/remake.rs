@@ -6,15 +6,15 @@ use crate::config::tables::parse_assignment;
 use super::departures::as_given;
 use super::run::RunReport;
 
-/// `learner train` with all that decides the outcome of the run. Nothing if what the run began from is no task of this learner's, but a
-/// file of its user's, or lacks a value that its task has.
+/// `learner train` with all that decides the outcome of the run. Nothing if what the run began from is no task of this
+/// learner's, but a file of its user's, or lacks a value that its task has.
 pub fn command(run: &RunReport) -> Option<String> {
     let experiment = &run.config.experiment;
     let given = as_given(run, false).ok()?;
     let (ours, theirs) = (settings::of_experiment(experiment), settings::of_experiment(&given));
     let mut words = vec!["learner train --task".to_owned(), quoted(&run.task)];
     let mut say = |flag: &str, value: &str| words.extend([flag.to_owned(), quoted(value)]);
-    if ours.get("algorithm") != Some(&"\"quad\"".to_owned()) {
+    if run.algorithm != "quad" {
         say("--algorithm", &run.algorithm);
     }
     if let Some(dataset) = &experiment.dataset {

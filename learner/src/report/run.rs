@@ -107,11 +107,20 @@ impl RunReport {
     /// # Errors
     /// Those of [`read`](Self::read).
     pub fn scored(path: &Path) -> anyhow::Result<Self> {
+        Ok(Self::with_scores(path)?.0)
+    }
+
+    /// The same, and the episodes' scores that it is made of.
+    ///
+    /// # Errors
+    /// Those of [`read`](Self::read).
+    pub fn with_scores(path: &Path) -> anyhow::Result<(Self, Vec<ScoreLine>)> {
         let (dir, config) = RunDir::open(path)?;
         let agent = config.experiment.method();
         let agent = agent.with_context(|| format!("config.toml in {} cannot be used", path.display()))?;
         let variant = config.experiment.variant()?.to_owned();
-        Ok(Self::new(path, config, agent, variant, &dir.read_scores()?))
+        let scores = dir.read_scores()?;
+        Ok((Self::new(path, config, agent, variant, &scores), scores))
     }
 
     fn new(path: &Path, config: RunConfig, agent: String, variant: String, lines: &[ScoreLine]) -> Self {
@@ -162,11 +171,6 @@ impl RunReport {
             precisions,
             config,
         }
-    }
-
-    /// What it was asked to do.
-    pub fn config(&self) -> &RunConfig {
-        &self.config
     }
 
     /// Whether every episode of every evaluation has its score.

@@ -2,7 +2,7 @@
 
 use std::collections::BTreeMap;
 use std::fs::{self, File};
-use std::io::{self, ErrorKind, Read, Seek, SeekFrom, Write};
+use std::io::{self, Write};
 use std::path::{Path, PathBuf};
 use std::time::{Duration, SystemTime, UNIX_EPOCH};
 
@@ -10,6 +10,7 @@ use anyhow::{Context, anyhow};
 use quad_service::hinted;
 
 use super::run::{EvaluationReport, RunReport};
+use crate::run::new_lines;
 
 /// What the name of an event file begins with, by which TensorBoard finds it.
 const PREFIX: &str = "events.out.tfevents.";
@@ -126,9 +127,7 @@ impl EventFile {
 
     /// The records of the whole lines of `metrics.jsonl` that are not in the file yet.
     fn rows(&mut self, path: &Path) -> anyhow::Result<Vec<u8>> {
-        let mut lines = read_from(path, self.read).with_context(|| cannot("read", path))?;
-        lines.truncate(lines.iter().rposition(|byte| *byte == b'\n').map_or(0, |last| last + 1));
-        self.read += lines.len() as u64;
+        let lines = new_lines(path, &mut self.read).with_context(|| cannot("read", path))?;
         let mut records = Vec::new();
         let rows = lines.split(|byte| *byte == b'\n').filter_map(|line| serde_json::from_slice(line).ok());
         for mut row in rows.collect::<Vec<BTreeMap<String, f64>>>() {
@@ -168,20 +167,6 @@ fn event_files(folder: &Path) -> io::Result<Vec<PathBuf>> {
     files.retain(|path| name(path).starts_with(PREFIX) && name(path).ends_with(SUFFIX));
     files.sort();
     Ok(files)
-}
-
-/// What a file has from a position on; nothing if it is not there.
-fn read_from(path: &Path, position: u64) -> io::Result<Vec<u8>> {
-    let mut bytes = Vec::new();
-    match File::open(path) {
-        Err(error) if error.kind() == ErrorKind::NotFound => return Ok(bytes),
-        opened => {
-            let mut file = opened?;
-            file.seek(SeekFrom::Start(position))?;
-            file.read_to_end(&mut bytes)?;
-        }
-    }
-    Ok(bytes)
 }
 
 /// The record of scalars, in tags, at a step.

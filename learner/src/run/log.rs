@@ -2,7 +2,7 @@
 
 use std::fs::{File, OpenOptions, TryLockError};
 use std::io::{self, Read, Seek, SeekFrom, Write};
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 use std::thread::sleep;
 use std::time::Duration;
 
@@ -128,6 +128,24 @@ impl Log {
         read.map_err(io_error("read", &self.path))?;
         Ok(bytes)
     }
+}
+
+/// The whole lines that a file has beyond its first `read` bytes, which then count as read; none if it is not there. A file
+/// that has become shorter is read from its beginning.
+pub(crate) fn new_lines(path: &Path, read: &mut u64) -> io::Result<Vec<u8>> {
+    let mut file = match File::open(path) {
+        Err(error) if error.kind() == io::ErrorKind::NotFound => return Ok(Vec::new()),
+        opened => opened?,
+    };
+    if file.metadata()?.len() < *read {
+        *read = 0;
+    }
+    let mut lines = Vec::new();
+    file.seek(SeekFrom::Start(*read))?;
+    file.read_to_end(&mut lines)?;
+    lines.truncate(lines.iter().rposition(|&byte| byte == b'\n').map_or(0, |last| last + 1));
+    *read += lines.len() as u64;
+    Ok(lines)
 }
 
 /// Length of the whole lines of a file, bytes.

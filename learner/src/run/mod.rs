@@ -23,5 +23,5 @@ pub(crate) use checkpoints::Checkpoint;
 pub use error::RunDirError;
 pub(crate) use folder::RunDir;
 pub(crate) use lines::{RunEndpoints, ScoreLine};
-pub(crate) use log::Log;
+pub(crate) use log::{Log, new_lines};
 pub(crate) use resume::{Begun, Past, open};

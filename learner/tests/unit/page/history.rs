@@ -53,6 +53,16 @@ fn a_run_that_went_back_to_its_checkpoint_is_shown_as_it_went_on() {
 }
 
 #[test]
+fn a_file_that_has_a_step_twice_is_read() {
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("metrics.jsonl");
+    fs::write(&path, lines([1, 2, 2, 3])).unwrap();
+    let mut history = History::of(path);
+    history.refresh().unwrap();
+    assert_eq!(history.rows.iter().map(|row| row.step).collect::<Vec<_>>(), [100.0, 200.0, 300.0]);
+}
+
+#[test]
 fn a_long_run_is_thinned_and_not_cut() {
     let folder = tempfile::tempdir().unwrap();
     let path = folder.path().join("metrics.jsonl");
