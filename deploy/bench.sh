@@ -1,9 +1,10 @@
 #!/usr/bin/env bash
 # How fast this machine trains and evaluates, beside its own peaks and beside JAX, and each kernel beside a library's:
-# prints the tables of docs/results.md.
+# prints the tables of docs/performance.md.
 #
 #   deploy/bench.sh [ROUNDS]     five rounds if not said otherwise, of two or three minutes each; on an idle machine
 #
+# QUAD_INSTRUCTIONS=avx2 keeps all of them, JAX too, to what a CPU without AVX-512 has.
 # Criterion's own reports are in target/criterion afterwards, every figure in target/bench.json.
 set -euo pipefail
 cd "$(dirname "$0")/.."

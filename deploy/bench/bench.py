@@ -1,5 +1,5 @@
 """Runs the benchmarks of learner, evaluator and kernels and of their peers in turns, and prints what
-docs/results.md shows. To be started by deploy/bench.sh.
+docs/performance.md shows. To be started by deploy/bench.sh.
 
     bench.py ROUNDS
 
@@ -32,6 +32,9 @@ PEAK_CALLS, PEAK_ROWS, PEAK_WIDTH = 1000, 128, 256
 KERNELS, OURS = "/20 in turn$|/mish", ("ours", "mish")
 LIBRARIES = {"gemm": "gemm", "gemm in f32": "gemm, f32", "mish by std's exp": "std's exp"}
 PYTHON = ".deps/venv/bin/python"
+# Asked for fewer instructions than the CPU has, JAX's compiler and its library of products keep to them, too.
+ONLY_AVX2 = os.environ.get("QUAD_INSTRUCTIONS") == "avx2"
+PEER_ENVIRONMENT = {"XLA_FLAGS": "--xla_cpu_max_isa=AVX2", "ONEDNN_MAX_CPU_ISA": "AVX2"} if ONLY_AVX2 else {}
 
 
 class Work:
@@ -108,7 +111,8 @@ class Peer:
 
     def __init__(self, *command):
         pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "text": True}
-        self.process = subprocess.Popen([PYTHON, "-W", "ignore", *command, "--serve", "--seconds", "1"], **pipes)
+        command = [PYTHON, "-W", "ignore", *command, "--serve", "--seconds", "1"]
+        self.process = subprocess.Popen(command, env=os.environ | PEER_ENVIRONMENT, **pipes)
 
     def measure(self, line=""):
         self.process.stdin.write(line + "\n")
@@ -167,9 +171,15 @@ def machine(rounds, count):
     model = next((line.split(": ")[1] for line in lines if line.startswith("model name")), platform.machine())
     flags = next((line.split() for line in lines if line.startswith("flags")), [])
     can = ", ".join(flag for flag in ("avx512f", "avx512_bf16", "amx_bf16") if flag in flags) or "no AVX-512"
+    can = f"has {can}, restricted to AVX2" if ONLY_AVX2 else can
     product, mish, slope = (median(rounds, lambda x: x["peak"][name]) / 1e9 for name in ("flop", "mish", "slope"))
     print(f"{model} ({can}), {rounds[0]['threads']} threads; the `gemm` crate does {product:.0f} GFLOP/s, a Mish loop")
     print(f"{mish:.1f} G elements/s, with the slope {slope:.1f}. Medians of {count} rounds.\n")
+
+
+def has_bf16(rounds):
+    """Whether this machine is faster in bf16; else it was not timed."""
+    return any(", bf16" in name for name in rounds[0]["seconds"])
 
 
 def updates(all_rounds):
@@ -183,14 +193,15 @@ def updates(all_rounds):
         plain, tuned = (lambda x, kind=kind: min(x["jax"][kind].values()) for kind in ("plain", "tuned"))
         best = lambda x: min(plain(x), tuned(x))
         ratio = lambda over, under: f"{median(rounds, lambda x: over(x) / under(x)):.2f} ×"
+        rounding = [ms(bf16), ratio(best, bf16)] if has_bf16(rounds) else ["", ""]
         share = median(rounds, lambda x: work.bound(x["peak"]) / ours(x))
         rows.append(
             [name, ms(lambda x: work.bound(x["peak"])), ms(ours), f"{100 * share:.0f} %", ms(plain), ratio(plain, ours)]
-            + [ms(tuned), ratio(tuned, ours), ms(bf16), ratio(best, bf16)]
+            + [ms(tuned), ratio(tuned, ours), *rounding]
         )
     for name in ALONE:
         rounds = all_rounds[name]
-        rows.append([name, "", ms(ours), "", "", "", "", "", ms(bf16), ""])
+        rows.append([name, "", ms(ours), "", "", "", "", "", ms(bf16) if has_bf16(rounds) else "", ""])
     table(*rows)
 
 
@@ -225,7 +236,7 @@ def rollouts(rounds):
     head = "ten Hopper episodes | environment steps/s | over JAX | step of all ten | its policy"
     rows = [head.split(" | ") + ["network and physics at their best", "over that"]]
     rows.append(["JAX, one at a time", f"{median(rounds, lambda x: 1 / jax(x)):.0f}", "", "", "", "", ""])
-    for name in "f32", "bf16":
+    for name in (name for name in ("f32", "bf16") if f"select/{name}" in rounds[0]["seconds"]):
         step = lambda x: x["seconds"][f"rollout/{ROLLOUT_STEPS} steps, {name}"] / ROLLOUT_STEPS
         bound = lambda x: work.bound(x["peak"]) + physics(x)
         row = [f"evaluator, {name}", f"{median(rounds, lambda x: EPISODES / step(x)):.0f}"]

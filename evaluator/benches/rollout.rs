@@ -18,6 +18,12 @@ const EPISODES: usize = 10;
 const CANDIDATES: u32 = 10;
 /// Steps from the episodes' beginning, few enough that none falls over.
 const STEPS: usize = 4;
+
+/// What this CPU computes in.
+fn precisions() -> impl Iterator<Item = Precision> {
+    [Precision::F32, Precision::Bf16].into_iter().filter(|precision| precision.is_available())
+}
+
 /// A policy of the paper's shape with random weights, as an evaluator gets it.
 fn policy(precision: Precision) -> Box<dyn Policy> {
     let shape = DiffusionShape::quad((11, 3), &MlpConfig::mish(&[256; 3]), 10, 5);
@@ -38,9 +44,9 @@ fn policy(precision: Precision) -> Box<dyn Policy> {
 fn steps(criterion: &mut Criterion) {
     let seeds: Vec<u64> = (0..EPISODES as u64).collect();
     let mut group = criterion.benchmark_group("rollout");
-    for (name, precision) in [("f32", Precision::F32), ("bf16", Precision::Bf16)] {
+    for precision in precisions() {
         let policy = policy(precision);
-        group.bench_function(format!("{STEPS} steps, {name}"), |bencher| {
+        group.bench_function(format!("{STEPS} steps, {}", precision.name()), |bencher| {
             bencher.iter_batched_ref(
                 || {
                     Rollout::new(|| Simulations.make("hopper", 0), (11, 3), &seeds, |seed| policy.begin(seed))
@@ -71,10 +77,10 @@ fn select(criterion: &mut Criterion) {
     let observations: Vec<f32> = (0..EPISODES * 11).map(|_| random.random_range(-1.0..1.0)).collect();
     let mut actions = vec![0.0; EPISODES * 3];
     let mut group = criterion.benchmark_group("select");
-    for (name, precision) in [("f32", Precision::F32), ("bf16", Precision::Bf16)] {
+    for precision in precisions() {
         let policy = policy(precision);
         let mut states: Vec<EpisodeState> = (0..EPISODES as u64).map(|seed| policy.begin(seed)).collect();
-        group.bench_function(name, |bencher| {
+        group.bench_function(precision.name(), |bencher| {
             bencher.iter(|| rayon::scope(|_| policy.act(&observations, &mut states, &mut actions)));
             black_box(&actions);
         });

@@ -6,11 +6,10 @@
 
 use criterion::measurement::WallTime;
 use criterion::{BenchmarkGroup, BenchmarkId, Criterion, Throughput, criterion_group, criterion_main};
-use gemm::{Parallelism, gemm};
 use quad_kernels::Buffer;
 use quad_kernels::activation::Activation::Mish;
 use quad_kernels::activation::{activate, activate_with_slope};
-use quad_kernels::product::{Rounded, outer, product, product_transposed};
+use quad_kernels::product::{Matrix, Rounded, by_gemm, outer, product, product_transposed};
 use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 use std::time::Duration;
@@ -18,13 +17,6 @@ use std::time::Duration;
 /// Right-hand sides that take turns: the hidden layers of ten critics, which come from a cache that cores share. So do the
 /// results of outer products, the gradients of as many layers.
 const IN_TURN: usize = 20;
-
-/// A matrix and its transpose have the same elements at other distances.
-#[derive(Clone, Copy)]
-enum Order {
-    RowMajor,
-    Transposed,
-}
 
 /// `len` numbers from a cache line on, as the networks keep them.
 fn numbers(len: usize, seed: usize) -> Buffer {
@@ -40,26 +32,6 @@ fn zeros(len: usize) -> Buffer {
     buffer
 }
 
-/// `out[m × n] = a[m × k] · b[k × n]`, where either may be stored as its transpose.
-fn by_gemm([m, k, n]: [usize; 3], a: (&[f32], Order), b: (&[f32], Order), out: &mut [f32]) {
-    assert!(a.0.len() == m * k && b.0.len() == k * n && out.len() == m * n, "the product's shape");
-    /// Distances between columns and between rows.
-    fn strides(order: Order, rows: usize, columns: usize) -> (isize, isize) {
-        match order {
-            Order::RowMajor => (1, columns as isize),
-            Order::Transposed => (rows as isize, 1),
-        }
-    }
-    let (a_strides, b_strides) = (strides(a.1, m, k), strides(b.1, k, n));
-    let (no, one) = (false, Parallelism::None);
-    // SAFETY: the three slices are of these shapes, and `out` is borrowed exclusively.
-    unsafe {
-        let (a, b, out) = (a.0.as_ptr(), b.0.as_ptr(), out.as_mut_ptr());
-        let ((a_column, a_row), (b_column, b_row)) = (a_strides, b_strides);
-        gemm(m, n, k, out, 1, n as isize, no, a, a_column, a_row, b, b_column, b_row, 0.0, 1.0, no, no, no, one);
-    }
-}
-
 fn group<'a>(criterion: &'a mut Criterion, name: &str, elements: usize) -> BenchmarkGroup<'a, WallTime> {
     let mut group = criterion.benchmark_group(name);
     group.sample_size(20).warm_up_time(Duration::from_millis(200)).measurement_time(Duration::from_millis(800));
@@ -70,11 +42,16 @@ fn group<'a>(criterion: &'a mut Criterion, name: &str, elements: usize) -> Bench
 /// Of the right-hand side of that number: its left and right side, and the result.
 type Product<'a> = &'a dyn Fn(usize, &[f32], &[f32], &mut [f32]);
 
+/// How a slice is taken.
+type Side = for<'a> fn(&'a [f32]) -> Matrix<'a>;
+const AS_IT_IS: Side = |elements| Matrix::RowMajor(elements);
+const TRANSPOSED: Side = |elements| Matrix::TransposeOf(elements);
+
 /// One of our products beside gemm's.
 fn compare(
     criterion: &mut Criterion,
     (name, [m, k, n]): (&str, [usize; 3]),
-    (a_order, b_order, outs): (Order, Order, usize),
+    (left_side, right_side, outs): (Side, Side, usize),
     ours: Product<'_>,
 ) {
     let mut group = group(criterion, name, 2 * m * k * n);
@@ -83,7 +60,7 @@ fn compare(
     let right: Vec<_> = (1..=IN_TURN).map(|seed| numbers(k * n, seed)).collect();
     let mut outs: Vec<_> = (0..outs).map(|_| zeros(m * n)).collect();
     let count = outs.len();
-    let by_gemm = |_, a: &[f32], b: &[f32], out: &mut [f32]| by_gemm([m, k, n], (a, a_order), (b, b_order), out);
+    let by_gemm = |_, a: &[f32], b: &[f32], out: &mut [f32]| by_gemm([m, k, n], left_side(a), right_side(b), out);
     let both: [(&str, Product<'_>); 2] = [("ours", ours), ("gemm", &by_gemm)];
     for (sides, (name, work)) in [1, IN_TURN].into_iter().flat_map(|sides| both.map(|one| (sides, one))) {
         let mut turn = 0;
@@ -101,24 +78,24 @@ fn compare(
 /// and of the demonstration's, and the first layer.
 fn products(criterion: &mut Criterion) {
     for [m, k, n] in [[128, 256, 256], [128, 128, 128], [128, 11, 256]] {
-        let (name, orders) = (format!("product, {m} × {k} × {n}"), (Order::RowMajor, Order::RowMajor, 1));
+        let (name, orders) = (format!("product, {m} × {k} × {n}"), (AS_IT_IS, AS_IT_IS, 1));
         compare(criterion, (&name, [m, k, n]), orders, &|_, x, weights, out| product(x, weights, out, k, n));
     }
     for [m, k, n] in [[128, 256, 256], [128, 128, 128]] {
         let name = format!("product with the transpose, {m} × {n} × {k}");
-        let orders = (Order::RowMajor, Order::Transposed, 1);
+        let orders = (AS_IT_IS, TRANSPOSED, 1);
         compare(criterion, (&name, [m, n, k]), orders, &|_, g, weights, out| product_transposed(g, weights, out, k, n));
     }
     for [m, k, n] in [[128, 256, 256], [256, 256, 256], [128, 128, 128]] {
         let name = format!("outer product of {m} rows, {k} × {n}");
-        let orders = (Order::Transposed, Order::RowMajor, IN_TURN);
+        let orders = (TRANSPOSED, AS_IT_IS, IN_TURN);
         compare(criterion, (&name, [k, m, n]), orders, &|_, x, g, out| outer(x, g, out, k, n));
     }
     // The library has no product of rounded operands and multiplies in f32; nor has a CPU that gains nothing by it.
     for [m, k, n] in [[32, 256, 256], [32, 128, 128]] {
         let round = |seed| Rounded::new(numbers(k * n, seed).first(k * n), k, n);
         let Some(rounded) = (1..=IN_TURN).map(round).collect::<Option<Vec<_>>>() else { return };
-        let (name, orders) = (format!("bf16 product, {m} × {k} × {n}"), (Order::RowMajor, Order::RowMajor, 1));
+        let (name, orders) = (format!("bf16 product, {m} × {k} × {n}"), (AS_IT_IS, AS_IT_IS, 1));
         compare(criterion, (&name, [m, k, n]), orders, &|i, x, _, out| rounded[i].product(x, out));
     }
 }

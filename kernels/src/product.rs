@@ -15,42 +15,50 @@ use crate::avx512;
 pub use crate::avx512::bf16::Rounded;
 use crate::level::Level;
 
-/// A row-major matrix or its transpose, as `gemm` wants it: first element, column stride, row stride.
-type Operand = (*const f32, isize, isize);
+/// The left or right side of a product.
+#[derive(Clone, Copy)]
+pub enum Matrix<'a> {
+    /// Of these elements, row by row.
+    RowMajor(&'a [f32]),
+    /// The transpose of the matrix that has these elements, row by row.
+    TransposeOf(&'a [f32]),
+}
 
-fn multiply(m: usize, n: usize, k: usize, out: &mut [f32], a: Operand, b: Operand) {
+/// First element, column stride, row stride.
+type Strided = (*const f32, isize, isize);
+
+impl Matrix<'_> {
+    /// # Panics
+    /// If it has not `rows × columns` elements.
+    fn strided(self, rows: usize, columns: usize) -> Strided {
+        let (elements, column, row) = match self {
+            Self::RowMajor(elements) => (elements, 1, columns),
+            Self::TransposeOf(elements) => (elements, rows, 1),
+        };
+        assert_eq!(elements.len(), rows * columns, "operands of a product");
+        (elements.as_ptr(), column as isize, row as isize)
+    }
+}
+
+/// `out[m × n] = a[m × k] · b[k × n]`, as the crate `gemm` does it with the instructions in use ([`Level`]).
+///
+/// # Panics
+/// If an operand has another number of elements.
+pub fn by_gemm([m, k, n]: [usize; 3], a: Matrix, b: Matrix, out: &mut [f32]) {
+    let (a, b) = (a.strided(m, k), b.strided(k, n));
     assert_eq!(out.len(), m * n, "the product's shape");
     #[cfg(target_arch = "x86_64")]
     if Level::in_use() == Level::Avx2
         && let Some(avx2) = <V3 as MixedSimd<f32, f32, f32, f32>>::try_new()
     {
-        // SAFETY: as below.
-        return unsafe { multiply_by_avx2(avx2, [m, n, k], out, a, b) };
+        // SAFETY: the operands span m × k and k × n elements, `out` is an exclusive slice of m × n.
+        return unsafe { by_avx2(avx2, [m, n, k], out, a, b) };
     }
-    // SAFETY: the three callers below check that `a` spans m × k and `b` k × n elements with these strides, and
-    // `out` is an exclusive slice of m × n.
+    let (no, one) = (false, Parallelism::None);
+    // SAFETY: as above.
     unsafe {
-        gemm(
-            m,
-            n,
-            k,
-            out.as_mut_ptr(),
-            1,
-            n as isize,
-            false,
-            a.0,
-            a.1,
-            a.2,
-            b.0,
-            b.1,
-            b.2,
-            0.0,
-            1.0,
-            false,
-            false,
-            false,
-            Parallelism::None,
-        );
+        let out = out.as_mut_ptr();
+        gemm(m, n, k, out, 1, n as isize, no, a.0, a.1, a.2, b.0, b.1, b.2, 0.0, 1.0, no, no, no, one);
     }
 }
 
@@ -59,7 +67,7 @@ fn multiply(m: usize, n: usize, k: usize, out: &mut [f32], a: Operand, b: Operan
 /// # Safety
 /// The matrices must span that many elements.
 #[cfg(target_arch = "x86_64")]
-unsafe fn multiply_by_avx2(avx2: V3, [m, n, k]: [usize; 3], out: &mut [f32], a: Operand, b: Operand) {
+unsafe fn by_avx2(avx2: V3, [m, n, k]: [usize; 3], out: &mut [f32], a: Strided, b: Strided) {
     use gemm_f32::microkernel::fma::f32::{H_M, H_N, H_UKR, MR_DIV_N, NR, UKR};
     const LANES: usize = 8;
     let (no, one) = (false, Parallelism::None);
@@ -96,15 +104,16 @@ unsafe fn multiply_by_avx2(avx2: V3, [m, n, k]: [usize; 3], out: &mut [f32], a: 
 }
 
 /// By AVX-512 where the CPU has it and the result is whole blocks wide, else by `gemm`.
-fn multiply_row_major(m: usize, n: usize, k: usize, out: &mut [f32], a: Operand, b: &[f32]) {
+fn multiply([m, k, n]: [usize; 3], a: Matrix, b: &[f32], out: &mut [f32]) {
     #[cfg(target_arch = "x86_64")]
     if avx512::serves(n) {
+        let ((first, column, row), b) = (a.strided(m, k), Matrix::RowMajor(b).strided(k, n));
+        let a = avx512::Strided { first, row: row as usize, column: column as usize };
         assert_eq!(out.len(), m * n, "the product's shape");
-        let a = avx512::Strided { first: a.0, row: a.2 as usize, column: a.1 as usize };
-        // SAFETY: as in `multiply`.
-        return unsafe { avx512::multiply(m, n, k, a, b.as_ptr(), out.as_mut_ptr()) };
+        // SAFETY: as in `by_gemm`.
+        return unsafe { avx512::multiply(m, n, k, a, b.0, out.as_mut_ptr()) };
     }
-    multiply(m, n, k, out, a, (b.as_ptr(), 1, n as isize));
+    by_gemm([m, k, n], a, Matrix::RowMajor(b), out);
 }
 
 /// Whether this CPU multiplies rounded operands ([`Rounded`]), and faster than in f32.
@@ -128,9 +137,7 @@ pub fn instructions(rounded: bool) -> &'static str {
 
 /// `out[m × n] = x[m × k] · w[k × n]`.
 pub fn product(x: &[f32], w: &[f32], out: &mut [f32], k: usize, n: usize) {
-    let m = x.len() / k;
-    assert!(x.len() == m * k && w.len() == k * n, "operands of a product");
-    multiply_row_major(m, n, k, out, (x.as_ptr(), 1, k as isize), w);
+    multiply([x.len() / k, k, n], Matrix::RowMajor(x), w, out);
 }
 
 /// There are none where no such CPU is.
@@ -151,21 +158,19 @@ impl Rounded {
 /// `out[m × k] = g[m × n] · w[k × n]ᵀ`: a gradient's backward pass through `product`.
 pub fn product_transposed(g: &[f32], w: &[f32], out: &mut [f32], k: usize, n: usize) {
     let m = g.len() / n;
-    assert!(g.len() == m * n && w.len() == k * n, "operands of a product");
     #[cfg(target_arch = "x86_64")]
     if avx512::serves(n) && avx512::serves(k) {
+        assert!(g.len() == m * n && w.len() == k * n, "operands of a product");
         assert_eq!(out.len(), m * k, "the product's shape");
-        // SAFETY: as in `multiply`.
+        // SAFETY: as in `by_gemm`.
         return unsafe { avx512::multiply_transposed(m, k, n, g.as_ptr(), w.as_ptr(), out.as_mut_ptr()) };
     }
-    multiply(m, k, n, out, (g.as_ptr(), 1, n as isize), (w.as_ptr(), n as isize, 1));
+    by_gemm([m, n, k], Matrix::RowMajor(g), Matrix::TransposeOf(w), out);
 }
 
 /// `out[k × n] = x[m × k]ᵀ · g[m × n]`: the gradient of `w` in `product`.
 pub fn outer(x: &[f32], g: &[f32], out: &mut [f32], k: usize, n: usize) {
-    let m = x.len() / k;
-    assert!(x.len() == m * k && g.len() == m * n, "operands of a product");
-    multiply_row_major(k, n, m, out, (x.as_ptr(), k as isize, 1), g);
+    multiply([k, x.len() / k, n], Matrix::TransposeOf(x), g, out);
 }
 
 #[cfg(test)]

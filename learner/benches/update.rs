@@ -6,9 +6,9 @@
 use candle_core::{Result, Tensor};
 use criterion::measurement::WallTime;
 use criterion::{BenchmarkGroup, Criterion, criterion_group, criterion_main};
-use gemm::{Parallelism, gemm};
 use quad_dataset::{Arrays, Transitions};
 use quad_kernels::activation::{Activation, activate, activate_with_slope};
+use quad_kernels::product::{Matrix::RowMajor, by_gemm};
 use quad_learner::algorithms::Context;
 use quad_learner::config::{Device, Experiment, resolve};
 use quad_learner::train::agent::Agent;
@@ -75,7 +75,10 @@ fn transitions(count: usize) -> Transitions {
 
 fn updates(criterion: &mut Criterion) {
     let (cpu, f32) = (Device::Cpu, Precision::F32);
-    let mut groups = vec![("update", cpu, f32), ("update, bf16", cpu, Precision::Bf16)];
+    let mut groups = vec![("update", cpu, f32)];
+    if Precision::Bf16.is_available() {
+        groups.push(("update, bf16", cpu, Precision::Bf16));
+    }
     // An update ends with its numbers on the host, so that nothing of it is left for the GPU to do.
     if cfg!(feature = "cuda") {
         groups.push(("update on cuda", Device::Cuda, f32));
@@ -105,14 +108,8 @@ fn peaks(criterion: &mut Criterion) {
     let mut tiles: Vec<_> =
         threads.clone().map(|_| (numbers(rows * width), numbers(width * width), vec![0.0_f32; rows * width])).collect();
     let product = |(x, w, out): &mut (Vec<f32>, Vec<f32>, Vec<f32>)| {
-        let (row, n) = (width as isize, width);
         for _ in 0..REPEAT {
-            // SAFETY: `out` and `x` are rows × width, `w` is width × width, all row-major.
-            unsafe {
-                let (out, x, w) = (out.as_mut_ptr(), x.as_ptr(), w.as_ptr());
-                let (no, one) = (false, Parallelism::None);
-                gemm(rows, n, n, out, 1, row, no, x, 1, row, w, 1, row, 0.0, 1.0, no, no, no, one);
-            }
+            by_gemm([rows, width, width], RowMajor(x), RowMajor(w), out);
         }
     };
     group.bench_function("product", |bencher| bencher.iter(|| tiles.par_iter_mut().for_each(product)));
