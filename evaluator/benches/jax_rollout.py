@@ -42,7 +42,7 @@ def main():
     @jax.jit
     def act(actor, critics, observation, key):
         actions, states = sample(actor, observation[None], jax.random.normal(key, (steps, 1, candidates, a)))
-        return actions[0, networks.values(critics, states, actions).mean(0)[0].argmax()]
+        return actions[0, networks.values(critics, states, actions, "mish").mean(0)[0].argmax()]
 
     environment, key = gymnasium.make("Hopper-v4"), jax.random.key(0)
     observation, _ = environment.reset(seed=0)

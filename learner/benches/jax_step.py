@@ -46,9 +46,10 @@ jax.config.update("jax_disable_most_optimizations", False)
 
 # As in learner/benches/update.rs. The demonstration's η is constant, so its actor predicts once, not twice.
 CONFIGURATIONS = {
-    "paper, 10 samples": {"hidden": 256, "critics": 10, "samples": 10},
-    "paper, 1 sample": {"hidden": 256, "critics": 10, "samples": 1},
-    "demo": {"hidden": 128, "critics": 5, "samples": 1, "eta": {"initial": 1.0}},
+    "paper, 10 samples": {"critics": 10, "samples": 10},
+    "paper, 1 sample": {"critics": 10, "samples": 1},
+    "demo": {name: networks.shape([128] * 3) for name in ("actor", "critic")}
+    | {"critics": 5, "samples": 1, "eta": {"initial": 1.0}},
 }
 
 
@@ -72,7 +73,7 @@ def sample(actor, states, noise):
     states = jnp.broadcast_to(states[:, None], noise.shape[1:-1] + states.shape[-1:])
     actions = noise[0]
     for t in range(steps, 0, -1):
-        epsilon = diffusion.predict_noise(actor, states, actions, jnp.full(states.shape[:-1], t))
+        epsilon = diffusion.predict_noise(actor, states, actions, jnp.full(states.shape[:-1], t), "mish")
         x0 = jnp.clip((actions - np.sqrt(1 - alpha_bar[t]) * epsilon) / np.sqrt(alpha_bar[t]), -1, 1)
         of_x0 = np.sqrt(alpha_bar[t - 1]) * beta[t] / (1 - alpha_bar[t])
         of_noisy = np.sqrt(1 - beta[t]) * (1 - alpha_bar[t - 1]) / (1 - alpha_bar[t])
@@ -86,7 +87,7 @@ def action_gradients(critics, states, actions):
     """∂Q_k/∂a for each critic and row, [K, B, a]."""
 
     def total(critic, actions):
-        return networks.mlp(critic, "", 4, jnp.concatenate([states, actions], -1)).sum()
+        return networks.mlp(critic, "", "mish", jnp.concatenate([states, actions], -1)).sum()
 
     return jax.vmap(jax.grad(total, 1), (0, None))(critics, actions)
 
@@ -111,9 +112,9 @@ def descend(config, state, name, gradients):
 def guide(agent, state, inputs, noisy, target_critic):
     """λ [B, 1], ḡ [B, a] and ν̂², Eq. 10 and 21-24."""
     s, rate, nu_squared = inputs["observations"], agent["nu_ema_rate"], state["nu_squared"]
-    q_scale = jnp.abs(networks.values(target_critic, s, inputs["actions"])).mean() + 1e-6
+    q_scale = jnp.abs(networks.values(target_critic, s, inputs["actions"], "mish")).mean() + 1e-6
     g = action_gradients(target_critic, s, noisy) / q_scale
-    predicted = diffusion.predict_noise(state["actor"], s, noisy, inputs["t"])
+    predicted = diffusion.predict_noise(state["actor"], s, noisy, inputs["t"], "mish")
     u = predicted / (jnp.linalg.norm(predicted, axis=-1, keepdims=True) + 1e-8)
     alignment = (u * g).sum(-1)  # [K, B]
     batch_nu = alignment.mean(0).var()
@@ -130,16 +131,16 @@ def step(config, state, inputs):
 
     # Critics, Eq. 20.
     next_actions, next_states = sample(state["target_actor"], inputs["next_observations"], inputs["next_noise"])
-    q = networks.values(state["target_critic"], next_states, next_actions).mean(-1)  # [K, B]
+    q = networks.values(state["target_critic"], next_states, next_actions, "mish").mean(-1)  # [K, B]
     targets = inputs["rewards"] + agent["gamma"] * inputs["masks"] * (q.mean(0) - agent["rho"] * q.std(0))
-    new = descend(config, state, "critic", jax.grad(quad.critic_loss)(state["critic"], s, a, targets))
+    new = descend(config, state, "critic", jax.grad(quad.critic_loss)(state["critic"], s, a, targets, "mish"))
     new["target_critic"] = networks.follow(state["target_critic"], new["critic"], agent["ema_rate"])
 
     # Actor, Eq. 5 and 19.
     noise_level = jnp.sqrt(1 - alpha_bar[t])[:, None]
     noisy = jnp.sqrt(alpha_bar[t])[:, None] * a + noise_level * epsilon
     weights, gradient, new["nu_squared"] = guide(agent, state, inputs, noisy, new["target_critic"])
-    arguments = (s, noisy, t, epsilon, state["eta"][0], weights * noise_level, gradient)
+    arguments = (s, noisy, t, epsilon, state["eta"][0], weights * noise_level, gradient, "mish")
     gradients, _ = jax.grad(quad.actor_loss, has_aux=True)(state["actor"], *arguments)
     new |= descend(config, state, "actor", gradients)
 
@@ -246,7 +247,7 @@ def check():
     worst = 0.0
     # In the first, both gradients are clipped and the target actor moves; in the second it does not.
     for name, mish in ("quad", networks.mish), ("ten-critics", networks.mish), ("quad", tuned_mish):
-        networks.mish = mish
+        networks.ACTIVATIONS["mish"] = mish
         folder = GOLDEN / name
         config = json.loads((folder / "config.json").read_text())
         start, inputs, expected = (load_file(folder / f"{x}.safetensors") for x in ("state", "inputs", "expected"))
@@ -279,7 +280,7 @@ def main():
     if arguments.check:
         return check()
     if arguments.tuned:
-        networks.mish = tuned_mish
+        networks.ACTIVATIONS["mish"] = tuned_mish
     names = map(str.strip, sys.stdin) if arguments.serve else CONFIGURATIONS
     for name in names:
         runs = ways(name)

@@ -15,6 +15,10 @@ const FRESH_TOLERANCE: f32 = 1e-2;
 #[allow(dead_code)] // not every crate makes some
 const FRESH_SEED: &str = "1000";
 
+/// The script that makes golden folders.
+#[allow(dead_code)] // not every crate makes some
+pub const MAKE: &str = "tests/golden/make.py";
+
 /// A golden folder.
 pub struct Golden {
     pub folder: PathBuf,
@@ -26,11 +30,11 @@ pub struct Golden {
     tolerance: f32,
 }
 
-/// Runs tests/golden/make.py. Without the Python that deploy/setup.sh --tests sets up it is skipped, unless
-/// QUAD_REQUIRE_PEERS=1 asks for it; says whether it ran.
-#[allow(dead_code)] // not every crate makes some
+/// Runs a script of the repository that needs JAX; says whether it ran. Without the Python that deploy/setup.sh --tests sets up it
+/// is skipped, unless QUAD_REQUIRE_PEERS=1 asks for it.
+#[allow(dead_code)] // not every crate runs some
 #[allow(clippy::print_stderr)] // what is skipped is said
-pub fn make(arguments: &[&str]) -> bool {
+pub fn run(script: &str, arguments: &[&str]) -> bool {
     let home = Path::new(env!("CARGO_MANIFEST_DIR")).join("..");
     let python = std::env::var_os("QUAD_PYTHON").map_or(home.join(".deps/venv/bin/python"), PathBuf::from);
     let has_jax = Command::new(&python).args(["-c", "import jax, safetensors"]).output();
@@ -41,9 +45,9 @@ pub fn make(arguments: &[&str]) -> bool {
         eprintln!("skipped, because {} has no jax; {remedy}", python.display());
         return false;
     }
-    let output = Command::new(python).arg(home.join("tests/golden/make.py")).args(arguments).output().unwrap();
+    let output = Command::new(python).arg(home.join(script)).args(arguments).output().unwrap();
     let text = String::from_utf8_lossy(&output.stdout) + String::from_utf8_lossy(&output.stderr);
-    assert!(output.status.success(), "make.py {}: {text}", arguments.join(" "));
+    assert!(output.status.success(), "{script} {}: {text}", arguments.join(" "));
     true
 }
 
@@ -52,7 +56,7 @@ pub fn make(arguments: &[&str]) -> bool {
 pub fn fresh(variant: &str) -> Option<Golden> {
     let seed = std::env::var("GOLDEN_SEED").unwrap_or_else(|_| FRESH_SEED.to_owned());
     let folder = std::env::temp_dir().join(format!("golden-{variant}-{seed}-{}", std::process::id()));
-    if !make(&["--seed", &seed, "--variant", variant, "--out", folder.to_str().unwrap()]) {
+    if !run(MAKE, &["--seed", &seed, "--variant", variant, "--out", folder.to_str().unwrap()]) {
         return None;
     }
     let golden = Golden::open(folder);

@@ -15,7 +15,7 @@ use quad_policy::{
     Choice, Ensemble, Header, Layout, NoisePredictor, PolicyConfig, Precision, Tensors, Weights, load_policy,
     read_tensors,
 };
-pub(super) use reader::{Golden, fresh, goldens, make};
+pub(super) use reader::{Golden, MAKE, fresh, goldens, run};
 
 /// Where updates are tested: on the CPU, and on a GPU with the feature `cuda`. Without a GPU that share is skipped,
 /// unless QUAD_REQUIRE_PEERS=1 asks for one.

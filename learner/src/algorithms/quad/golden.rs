@@ -2,7 +2,7 @@
 
 use super::*;
 use crate::algorithms::golden::{
-    Golden, batch, chain_noise, check_update, context, denoising, devices, fresh, goldens, load, table,
+    Golden, batch, chain_noise, check_update, context, denoising, devices, fresh, goldens, load, run, table,
 };
 use crate::algorithms::hyperparameters::{NotNegative, Positive};
 use candle_core::{DType, Device};
@@ -170,4 +170,10 @@ fn an_infinite_temperature_is_dac() {
         quad.step(0, &batch, &noise).unwrap()
     });
     assert_eq!(quad, dac);
+}
+
+/// What `deploy/bench.sh` sets the learner beside does the work that the learner does.
+#[test]
+fn golden_peer_of_the_benchmarks() {
+    run("learner/benches/jax_step.py", &["--check"]);
 }
