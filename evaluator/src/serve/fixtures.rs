@@ -1,4 +1,4 @@
-//! What tests of this room are made of.
+//! Data for the tests of this module.
 
 use candle_core::{DType, Device, Tensor};
 use quad_policy::{
@@ -22,7 +22,7 @@ pub fn job() -> Job {
     }
 }
 
-/// A snapshot of this file.
+/// A snapshot with this file.
 pub fn snapshot(file: Vec<u8>) -> Snapshot {
     Snapshot { run: job().run, incarnation: 1, step: 1, hash: Hash::of(&file), file }
 }

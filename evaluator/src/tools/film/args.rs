@@ -1,4 +1,4 @@
-//! What `evaluator film` is asked for.
+//! The arguments of `evaluator film`.
 
 use std::path::PathBuf;
 

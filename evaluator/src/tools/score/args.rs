@@ -1,4 +1,4 @@
-//! What `evaluator score` is asked for.
+//! The arguments of `evaluator score`.
 
 use std::path::PathBuf;
 
@@ -7,9 +7,9 @@ use quad_dataset::EnvironmentSpec;
 use quad_dataset::environment;
 use quad_policy::{Choice, Precision, Reduce, Rule};
 
-/// Most episodes: far above any use, low enough for memory.
+/// Most episodes: far above any use, but few enough for memory.
 pub const MOST_EPISODES: i64 = 10_000;
-/// [`Choice::MOST_CANDIDATES`], as clap takes it.
+/// [`Choice::MOST_CANDIDATES`], in clap's type.
 const MOST_CANDIDATES: i64 = Choice::MOST_CANDIDATES as i64;
 
 const AFTER_HELP: &str = "\
