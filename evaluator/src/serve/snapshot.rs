@@ -75,7 +75,7 @@ struct State {
     /// The learner whose snapshots are kept.
     incarnation: AtomicU64,
     has_news: AtomicBool,
-    /// The log gets one line per bad snapshot; the metric counts all.
+    /// Whether a bad snapshot was logged as a warning; further ones are only counted.
     warned: AtomicBool,
 }
 
