@@ -22,9 +22,9 @@ const ANSWER: Duration = Duration::from_secs(5);
 const UPDATE: &str = "update the older program (--version tells); if the learner hangs, its log says why";
 
 const AFTER_HELP: &str = "\
-A line per check: ok, warn or FAIL, and a hint where there is something to do. The exit code is 1 if anything failed.";
+The evaluator prints a line per check: ok, warn or FAIL, with a hint if you can do something. The exit code is 1 if a check failed.";
 
-/// Check this machine before it evaluates anything, and say what to do about what is wrong
+/// Check this machine before it evaluates anything, and say how to fix what is wrong
 #[derive(Args, Debug)]
 #[command(after_help = AFTER_HELP)]
 pub struct DoctorArgs {
@@ -34,7 +34,7 @@ pub struct DoctorArgs {
     /// Folder with ca.pem, cert.pem and key.pem, for endpoints tls/HOST:PORT (docs/security.md)
     #[arg(long, value_name = "DIR", env = "QUAD_CERTIFICATES")]
     certificates: Option<PathBuf>,
-    /// Print a JSON array of objects with verdict, check, what and, where there is something to do, hint
+    /// Print a JSON array of objects with verdict, check, what and (if you can do something) hint
     #[arg(long)]
     pub json: bool,
 }

@@ -51,18 +51,18 @@ use evaluate::Evaluator;
 use worker::Worker;
 
 const AFTER_HELP: &str = "\
-The evaluator finds all runs at its endpoints, also those that start later, and serves them in turn. Stop it at any time
-(Ctrl-C or SIGTERM): its job goes to another evaluator.
+The evaluator finds all runs at its endpoints, also runs that start later, and serves them in turn. You may stop it at any time
+(Ctrl-C or SIGTERM): the learner gives its job to another evaluator.
 
 Examples:
-  evaluator serve                                       the learner of this machine
+  evaluator serve                                       a learner on this machine
   evaluator serve --connect tcp/learner.example:7447    a learner or router elsewhere
   evaluator serve --connect tls/learner.example:7447 --certificates certificates/box7    the same, by TLS
   evaluator serve --metrics 127.0.0.1:9101              with http://127.0.0.1:9101/metrics
 
-RAYON_NUM_THREADS sets how many processor cores are used; without it, all are.";
+RAYON_NUM_THREADS sets the number of processor cores; the default is all.";
 
-/// Measure the weights that learners publish, until told to stop
+/// Evaluate the snapshots that learners publish, until told to stop
 #[derive(Args, Debug)]
 #[command(after_help = AFTER_HELP)]
 pub struct ServeArgs {
@@ -70,17 +70,16 @@ pub struct ServeArgs {
     /// [default: tcp/127.0.0.1:7447, or tls/… with --certificates]
     #[arg(long, value_name = "ENDPOINT", value_parser = parse_endpoint)]
     pub connect: Vec<String>,
-    /// Folder with ca.pem, cert.pem and key.pem, with which this evaluator proves who it is at endpoints like tls/HOST:PORT
-    /// (docs/security.md)
+    /// Folder with ca.pem, cert.pem and key.pem, for endpoints tls/HOST:PORT (docs/security.md)
     #[arg(long, value_name = "DIR", env = "QUAD_CERTIFICATES")]
     pub certificates: Option<PathBuf>,
-    /// Where to serve /metrics and /healthz; port 0 takes a free one
+    /// Address of /metrics and /healthz; port 0 takes a free one
     #[arg(long, value_name = "ADDR:PORT")]
     pub metrics: Option<SocketAddr>,
     /// Name in scores and metrics, unique among the evaluators of a run [default: HOST-PID-RANDOM]
     #[arg(long, value_parser = |text: &str| Name::new(text))]
     pub name: Option<Name>,
-    /// Arithmetic of the networks, f32 or bf16, which rounds and is faster on CPUs with AMX or AMD's AVX512-BF16
+    /// Precision of the networks: f32, or bf16, which rounds and is faster on CPUs with AMX or AMD's AVX512-BF16
     #[arg(long, value_name = "NAME", default_value = "f32")]
     pub precision: Precision,
 }
@@ -171,7 +170,7 @@ fn keep_heap_small() {
     unsafe { libc::mallopt(libc::M_MMAP_THRESHOLD, LARGE_BLOCK) };
 }
 
-/// Host and process for people, a random part because containers share both.
+/// Host and process for readers, and a random part, because containers may share both.
 fn unique_name() -> anyhow::Result<Name> {
     let host = std::fs::read_to_string("/proc/sys/kernel/hostname").unwrap_or_default();
     let host: String = host.chars().filter(|c| c.is_ascii_alphanumeric() || *c == '-').take(40).collect();
