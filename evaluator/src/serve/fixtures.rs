@@ -32,7 +32,7 @@ pub fn smallest() -> DiffusionShape {
     DiffusionShape::quad((11, 3), &MlpConfig::mish(&[1]), 1, 1)
 }
 
-/// The file of a diffusion policy for an environment, all zero, that takes the best of so many candidates.
+/// The file of a diffusion policy for an environment, all zero, that takes the best of `candidates`.
 pub fn file(environment: &str, shape: DiffusionShape, candidates: u32) -> Vec<u8> {
     let zeros = |layout: Layout| {
         let values = Tensor::zeros(layout.count(), DType::F32, &Device::Cpu).unwrap();

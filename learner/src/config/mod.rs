@@ -4,10 +4,10 @@
 //! it, from any thread. Of the learner it imports only the list of [`algorithms`](crate::algorithms), whose hyper-parameters
 //! it checks.
 //!
-//! In reading order: `tasks` are what can be learnt, `hyperparameters` an algorithm's values for them, `presets` what a user
-//! begins from, by name or in a file; `experiment` is all of that, resolved; `run_config` is what a run's folder says of
-//! itself; `schedule` tells which steps are evaluated; `settings` compares two runs key by key; `device`, `nearest` and
-//! `tables` are small parts of these.
+//! In reading order: `tasks` are the tasks, `hyperparameters` an algorithm's values for them, `presets` the task or file from
+//! which a user starts; `experiment` is all of that, resolved; `run_config` is the content of `config.toml`; `schedule` tells
+//! which steps are evaluated; `settings` compares two runs key by key; `device`, `nearest` and `tables` are small parts of
+//! these.
 
 mod device;
 mod experiment;

@@ -34,7 +34,7 @@ pub(crate) struct Display {
 }
 
 impl Display {
-    /// Starts the display, for so many gradient steps.
+    /// Starts the display of a run with `steps` gradient steps.
     pub fn start(metrics: Metrics, steps: u64) -> Self {
         let bar = ProgressBar::with_draw_target(Some(steps), ProgressDrawTarget::stderr());
         // Without our style the bar still works, but shows less.

@@ -45,7 +45,7 @@ pub(super) struct JobAtWork {
 }
 
 impl Live {
-    /// The state of a run of so many gradient steps that is about to begin.
+    /// The state of a run of `steps` gradient steps that is about to begin.
     pub fn new(run: Name, steps: u64, metrics: Metrics, health: Health) -> Self {
         Self { run, steps, metrics, health, coordinator: Arc::default() }
     }

@@ -60,7 +60,7 @@ struct Started {
 }
 
 impl LocalEvaluators {
-    /// So many evaluators, not started yet, with so many cores for all of them together.
+    /// Prepares `count` evaluators, which share `cores` cores. Does not start them.
     ///
     /// # Errors
     /// There is no program `evaluator` beside this program, nor on the PATH.

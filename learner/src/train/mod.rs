@@ -6,7 +6,7 @@
 //!
 //! In reading order: `training` (the thread's work), `steps` (the loop), `agent` (an algorithm at work, saved and loaded),
 //! `device` (where it computes), `pool` (rayon's threads kept awake), `results`, `outbox`, `metrics`. Beside them, `price`
-//! foretells what a run costs, on the thread of its caller.
+//! estimates what a run costs, on its caller's thread.
 
 pub mod agent;
 mod device;

@@ -17,7 +17,7 @@ pub struct Recipe {
     pub mixture: &'static [(f64, f64)],
 }
 
-/// With so many transitions most searches move well, and a minute of two cores is over.
+/// With this many transitions most searches move well, after a minute on two cores.
 const MOST_TRANSITIONS: u64 = 100_000;
 
 /// The environments that linear policies learn to move in.

@@ -19,7 +19,7 @@ const COLOURS: usize = 64;
 /// Sampling of the first picture to choose colours: 1 is all of it, 10 a tenth.
 const SAMPLE: i32 = 10;
 
-/// Writes pictures, each shown for so many seconds.
+/// Writes pictures, each shown for `seconds`.
 ///
 /// # Errors
 /// A picture cannot be drawn, or the file cannot be written.

@@ -49,7 +49,7 @@ impl Episode {
         Ok(Self { seed, poses: poses.try_iter().collect(), gradient_step: subject.step, choice })
     }
 
-    /// Both columns of the caption after so many steps; later than the end, those of the end.
+    /// Both columns of the caption after `steps` steps; later than the end, those of the end.
     pub fn caption(&self, steps: usize) -> [String; 2] {
         let Self { gradient_step, choice, .. } = self;
         let step = if steps < self.length() { steps.to_string() } else { format!("{}, end", self.length()) };
@@ -57,7 +57,7 @@ impl Episode {
         [format!("trained {gradient_step}\nstep {step}"), format!("return {episode_return:.1}\n{choice}")]
     }
 
-    /// The pose after so many steps; later than the end, the last pose.
+    /// The pose after `steps` steps; later than the end, the last pose.
     pub fn pose(&self, steps: usize) -> &Pose {
         &self.poses[steps.min(self.length())]
     }

@@ -64,7 +64,7 @@ impl Layout {
         self.width as f64 / self.height as f64
     }
 
-    /// Width and height of the picture of so many episodes, pixels.
+    /// Width and height of the picture of several episodes, pixels.
     pub fn size(self, episodes: usize) -> (usize, usize) {
         if self.stacked { (self.width, self.height * episodes) } else { (self.width * episodes, self.height) }
     }

@@ -55,7 +55,7 @@ pub struct Stage {
 }
 
 impl Stage {
-    /// Builds the stage of an environment, for pictures of so many episodes.
+    /// Builds the stage of an environment, for pictures of several episodes.
     ///
     /// # Errors
     /// There is no OpenGL, or MuJoCo fails.
@@ -73,7 +73,7 @@ impl Stage {
         Ok(Self { context, scene, data, camera, layout, _gl: gl })
     }
 
-    /// The picture of all episodes after so many steps.
+    /// The picture of all episodes after `steps` steps.
     ///
     /// # Errors
     /// The pixels cannot be read.
