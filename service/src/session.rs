@@ -22,8 +22,8 @@ const MAX_SNAPSHOT_SIZE: u64 = 65 << 20;
 /// come, together with the buffer of 64 KiB in which it arrived, so fragments of one byte could fill any memory. Evaluators'
 /// messages have at most 30 KiB and need no fragments: one packet has space for 32,700 bytes on every network.
 const MAX_PIECED_REQUEST: u64 = 0;
-/// Most connections of a listening session; it refuses further ones. Each is an open file, and many systems allow a process
-/// 1024. The rest is for datasets, logs and metrics.
+/// Most connections of a listening session; it refuses further ones. Each is an open file, and a process may open 1024 files
+/// on many systems. The rest is for datasets, logs and metrics.
 const MAX_SESSIONS: u64 = 768;
 /// First and longest pause between two attempts to connect.
 const RETRY: [Duration; 2] = [Duration::from_millis(250), Duration::from_secs(2)];
