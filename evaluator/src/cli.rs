@@ -34,46 +34,46 @@ enum Command {
     Collect(CollectArgs),
     VerifyDataset(VerifyArgs),
     Doctor(DoctorArgs),
-    /// Print a script by which a shell completes this program's arguments
+    /// Print a script that lets a shell complete this program's arguments
     Completions {
         /// The shell
         shell: Shell,
     },
 }
 
-/// Record a dataset of mediocre behaviour to learn from, without downloading anything
+/// Record a dataset of mediocre behaviour to learn from, without a download
 ///
-/// Trains linear policies by augmented random search, from ones that fall over at once to ones that move well, and mixes
-/// noisy episodes of all of them into one file in D4RL's layout (HDF5; h5py reads it). One to two minutes on two cores. The
-/// same seed makes the same data.
+/// Trains linear policies by augmented random search, from policies that fall at once to policies that move well, and mixes
+/// noisy episodes of all of them into one file in D4RL's layout (HDF5). This takes one to two minutes on two cores. The same
+/// seed makes the same data.
 #[derive(Debug, Args)]
 struct CollectArgs {
     /// Environment to act in: hopper, halfcheetah or walker2d
     #[arg(long, value_name = "NAME", value_parser = collect::environment)]
     env: &'static EnvironmentSpec,
-    /// The file to write. It appears when it is complete
+    /// File to write; it appears when it is complete
     #[arg(long, value_name = "FILE")]
     out: PathBuf,
-    /// Transitions to record, at least: the last episode is recorded to its end
+    /// Least number of transitions; the last episode is recorded to its end
     #[arg(long, value_name = "N", default_value = "100000")]
     transitions: NonZeroUsize,
-    /// Seed of everything random
+    /// Seed of all random numbers
     #[arg(long, value_name = "N", default_value_t = 0)]
     seed: u64,
 }
 
-/// Replay a recorded file one step at a time from its own states, and say how far the simulation is from it
+/// Replay a recorded file one step at a time from its own states, and measure how far the simulation is from it
 ///
-/// The file needs infos/qpos, infos/qvel and, for a maze, infos/goal beside what is learned from. Without next_observations,
-/// the observation of the following row counts, as long as no episode ends between the two. Differences are reported, not
-/// judged: the exit code is 0 whenever the file could be replayed. A reward differs when it is more than 0.001 (relative,
-/// for rewards above 1) away from the recorded one, and further than the next observation, which rounding to float32 cannot
-/// explain.
+/// The file needs infos/qpos, infos/qvel and, for a maze, infos/goal in addition to the arrays for learning. Without
+/// next_observations, the replay compares with the observation of the following row of the same episode. It reports
+/// differences and does not judge them: the exit code is 0 whenever the file could be replayed. A reward differs if it is more
+/// than 0.001 (relative, for rewards above 1) from the recorded one, and further than the next observation, which rounding to
+/// float32 cannot explain.
 #[derive(Debug, Args)]
 struct VerifyArgs {
-    /// The file to replay
+    /// File to replay
     file: PathBuf,
-    /// Environment that it was recorded in [default: what the file says, or the only environment of its sizes]
+    /// Environment of the recording [default: the one that the file names, or the only environment of its sizes]
     #[arg(long, value_name = "NAME", value_parser = environment::find)]
     env: Option<&'static EnvironmentSpec>,
     /// Print one JSON object
@@ -82,7 +82,7 @@ struct VerifyArgs {
 }
 
 impl Cli {
-    /// Does what was asked for.
+    /// Runs the command.
     pub fn run(self) -> anyhow::Result<()> {
         match self.command {
             Command::Serve(args) => serve::serve(args, Arc::new(Simulations)),

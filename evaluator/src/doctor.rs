@@ -14,17 +14,17 @@ use crate::serve::DEFAULT_PORT;
 use crate::sim::{Environments, Rollout, Simulations};
 use crate::tools::film::{Gl, INSTALL};
 
-/// What is tried.
+/// The environment of the trial.
 const HOPPER: &str = "hopper";
-/// How long learners are waited for.
+/// How long the check waits for learners.
 const ANSWER: Duration = Duration::from_secs(5);
 
 const UPDATE: &str = "update the older program (--version tells); if the learner hangs, its log says why";
 
 const AFTER_HELP: &str = "\
-A line per check: ok, warn or FAIL, and a hint where there is something to do. The exit code is 1 if anything failed.";
+The evaluator prints a line per check: ok, warn or FAIL, with a hint if you can do something. The exit code is 1 if a check failed.";
 
-/// Check this machine before it evaluates anything, and say what to do about what is wrong
+/// Check this machine before it evaluates anything, and say how to fix what is wrong
 #[derive(Args, Debug)]
 #[command(after_help = AFTER_HELP)]
 pub struct DoctorArgs {
@@ -34,15 +34,15 @@ pub struct DoctorArgs {
     /// Folder with ca.pem, cert.pem and key.pem, for endpoints tls/HOST:PORT (docs/security.md)
     #[arg(long, value_name = "DIR", env = "QUAD_CERTIFICATES")]
     certificates: Option<PathBuf>,
-    /// Print a JSON array of objects with verdict, check, what and, where there is something to do, hint
+    /// Print a JSON array of objects with verdict, check, what and (if you can do something) hint
     #[arg(long)]
     pub json: bool,
 }
 
-/// Does all checks.
+/// Runs all checks.
 ///
 /// # Errors
-/// The checks cannot be done; what they find is no error.
+/// A check cannot run; a finding is no error.
 pub fn examine(args: &DoctorArgs) -> anyhow::Result<Findings> {
     let mut findings = Findings::default();
     doctor::threads(&mut findings);
@@ -61,7 +61,7 @@ pub fn examine(args: &DoctorArgs) -> anyhow::Result<Findings> {
     Ok(findings)
 }
 
-/// One step of one episode. Without any libmujoco this program would not have started.
+/// Runs one step of one episode. (Without any libmujoco this program would not have started.)
 fn simulator(findings: &mut Findings) {
     let version = mujoco_rs::mujoco_version();
     let step = || -> anyhow::Result<()> {
@@ -74,7 +74,7 @@ fn simulator(findings: &mut Findings) {
     }
 }
 
-/// The runs whose learners are there, and whether each speaks this program's version of the protocol.
+/// Lists the runs whose learners are connected, and checks that each speaks this program's version of the protocol.
 async fn runs(findings: &mut Findings, session: &Session) -> anyhow::Result<()> {
     let tokens = session.liveliness().get(keys::ALL_LEARNERS).timeout(ANSWER).await.map_err(anyhow::Error::msg)?;
     let mut found = false;
@@ -93,7 +93,7 @@ async fn runs(findings: &mut Findings, session: &Session) -> anyhow::Result<()> 
     Ok(())
 }
 
-/// Asks a run's learner for a job in no environment, so that there is none, and gives what is wrong with its answer.
+/// Asks a run's learner for a job in no environment, so that it gives none. Returns what is wrong with the answer.
 async fn ask(session: &Session, run: &Name) -> anyhow::Result<Option<String>> {
     let evaluator = Name::new(format!("doctor-{}", std::process::id()))?;
     let claim = encode(&JobRequest::Claim { evaluator, attempt: rand::random(), environments: Vec::new() })?;

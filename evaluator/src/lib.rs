@@ -1,15 +1,14 @@
-//! What an evaluator does: runs policies in MuJoCo, and records datasets there.
+//! The evaluator: runs policies in MuJoCo, and records datasets there.
 //!
 //! # Layout
 //!
-//! Three rooms, of which the later two use the first and never each other:
+//! Three modules. The second and third use the first, and not each other:
 //!
-//! - [`sim`]: the tasks and whole batches of their episodes.
+//! - [`sim`]: environments, and batches of episodes.
 //! - [`serve`]: finds runs on the network, evaluates their snapshots, delivers the scores.
-//! - [`tools`]: records datasets, replays them, scores saved policies, on this machine alone.
+//! - [`tools`]: records and replays datasets, scores and films saved policies, on this machine alone.
 //!
-//! Beside them: [`cli`], the command line; `doctor`, which checks this machine before it evaluates anything; `metrics`, what
-//! Prometheus is told.
+//! Also: [`cli`], the command line; `doctor`, checks of this machine; `metrics`, for Prometheus.
 
 pub mod cli;
 mod doctor;

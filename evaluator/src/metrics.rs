@@ -7,11 +7,11 @@ use prometheus::{Counter, Histogram, HistogramOpts, IntCounter, IntCounterVec, I
 /// How a job ended.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum JobOutcome {
-    /// Its scores were acknowledged.
+    /// The learner acknowledged its scores.
     Scored,
-    /// It was given up: this evaluator is leaving and hands it back, or the learner refused the scores or never came back.
+    /// The evaluator gave it up: it is leaving and hands the job back, or the learner refused the scores or never came back.
     Abandoned,
-    /// Its weights or its environment could not be used, or its policy could not act.
+    /// The evaluator could not use its weights or its environment, or the policy could not act.
     Failed,
 }
 
@@ -30,9 +30,9 @@ impl JobOutcome {
 /// The metrics of one evaluator process, in a registry of their own.
 #[derive(Clone)]
 pub struct Metrics {
-    /// What `/metrics` shows.
+    /// The registry that `/metrics` serves.
     pub registry: Registry,
-    /// Episodes finished, also those of jobs that were given up.
+    /// Episodes finished, in any job.
     pub episodes: IntCounter,
     /// Environment steps taken.
     pub environment_steps: IntCounter,
@@ -46,14 +46,14 @@ pub struct Metrics {
     pub select_seconds: Counter,
     /// Seconds spent in the physics.
     pub physics_seconds: Counter,
-    /// Runs that are being served.
+    /// Runs that the evaluator serves.
     pub runs: IntGauge,
     jobs: IntCounterVec,
     rejected_messages: IntCounterVec,
 }
 
 impl Metrics {
-    /// Registers every metric, and the process's own (`process_…`).
+    /// Registers all metrics, and those of the process (`process_…`).
     pub fn new() -> prometheus::Result<Metrics> {
         let registry = Registry::new();
         registry.register(Box::new(ProcessCollector::for_self()))?;
@@ -73,7 +73,7 @@ impl Metrics {
                 "quad_evaluator_snapshots_received_total",
                 "Weight snapshots received whole and verified",
             )?,
-            // 100 is an expert by the normalisation; the fine buckets are where training starts.
+            // A score of 100 is an expert; the fine buckets are for the start of training.
             episode_score: histogram(
                 "quad_evaluator_episode_score",
                 "Normalised score of each scored episode",
@@ -101,18 +101,18 @@ impl Metrics {
         Ok(metrics)
     }
 
-    /// Counts a job that is over.
+    /// Counts a job that has ended.
     pub fn job(&self, outcome: JobOutcome) {
         self.jobs.with_label_values(&[outcome.label()]).inc();
     }
 
-    /// Counts a message that was not used. The reasons are a fixed list, because every label stays in the registry.
+    /// Counts a message that the evaluator did not use. The reasons are a fixed list, because the registry keeps every label.
     pub fn rejected(&self, reason: &'static str) {
         self.rejected_messages.with_label_values(&[reason]).inc();
     }
 }
 
-/// Adds a metric to what `/metrics` shows.
+/// Adds a metric to the registry.
 fn register<M: Collector + Clone + 'static>(registry: &Registry, metric: M) -> prometheus::Result<M> {
     registry.register(Box::new(metric.clone()))?;
     Ok(metric)

@@ -1,18 +1,18 @@
-//! The learner: trains on a dataset, publishes snapshots, collects their scores, and keeps all of it in the run's folder.
+//! The learner: trains on a dataset, publishes snapshots, collects their scores, and keeps everything in the run's folder.
 //!
 //! # Layout
-//! In reading order, each room over those below it:
+//! In reading order; each module may use those below it:
 //!
-//! - `cli` is the command line, [`command`] goes from there to the exit.
-//! - `sweep` does many runs, each as a process.
+//! - `cli` is the command line; [`command`] runs a command, up to its exit code.
+//! - `sweep` runs many runs, each as a process.
 //! - `service` is a run at work: threads, main loop, Zenoh.
-//! - `page` shows runs to a browser.
-//! - `report` summarises scores as tables and as a picture.
+//! - `page` shows runs in a browser.
+//! - `report` summarises scores as tables and figures.
 //! - [`train`] makes gradient steps.
 //! - `run` is the folder of a run.
-//! - `evaluation` is what is to be scored and by which evaluator, without input or output.
-//! - `data` finds or fetches the data that a run learns from; [`config`] says what was asked for.
-//! - [`algorithms`]: each a file to be read beside its paper.
+//! - `evaluation` tracks which episodes wait for a score, and which evaluator has which. It does no input or output.
+//! - `data` finds or fetches the data that a run learns from; [`config`] has the settings of a run.
+//! - [`algorithms`]: one file each, to be read beside its paper.
 
 #![deny(unsafe_code)]
 

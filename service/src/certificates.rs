@@ -1,4 +1,4 @@
-//! The certificate by which a program shows what it is: three files that `deploy/zenoh/certificates.sh` makes.
+//! The certificate by which a program shows its role: three files that `deploy/zenoh/certificates.sh` makes.
 
 use std::fmt;
 use std::net::IpAddr;
@@ -17,10 +17,10 @@ use x509_parser::extensions::GeneralName;
 use x509_parser::prelude::{FromDer, X509Certificate};
 use x509_parser::time::ASN1Time;
 
-/// The authority that is trusted, the program's own certificate, and its private key.
+/// The trusted authority, the program's own certificate, and its private key.
 const FILES: [&str; 3] = ["ca.pem", "cert.pem", "key.pem"];
 
-/// A certificate that is valid for fewer days than this is worth a warning: people need time to renew it.
+/// The program warns about a certificate that is valid for fewer days than this: an operator needs time to renew it.
 const EXPIRES_SOON: i64 = 14;
 
 const HINT: &str = "--certificates takes a folder with ca.pem, cert.pem and key.pem that this user may read; \
@@ -55,7 +55,7 @@ impl Role {
 pub struct Certificates {
     folder: PathBuf,
     expires: ASN1Time,
-    /// The hosts at which clients may connect to its owner.
+    /// The hosts at which clients may connect to the certificate's owner.
     hosts: Vec<String>,
 }
 
@@ -80,8 +80,8 @@ impl CertificatesError {
 }
 
 impl Certificates {
-    /// Checks the files in `folder` as the other side of a connection would, and that the certificate is one of `role`;
-    /// logs until when it is valid.
+    /// Checks the files in `folder` as the other side of a connection would, and that the certificate is for `role`. Logs
+    /// until when the certificate is valid.
     ///
     /// # Errors
     /// A file is missing or malformed; the certificate is of another role, not valid now, or of another authority; the key is
@@ -118,7 +118,7 @@ impl Certificates {
         }
         let (expires, hosts) = (validity.not_after, hosts(&certificate));
         verify(&chain, authorities).map_err(|error| match error {
-            // The second is of an authority that has the same name.
+            // The second authority has the same name as the first.
             TlsError::InvalidCertificate(CertificateError::UnknownIssuer | CertificateError::BadSignature) => {
                 CertificatesError::new(&own, format!("is of another authority than {}", ca.display()), HINT)
             }
@@ -130,12 +130,12 @@ impl Certificates {
         Ok(Self { folder: folder.to_owned(), expires, hosts })
     }
 
-    /// Whether a new one should be made now.
+    /// Whether the operator should renew the certificate.
     pub(crate) fn expire_soon(&self) -> bool {
         self.expires.timestamp() - ASN1Time::now().timestamp() < EXPIRES_SOON * 24 * 60 * 60
     }
 
-    /// Whether only programs on this machine could connect to its owner.
+    /// Whether only programs on this machine could connect to the certificate's owner.
     pub(crate) fn is_for_this_machine_alone(&self) -> bool {
         self.hosts.iter().all(|host| is_this_machine(host))
     }
@@ -160,7 +160,7 @@ impl fmt::Display for Certificates {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         let (path, hosts) = (self.folder.join(FILES[1]), self.hosts.join(", "));
         write!(f, "{} is valid until {}", path.display(), self.expires)?;
-        // An evaluator's names none: it never listens.
+        // An evaluator's certificate names no host: an evaluator never listens.
         if hosts.is_empty() { Ok(()) } else { write!(f, ", to listen at {hosts}") }
     }
 }

@@ -1,62 +1,62 @@
-//! Where learner and evaluators meet, as a person writes it: Zenoh's endpoints.
+//! Zenoh endpoints as a user writes them: where learner and evaluators meet.
 
 use zenoh::config::EndPoint;
 
 use crate::certificates::{Certificates, is_this_machine};
 
-/// The protocols that Zenoh is built with here: neither encrypted nor authenticated, and both.
+/// The two protocols that this program's Zenoh supports: without and with encryption and authentication.
 const OPEN: &str = "tcp/";
 const PROTECTED: &str = "tls/";
 
-/// Where a session meets the others, as Zenoh's endpoints: `tcp/127.0.0.1:7447`, or with certificates
-/// `tls/127.0.0.1:7447`.
+/// The endpoints of a session: `tcp/127.0.0.1:7447`, or with certificates `tls/127.0.0.1:7447`.
 ///
-/// There is no scouting: only the endpoints named here are used. A session that listens is a peer, to which clients connect
-/// directly; one that does not is a client of the peer or router that it connects to.
+/// There is no scouting: a session uses only the endpoints named here. A session that listens is a peer, to which clients
+/// connect directly. A session that does not listen is a client of the peer or router that it connects to.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
 pub struct Endpoints {
-    /// Listen here. Port 0 takes a free one; [`reachable_at`](crate::reachable_at) tells which.
+    /// Listen here. Port 0 takes a free port; [`reachable_at`](crate::reachable_at) returns it.
     pub listen: Vec<String>,
-    /// Connect to these. A client keeps one connection: to reach several learners or routers, open a session for each.
+    /// Connect to these. A client keeps one connection, so a program that must reach several learners or routers opens a
+    /// session for each.
     pub connect: Vec<String>,
-    /// With them, every connection is by TLS, and both sides show a certificate. A client of a session that listens may
+    /// With certificates, every connection uses TLS, and both sides show a certificate. A client of a session that listens may
     /// do what deploy/zenoh/router-tls.json5 allows its role.
     pub certificates: Option<Certificates>,
 }
 
-/// There is no session, or it does not answer.
+/// Why there is no session.
 #[derive(Debug, thiserror::Error)]
 pub enum SessionError {
-    /// Nothing to listen at and nothing to connect to.
+    /// The endpoints name neither a place to listen at nor one to connect to.
     #[error("no endpoint to listen at or to connect to")]
     NoEndpoint,
-    /// Not an endpoint that this program can use. Zenoh would try for ever to connect to one of another protocol.
+    /// This program cannot use the endpoint. (Zenoh would try for ever to connect by an unknown protocol.)
     #[error("{endpoint:?} is not an endpoint; write it like {OPEN}127.0.0.1:7447 or {PROTECTED}127.0.0.1:7447")]
     NotAnEndpoint {
-        /// What was given.
+        /// The endpoint as the user wrote it.
         endpoint: String,
     },
-    /// Certificates are there, but would not be used.
+    /// There are certificates, but the endpoint would not use them.
     #[error("certificates are given, but the connection at {endpoint} would not be encrypted")]
     Open {
         /// The endpoint.
         endpoint: String,
     },
-    /// Certificates are not there, but would be needed.
+    /// The endpoint needs certificates, but there are none.
     #[error("{endpoint} needs certificates")]
     NoCertificates {
         /// The endpoint.
         endpoint: String,
     },
-    /// It cannot be listened at, or its options are wrong.
+    /// The session cannot listen at the endpoints, or their options are wrong.
     #[error("cannot use the Zenoh endpoint {endpoints}: {reason}")]
     Endpoint {
         /// The endpoints.
         endpoints: String,
-        /// Zenoh's own words.
+        /// Zenoh's error message.
         reason: String,
     },
-    /// The session does not tell which endpoints it has bound.
+    /// The session does not say which endpoints it has bound.
     #[error("the Zenoh session does not tell where it listens")]
     Unknown,
 }
@@ -78,7 +78,7 @@ impl SessionError {
 }
 
 impl Endpoints {
-    /// Tells early what [`open_session`](crate::open_session) would refuse.
+    /// Checks early for what [`open_session`](crate::open_session) would refuse.
     ///
     /// # Errors
     ///
@@ -103,13 +103,13 @@ impl Endpoints {
         self.for_others().filter(|_| self.certificates.is_none())
     }
 
-    /// The endpoint for other machines at which all of them would refuse its certificate, if there is one: the certificate
-    /// names only this machine's names for itself.
+    /// The endpoint for other machines whose certificate all of them would refuse, if there is one: the certificate contains
+    /// only names that this machine has for itself.
     pub(crate) fn closed_to_all(&self) -> Option<&str> {
         self.for_others().filter(|_| self.certificates.as_ref().is_some_and(Certificates::is_for_this_machine_alone))
     }
 
-    /// The first endpoint that it listens at for other machines, so not on loopback.
+    /// The first endpoint to listen at that other machines can reach, so not on loopback.
     fn for_others(&self) -> Option<&str> {
         let is_local = |endpoint: &&String| {
             let address = address_of(endpoint);
@@ -120,16 +120,16 @@ impl Endpoints {
     }
 }
 
-/// Where learner and evaluator of one machine meet by default.
+/// The default endpoint at which learner and evaluator of one machine meet.
 pub fn default_endpoint(certificates: Option<&Certificates>, port: u16) -> String {
     format!("{}127.0.0.1:{port}", if certificates.is_some() { PROTECTED } else { OPEN })
 }
 
-/// Checks an endpoint that a person wrote, and gives it back as it is: a `value_parser` for a command line.
+/// Checks an endpoint from the command line and returns it unchanged: a `value_parser`.
 ///
 /// # Errors
 ///
-/// [`SessionError::NotAnEndpoint`]: it is malformed, or names another protocol than TCP and TLS.
+/// [`SessionError::NotAnEndpoint`]: the endpoint is malformed, or names a protocol other than TCP and TLS.
 pub fn parse_endpoint(text: &str) -> Result<String, SessionError> {
     if [OPEN, PROTECTED].iter().any(|protocol| text.starts_with(protocol)) && text.parse::<EndPoint>().is_ok() {
         return Ok(text.to_owned());
@@ -143,7 +143,7 @@ pub(crate) fn address_of(endpoint: &str) -> &str {
     address.split(['?', '#']).next().unwrap_or(address)
 }
 
-/// Whether the system is to choose the endpoint's port.
+/// Whether the system chooses the endpoint's port.
 pub(crate) fn leaves_port_open(endpoint: &str) -> bool {
     address_of(endpoint).ends_with(":0")
 }

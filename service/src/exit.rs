@@ -1,4 +1,4 @@
-//! How a result or an error is shown to the user, and the exit code.
+//! How a program shows a result or an error to the user, and its exit code.
 
 use std::fmt;
 use std::io::{self, Write};
@@ -8,16 +8,15 @@ use rustix::event::{PollFd, PollFlags, Timespec, poll};
 
 use crate::logging::Logging;
 
-/// Adds advice to an error: what to do about it, on a line of its own.
+/// Adds a hint to an error: what the user can do, on a line of its own.
 pub trait Hint<T> {
-    /// What may have gone wrong.
+    /// The type of the error.
     type Error;
 
-    /// If this is an error, `hint` is shown below it. An error that has a hint already keeps that one, which was given closer
-    /// to the cause.
+    /// Adds `hint` if this is an error. An error that has a hint keeps it, because that hint is from closer to the cause.
     fn hint(self, hint: impl fmt::Display) -> anyhow::Result<T>;
 
-    /// The same, with advice that depends on the error.
+    /// As [`hint`](Self::hint), with a hint that depends on the error.
     fn hint_of<H: fmt::Display>(self, hint: impl FnOnce(&Self::Error) -> H) -> anyhow::Result<T>;
 }
 
@@ -37,24 +36,23 @@ impl<T, E: Into<anyhow::Error>> Hint<T> for Result<T, E> {
     }
 }
 
-/// An error with advice, which is shown below it; one that has advice already keeps that.
+/// An error with a hint; an error that has a hint keeps it.
 pub fn hinted(error: impl Into<anyhow::Error>, hint: impl fmt::Display) -> anyhow::Error {
     let error = error.into();
     if error.is::<Hinted>() { error } else { Hinted { error, hint: hint.to_string(), unfinished: false }.into() }
 }
 
-/// An error with advice that is none of the program's: it did not finish, and the same command goes on. The exit code is then
-/// [`UNFINISHED`].
+/// An error with a hint that means "not finished": the same command continues the work. The exit code is then [`UNFINISHED`].
 pub fn unfinished(error: impl Into<anyhow::Error>, hint: impl fmt::Display) -> anyhow::Error {
     Hinted { error: error.into(), hint: hint.to_string(), unfinished: true }.into()
 }
 
-/// The advice that an error has.
+/// The hints of an error.
 pub fn hints(error: &anyhow::Error) -> impl Iterator<Item = &str> {
     error.chain().filter_map(|cause| cause.downcast_ref::<Hinted>()).map(|hinted| &*hinted.hint)
 }
 
-/// An error with advice; everything else is the error's own.
+/// An error with a hint; all else is the wrapped error's.
 #[derive(Debug)]
 struct Hinted {
     error: anyhow::Error,
@@ -74,15 +72,15 @@ impl std::error::Error for Hinted {
     }
 }
 
-/// The exit code of a program that has not finished, and goes on when the same command is given again: EX_TEMPFAIL of
-/// `sysexits.h`, so that a scheduler can tell it from a failure.
+/// The exit code of a program that has not finished and continues when the same command is given again: EX_TEMPFAIL of
+/// `sysexits.h`, which a scheduler can tell from a failure.
 const UNFINISHED: u8 = 75;
-/// How long the last words wait for stderr to be read.
+/// How long the program waits for a reader of stderr before it ends.
 const LAST_WORDS: Timespec = Timespec { tv_sec: 1, tv_nsec: 0 };
-/// What a pipe that has room takes without waiting, bytes.
+/// Bytes that a pipe with free space takes without waiting.
 const PIPE: usize = 4096;
 
-/// Prints a command's result to stdout, where logs do not go. The reader may stop at any time, like `head` does.
+/// Prints a command's result to stdout; logs go to stderr. A reader that stops early, like `head`, is no error.
 ///
 /// # Errors
 /// Stdout cannot be written to.
@@ -93,23 +91,23 @@ pub fn print(text: &str) -> anyhow::Result<()> {
     }
 }
 
-/// Runs `main`, and ends the logging. An error is printed to stderr with its causes and hints; the exit code is then 1, or 75
-/// if the error is one of [`unfinished`]; otherwise 0.
+/// Runs `main`, and ends the logging. Prints an error to stderr with its causes and hints. The exit code is 0, or 1 after an
+/// error, or 75 if the error is [`unfinished`].
 ///
-/// (A wrong command line is 2, which clap sees to.)
+/// (clap ends the program with 2 if the command line is wrong.)
 pub fn run_main(logging: Logging, main: impl FnOnce() -> anyhow::Result<()>) -> ExitCode {
     let result = main();
     drop(logging);
     let Err(error) = result else { return ExitCode::SUCCESS };
     let unfinished = error.chain().filter_map(|cause| cause.downcast_ref::<Hinted>()).any(|hinted| hinted.unfinished);
     let mut text = Vec::new();
-    // With stderr closed, the exit code is all that can be said.
+    // If stderr is closed, only the exit code can say something.
     show(&error, &mut text).and_then(|()| say(&text)).ok();
     if unfinished { UNFINISHED.into() } else { ExitCode::FAILURE }
 }
 
-/// Writes to stderr for as long as that takes it. Not by [`io::Stderr`], which a log line that waits for a reader may have
-/// locked; nor on another thread, which may take seconds to start where many processes share the processors.
+/// Writes to stderr, and waits for a reader only for a limited time. It does not use [`io::Stderr`], which a blocked log line
+/// may have locked, nor another thread, which may take seconds to start if many processes share the processors.
 fn say(mut text: &[u8]) -> io::Result<()> {
     let stderr = io::stderr();
     while !text.is_empty() && poll(&mut [PollFd::new(&stderr, PollFlags::OUT)], Some(&LAST_WORDS))? > 0 {
@@ -122,7 +120,7 @@ fn show(error: &anyhow::Error, to: &mut impl Write) -> io::Result<()> {
     let mut last = String::new();
     for (depth, cause) in error.chain().enumerate() {
         let text = cause.to_string().trim_end().to_owned();
-        // Some errors quote their cause.
+        // Some errors already contain the text of their cause.
         if depth == 0 {
             writeln!(to, "error: {text}")?;
         } else if !last.contains(&text) {

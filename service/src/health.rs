@@ -1,20 +1,20 @@
-//! Whether a process still does its work: its parts say that they are alive, `/healthz` names those that have stopped.
+//! Whether a process still works: its parts report that they are alive, and `/healthz` names the parts that have stopped.
 
 use std::sync::atomic::{AtomicU64, Ordering::Relaxed};
 use std::sync::{Arc, Mutex, PoisonError};
 use std::time::{Duration, Instant};
 
-/// The parts of a process and how they are. Cheap to clone; all clones are the same.
+/// The parts of a process and their health. Clones are cheap and share the state.
 ///
-/// Without parts, a process is healthy.
+/// A process without parts is healthy.
 #[derive(Clone, Debug, Default)]
 pub struct Health {
     parts: Arc<Mutex<Vec<Arc<Part>>>>,
 }
 
 impl Health {
-    /// Adds a part of the process that promises to say so at least every `limit` while it is alive. It counts as alive
-    /// from now on.
+    /// Adds a part of the process that will report at least every `limit` while it is alive. The part counts as alive from
+    /// this call on.
     pub fn part(&self, name: impl Into<String>, limit: Duration) -> Beat {
         let part = Arc::new(Part {
             name: name.into(),
@@ -27,7 +27,7 @@ impl Health {
         Beat { part }
     }
 
-    /// What is wrong, a line each; nothing if all is well.
+    /// What is wrong, one line per problem; empty if all is well.
     pub fn problems(&self) -> Vec<String> {
         self.problems_at(Instant::now())
     }
@@ -38,15 +38,16 @@ impl Health {
     }
 }
 
-/// What a part holds to say how it is. Dropped without [`finish`](Beat::finish), as by a panic of its thread, the part
-/// counts as broken.
+/// A part's handle to report its health. If it is dropped without [`finish`](Beat::finish), as by a panic, the part counts as
+/// broken.
 #[derive(Debug)]
 pub struct Beat {
     part: Arc<Part>,
 }
 
 impl Beat {
-    /// Says that the part is alive: a look at the clock and an atomic store, so any thread may do it as often as it likes.
+    /// Reports that the part is alive. This reads the clock and stores an atomic, so a thread may call it as often as it
+    /// likes.
     pub fn alive(&self) {
         self.alive_at(Instant::now());
     }
@@ -55,17 +56,17 @@ impl Beat {
         self.part.last.store((now - self.part.start).as_millis() as u64, Relaxed);
     }
 
-    /// How often to say so when there is nothing else to do: several times within the limit.
+    /// How often an idle part should report: several times within the limit.
     pub fn interval(&self) -> Duration {
         self.part.limit / 4
     }
 
-    /// Says what is wrong with the part although it is alive, like a full disk; `None` when it is over.
+    /// Reports a problem of a part that is alive, like a full disk; `None` when the problem is over.
     pub fn set_trouble(&self, trouble: Option<String>) {
         self.part.state().trouble = trouble;
     }
 
-    /// The part's work is done; it need not be alive any more.
+    /// Reports that the part's work is done; it need not report again.
     pub fn finish(self) {
         self.part.state().ending = Ending::Finished;
     }

@@ -1,20 +1,19 @@
-//! What the learner and the evaluator have in common as long-running programs.
+//! What learner and evaluator share as long-running programs.
 //!
 //! # Layout
 //!
-//! In reading order, which is the order of a process's life:
+//! In reading order, which follows a process from start to end:
 //!
-//! - `logging`: which log lines are written, and where to.
-//! - `endpoints`: where learner and evaluators meet; `certificates`: how they show what they are; `access`: what each role may
-//!   do; `session`: the connection between them, over Zenoh;
-//!   `router`: a meeting point of many learners on one machine.
-//! - `threads`, `background`: how little of the processor the network takes.
+//! - `logging`: which log lines a program writes, and where to.
+//! - `endpoints`: where learner and evaluators meet; `certificates`: how they show their roles; `access`: what each role may
+//!   do; `session`: the connection over Zenoh; `router`: a meeting point of many learners on one machine.
+//! - `threads`, `background`: limit the processor time that the network takes.
 //! - `health`: whether the parts of a process still do their work.
 //! - `metrics_server`: `/metrics` and `/healthz`.
 //! - `shutdown`: the signals that end a process.
-//! - `exit`: how a result or an error is shown to the user, and the exit code.
-//! - `progress`: how far something is, for people.
-//! - [`doctor`]: checks of a machine, before a run is started on it.
+//! - `exit`: how a program shows a result or an error to the user, and its exit code.
+//! - `progress`: shows how far a task is.
+//! - [`doctor`]: checks of a machine, before a run starts on it.
 
 mod access;
 mod background;

@@ -1,4 +1,4 @@
-//! Which log lines are written, and where to.
+//! Which log lines a program writes, and where to.
 
 use std::env;
 use std::io::IsTerminal;
@@ -12,30 +12,30 @@ use tracing_subscriber::fmt::MakeWriter;
 use tracing_subscriber::prelude::*;
 use tracing_subscriber::{EnvFilter, fmt, registry};
 
-/// Without RUST_LOG: our own progress and Zenoh's complaints. `zenoh` is the prefix of all of its crates. One of its warnings
-/// is left out: that scouting by gossip is off, which it is on purpose. So is what it says when it cannot listen or connect, which
-/// is told in our own words.
+/// The default of RUST_LOG: our own progress and Zenoh's warnings. `zenoh` is the prefix of all of its crates. Two of its
+/// messages are left out: that scouting by gossip is off, which is intended; and that it cannot listen or connect, which this
+/// program reports itself.
 const DEFAULT_FILTER: &str =
     "info,zenoh=warn,zenoh::net::routing::hat::peer=error,zenoh::net::runtime::orchestrator=error";
 
-/// Most lines of Zenoh's in a minute. It writes one for each client that it refuses, so that a stranger could fill the disk.
-/// Our own lines are not counted: what strangers send is logged at the level `debug`, which only RUST_LOG shows.
+/// Most lines of Zenoh in a minute. Zenoh writes a line for each client that it refuses, so a stranger could fill the disk.
+/// Our own lines are not counted: messages of strangers are logged at the level `debug`, which only RUST_LOG shows.
 const ZENOH_LINES: u32 = 100;
 const MINUTE: Duration = Duration::from_secs(60);
 
-/// Lines that wait for a reader of stderr; later ones are lost.
+/// Lines that may wait for a reader of stderr; further lines are lost.
 const MOST_WAITING: usize = 10_000;
 
-/// Writes log lines for as long as it lives. Dropped, it writes those that wait, but for no longer than a second.
+/// Writes log lines as long as it lives. When it is dropped it writes the waiting lines, for at most a second.
 #[must_use]
 pub struct Logging {
     _writer: WorkerGuard,
 }
 
-/// Sends log lines to stderr, coloured on a terminal that has colours, unless NO_COLOR is set; the environment variable RUST_LOG chooses which. Only a thread of the
-/// log's own waits when stderr is not read.
+/// Sends log lines to stderr, in colour on a terminal with colours unless NO_COLOR is set. The environment variable RUST_LOG
+/// chooses the lines. If stderr is not read, only the log's own thread waits.
 ///
-/// To be called once, first thing in `main`; further calls do nothing.
+/// Call it once, first in `main`; further calls do nothing.
 pub fn init_logging() -> Logging {
     let writer = NonBlockingBuilder::default().buffered_lines_limit(MOST_WAITING).thread_name("log");
     let (lines, guard) = writer.finish(std::io::stderr());
@@ -59,7 +59,7 @@ where
     registry().with(lines).with(filter)
 }
 
-/// Counts one more line of Zenoh's in the minute that began at the first value.
+/// Counts one more line of Zenoh in the minute that began at the first value.
 fn has_room(minute: &Mutex<(Instant, u32)>, now: Instant) -> bool {
     let (begin, count) = &mut *minute.lock().unwrap_or_else(PoisonError::into_inner);
     if now - *begin >= MINUTE {

@@ -1,4 +1,4 @@
-//! `/metrics`, `/healthz` and the pages of a program.
+//! Serves `/metrics`, `/healthz` and the pages of a program.
 
 use std::collections::VecDeque;
 use std::io;
@@ -21,32 +21,32 @@ use tracing::{debug, warn};
 
 use crate::health::Health;
 
-/// A request is a few lines in one packet. A connection on which it is not there whole by then is closed.
+/// A request is a few lines in one packet. The server closes a connection whose request is incomplete after this time.
 const REQUEST: Duration = Duration::from_secs(3);
-/// A connection is for one request, and lasts at most this long however slowly its client reads.
+/// A connection serves one request, and lasts at most this long, however slowly its client reads.
 const CONNECTION: Duration = Duration::from_secs(15);
-/// Connections at a time. One more ends the oldest of them, so that idle clients do not keep others out.
+/// Most connections at a time. A further connection ends the oldest, so that idle clients do not keep others out.
 const MOST_CONNECTIONS: usize = 64;
-/// Bytes that are kept of a connection's request; hyper takes no fewer.
+/// Bytes of a connection's request that the server buffers; hyper takes no fewer.
 const MOST_BUFFERED: usize = 8 << 10;
-/// When a connection cannot be accepted, most likely because too many files are open, the next try is after this time.
+/// Pause after a connection could not be accepted, most likely because too many files are open.
 const RETRY: Duration = Duration::from_secs(1);
 
-/// Serves for as long as it is held.
+/// Serves as long as this value lives.
 #[derive(Debug)]
 pub struct MetricsServer {
-    /// Where it listens; with the port that the system chose where 0 was asked for.
+    /// Where the server listens; if port 0 was asked for, with the port that the system chose.
     pub address: SocketAddr,
     task: JoinHandle<()>,
 }
 
-/// The address cannot be listened at.
+/// The server cannot listen at the address.
 #[derive(Debug, thiserror::Error)]
 #[error("cannot serve metrics at {address}")]
 pub struct BindError {
     /// The address.
     pub address: SocketAddr,
-    /// Why not.
+    /// The cause.
     pub source: io::Error,
 }
 
@@ -57,13 +57,13 @@ impl BindError {
     }
 }
 
-/// Serves over HTTP at `address`: at `/metrics` what `registry` gathers, in Prometheus's text format; at `/healthz` `ok`,
-/// or status 503 and a line for each problem; and the `pages` of the program's own.
+/// Serves over HTTP at `address`: `/metrics` with the metrics of `registry` in Prometheus's text format; `/healthz` with `ok`,
+/// or with status 503 and a line for each problem; and the program's own `pages`.
 ///
-/// Clients that send or read slowly, or only hold connections, are cut off; they cost a bounded amount of memory.
+/// The server cuts off clients that send or read slowly, or hold idle connections; they cost a bounded amount of memory.
 ///
 /// # Errors
-/// The address cannot be listened at.
+/// The server cannot listen at the address.
 pub async fn serve_metrics(
     address: SocketAddr,
     registry: Registry,
@@ -81,7 +81,7 @@ pub async fn serve_metrics(
 }
 
 async fn accept(listener: TcpListener, router: Router) {
-    // Dropped with this task, it ends them all.
+    // Dropped with this task, the set ends all connections.
     let mut connections = JoinSet::new();
     let mut oldest_first: VecDeque<AbortHandle> = VecDeque::new();
     loop {

@@ -1,4 +1,4 @@
-//! What a person sees while something of known size is done: a bar on a terminal, plain log lines otherwise.
+//! Shows the progress of a task of known size: a bar on a terminal, plain log lines otherwise.
 
 use std::cell::Cell;
 use std::time::{Duration, Instant};
@@ -9,11 +9,11 @@ use tracing::info;
 /// How often a log gets a line.
 const LINE: Duration = Duration::from_secs(5);
 
-/// The display of one thing that is done, such as a file that is fetched.
+/// Shows the progress of one task, such as a fetch of a file.
 pub struct Progress {
-    /// Hidden where stderr is no terminal.
+    /// Hidden if stderr is no terminal.
     bar: ProgressBar,
-    /// What is counted; none of bytes.
+    /// What is counted; `None` for bytes.
     counted: Option<&'static str>,
     last_line: Cell<Instant>,
 }
@@ -24,7 +24,7 @@ impl Progress {
         Self::new(None)
     }
 
-    /// A display that shows nothing yet, of what is `counted`, such as `transitions recorded`.
+    /// A display that shows nothing yet, of `counted` things, such as `transitions recorded`.
     pub fn of(counted: &'static str) -> Self {
         Self::new(Some(counted))
     }
@@ -34,12 +34,12 @@ impl Progress {
         Self { bar, counted, last_line: Cell::new(Instant::now()) }
     }
 
-    /// Starts, or starts again, behind the first `position` of so many.
+    /// Starts (again) with `position` of `length` done.
     pub fn start(&self, position: u64, length: u64) {
         let figures = self.counted.map_or("{bytes}/{total_bytes} at {bytes_per_sec}".to_owned(), |counted| {
             format!("{{pos}}/{{len}} {counted}")
         });
-        // Without a style of ours the bar still works, with less beside it.
+        // Without our style the bar still works, but shows less.
         if let Ok(style) = ProgressStyle::with_template(&format!("{{bar:40}} {figures}, {{eta}} left")) {
             self.bar.set_style(style);
         }
@@ -48,7 +48,7 @@ impl Progress {
         self.bar.reset_eta();
     }
 
-    /// So many are done.
+    /// Sets how much is done.
     pub fn advance(&self, position: u64) {
         self.bar.set_position(position);
         if !self.bar.is_hidden() || self.last_line.get().elapsed() < LINE {

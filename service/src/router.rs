@@ -1,4 +1,4 @@
-//! A Zenoh router in this process: where many learners and evaluators of one machine meet.
+//! A Zenoh router in this process, at which many learners and evaluators of one machine meet.
 
 use serde_json::json;
 use zenoh::{Config, Session};
@@ -6,15 +6,15 @@ use zenoh::{Config, Session};
 use crate::endpoints::{Endpoints, SessionError};
 use crate::session::{for_people, reachable_at};
 
-/// What a router of its own is told, too.
+/// Settings beyond those of the file.
 const SETTINGS: &str = include_str!("../../deploy/zenoh/router.json5");
-/// Other machines do not reach it; the system chooses the port.
+/// Other machines cannot reach the router; the system chooses its port.
 const LISTEN: &str = "tcp/127.0.0.1:0";
 
-/// Opens a router that lasts as long as the session, and gives its endpoint. Needs a multi-thread tokio runtime.
+/// Opens a router that lives as long as the session, and returns its endpoint. Needs a multi-thread tokio runtime.
 ///
 /// # Errors
-/// It cannot listen.
+/// The router cannot listen.
 pub async fn open_router() -> Result<(Session, String), SessionError> {
     let wrong = |error| SessionError::Endpoint { endpoints: LISTEN.to_owned(), reason: for_people(error) };
     let session = zenoh::open(config().map_err(wrong)?).await.map_err(wrong)?;
@@ -27,7 +27,7 @@ pub async fn open_router() -> Result<(Session, String), SessionError> {
 fn config() -> zenoh::Result<Config> {
     let mut config = Config::from_json5(SETTINGS)?;
     config.insert_json5("listen/endpoints", &json!([LISTEN]).to_string())?;
-    // Tells which port the system has chosen.
+    // Makes the session report which port the system has chosen.
     config.insert_json5("adminspace/enabled", "true")?;
     Ok(config)
 }

@@ -13,36 +13,36 @@ use crate::access;
 use crate::background::stay_in_background;
 use crate::endpoints::{Endpoints, SessionError, leaves_port_open};
 
-/// A process that is frozen or disconnected counts as gone after this time. (The end of a process is noticed at once.) Half of
-/// Zenoh's default; a machine that is busy training may still miss several keep-alive messages in it.
+/// A frozen or disconnected process counts as gone after this time; the end of a process is noticed at once. This is half of
+/// Zenoh's default, but long enough for a machine that is busy training and misses several keep-alive messages.
 const LEASE: Duration = Duration::from_secs(5);
-/// Largest message that a client takes in, bytes: the largest snapshot that may be sent (64 MiB) and what Zenoh adds.
+/// Largest message that a client accepts, bytes: the largest snapshot (64 MiB) and what Zenoh adds.
 const MAX_SNAPSHOT_SIZE: u64 = 65 << 20;
-/// Largest message in several pieces that a session that listens takes in, bytes: none. Zenoh keeps each piece until the last
-/// one has come, and with it the whole buffer of 64 KiB that it was received in, so that pieces of one byte could fill any
-/// memory. What evaluators send (at most 30 KiB) comes in one piece: one has room for 32,700 bytes on every network.
+/// Largest fragmented message that a listening session accepts, bytes: none. Zenoh keeps each fragment until the last one has
+/// come, together with the buffer of 64 KiB in which it arrived, so fragments of one byte could fill any memory. Evaluators'
+/// messages have at most 30 KiB and need no fragments: one packet has space for 32,700 bytes on every network.
 const MAX_PIECED_REQUEST: u64 = 0;
-/// Most connections of a session that listens. Each is an open file, of which many systems allow a process 1024; the rest
-/// is for datasets, logs and metrics. Beyond it, connections are refused; without it, files could not be opened any more.
+/// Most connections of a listening session; it refuses further ones. Each is an open file, and a process may open 1024 files
+/// on many systems. The rest is for datasets, logs and metrics.
 const MAX_SESSIONS: u64 = 768;
-/// First and longest pause between two tries to connect.
+/// First and longest pause between two attempts to connect.
 const RETRY: [Duration; 2] = [Duration::from_millis(250), Duration::from_secs(2)];
-/// How long a large message that may be dropped waits for a receiver that does not keep up. Zenoh's 50 ms are not
-/// enough for a snapshot when training has taken all cores; a receiver that hangs must not hold up the others for long.
+/// How long a large message that may be dropped waits for a slow receiver. Zenoh's 50 ms are too short for a snapshot when
+/// training uses all cores; but a receiver that hangs must not delay the others for long.
 const DROP_AFTER: Duration = Duration::from_millis(500);
-/// How long a message that may not be dropped waits for a receiver that does not read, before its connection is closed.
-/// Meanwhile other receivers may have to wait, so this is less than Zenoh's five seconds; a network of 256 kbit/s still takes
-/// one packet of 64 KiB in it.
+/// How long a message that may not be dropped waits for a receiver that does not read, before the connection is closed. Other
+/// receivers may wait meanwhile, so this is less than Zenoh's five seconds; it suffices for one packet of 64 KiB on a network
+/// of 256 kbit/s.
 const CLOSE_AFTER: Duration = Duration::from_secs(2);
-/// A client that has no connection after this time says so.
+/// A client that has no connection after this time logs it.
 const PATIENCE: Duration = Duration::from_secs(10);
-/// A session asks itself what it listens at, so there is no network in between.
+/// Time limit when a session asks itself for its endpoints, which needs no network.
 const SELF_QUERY_TIMEOUT: Duration = Duration::from_secs(5);
 
 /// Opens a session. Needs a multi-thread tokio runtime.
 ///
-/// A session that listens is open at once, a client as soon as it has a connection: it waits for a learner or router that has
-/// not started yet, until this future is dropped. Later it connects again whenever the connection is lost.
+/// A session that listens is open at once. A client is open as soon as it has a connection: it waits for a learner or router
+/// that has not started yet, until this future is dropped. If the connection is lost later, the client connects again.
 pub async fn open_session(endpoints: &Endpoints) -> Result<Session, SessionError> {
     endpoints.check()?;
     if let Some(endpoint) = endpoints.closed_to_all() {
@@ -56,11 +56,11 @@ pub async fn open_session(endpoints: &Endpoints) -> Result<Session, SessionError
         SessionError::Endpoint { endpoints, reason: for_people(error) }
     };
     let config = config(endpoints).map_err(wrong)?;
-    // Zenoh's future blocks its thread until there is a connection, so it gets a thread of its own. That is never joined:
-    // dropping this future gives up waiting, and the process can end.
+    // Zenoh's future blocks its thread until there is a connection, so it gets a thread of its own. Nothing joins that thread:
+    // if this future is dropped, the process can end.
     let (sender, mut opened) = oneshot::channel();
     let open = move || {
-        // Zenoh's own threads are started by this one, and inherit its priority.
+        // This thread starts Zenoh's own threads, which inherit its priority.
         stay_in_background();
         drop(sender.send(zenoh::open(config).wait()));
     };
@@ -87,7 +87,7 @@ fn config(endpoints: &Endpoints) -> zenoh::Result<Config> {
         ("mode", json!(mode)),
         ("listen/endpoints", json!(endpoints.listen)),
         ("connect/endpoints", json!(endpoints.connect)),
-        // Wait for a learner or router that is not there yet. A client would give up at once otherwise.
+        // Makes a client wait for a learner or router that has not started; by default it would give up at once.
         ("connect/timeout_ms", json!(-1)),
         ("connect/exit_on_failure", json!(false)),
         ("connect/retry", json!({ "period_init_ms": retry[0], "period_max_ms": retry[1] })),
@@ -101,8 +101,8 @@ fn config(endpoints: &Endpoints) -> zenoh::Result<Config> {
         ("transport/link/tx/queue/congestion_control/block/wait_before_close", json!(CLOSE_AFTER.as_micros() as u64)),
         ("transport/link/rx/max_message_size", json!(if listens { MAX_PIECED_REQUEST } else { MAX_SNAPSHOT_SIZE })),
         ("transport/unicast/max_sessions", json!(MAX_SESSIONS)),
-        // The only stable way to learn a port that the system chose. Clients could read the configuration there, so it is
-        // off where it is not needed.
+        // This is the only stable way to learn a port that the system chose. Clients could read the configuration there, so it
+        // is on only if needed.
         ("adminspace/enabled", json!(endpoints.listen.iter().any(|endpoint| leaves_port_open(endpoint)))),
     ];
     if let Some(certificates) = &endpoints.certificates {
@@ -119,7 +119,7 @@ fn config(endpoints: &Endpoints) -> zenoh::Result<Config> {
     Ok(config)
 }
 
-/// Zenoh's message without the places in its source code (`at /…/tcp.rs:61.`) that it adds.
+/// Zenoh's message without the places in its source code (`at /…/tcp.rs:61.`).
 pub(crate) fn for_people(error: zenoh::Error) -> String {
     let text = error.to_string();
     let mut words = text.split(' ').peekable();
@@ -134,8 +134,8 @@ pub(crate) fn for_people(error: zenoh::Error) -> String {
     plain
 }
 
-/// Where evaluators can meet `session`, which was opened with `endpoints`: what it listens at, with the ports that the system
-/// chose, or, if it does not listen, what it connects to.
+/// Where evaluators can reach `session`, which was opened with `endpoints`: the addresses at which it listens, with the ports
+/// that the system chose, or, if it does not listen, those to which it connects.
 pub async fn reachable_at(session: &Session, endpoints: &Endpoints) -> Result<Vec<String>, SessionError> {
     if endpoints.listen.is_empty() {
         return Ok(endpoints.connect.clone());

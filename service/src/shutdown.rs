@@ -7,21 +7,21 @@ use tokio::signal::unix::{Signal, SignalKind, signal};
 use tokio::sync::oneshot;
 use tracing::{info, warn};
 
-/// A process that was told to end has so long for it: less than the 10 s after which Docker kills.
+/// A process that was told to end has this long for it: less than the 10 s after which Docker kills it.
 const LEAVE_WITHIN: Duration = Duration::from_secs(9);
-/// A second signal within this time means the same as the first: a terminal's Ctrl-C reaches a script and what it has started,
-/// and then the script sends these a signal, too.
+/// A second signal within this time counts as the first: a terminal's Ctrl-C reaches a script and its children, and the script
+/// may then send them a signal, too.
 const SAME: Duration = Duration::from_millis(500);
-/// The thread that writes the log gets so long for the last line.
+/// How long the thread that writes the log has for its last line.
 const LAST_WORDS: Duration = Duration::from_millis(100);
-/// What a shell reports of a process that SIGINT has ended.
+/// The exit code that shells report for a process that SIGINT ended.
 const ENDED_AT_ONCE: i32 = 130;
 
-/// Becomes ready at the first SIGINT (Ctrl-C) or SIGTERM after this call, even if it is not awaited by then.
+/// Becomes ready at the first SIGINT (Ctrl-C) or SIGTERM after this call, even before a task awaits it.
 ///
-/// From this call on, the first of the two signals does not end the process by itself any more. The next one that comes half
-/// a second later or more does, at once, with exit code 130; and so does the process itself if it is still there 9 s after
-/// the first, whatever it waits for. Needs a tokio runtime, and lasts as long as that.
+/// From this call on, the first of the two signals does not end the process. A further signal, half a second later or more,
+/// ends it at once with exit code 130. The process also ends 9 s after the first signal, whatever it waits for. Needs a tokio
+/// runtime, and lasts as long as that runtime.
 pub fn shutdown_signal() -> impl Future<Output = ()> + Send {
     let (mut interrupt, mut terminate) = (listen(SignalKind::interrupt()), listen(SignalKind::terminate()));
     let (tell, told) = oneshot::channel();
@@ -47,7 +47,7 @@ pub fn shutdown_signal() -> impl Future<Output = ()> + Send {
     });
     async move {
         if told.await.is_err() {
-            // The task above ended with its runtime, so that no signal will come.
+            // The task above ended with its runtime, so no signal will come.
             std::future::pending::<()>().await;
         }
     }
@@ -61,7 +61,7 @@ async fn either(interrupt: &mut Option<Signal>, terminate: &mut Option<Signal>) 
     }
 }
 
-/// A signal that cannot be listened to keeps its default action: it ends the process.
+/// A signal for which no handler can be set keeps its default action: it ends the process.
 fn listen(kind: SignalKind) -> Option<Signal> {
     signal(kind).inspect_err(|error| warn!("cannot prepare for a clean shutdown: {error}")).ok()
 }

@@ -1,4 +1,4 @@
-//! Everything that is exchanged with the learner of one run: jobs, snapshots, progress, scores.
+//! All communication with the learner of one run: jobs, snapshots, progress, scores.
 
 use std::collections::BTreeSet;
 use std::sync::Arc;
@@ -18,20 +18,20 @@ use super::scheduler::Turn;
 use super::snapshot::{Listener, Snapshots, is_named_by};
 use crate::metrics::{JobOutcome, Metrics};
 
-/// A learner answers in milliseconds; one that takes this long hangs, and other runs wait behind it.
+/// A learner answers in milliseconds; one that takes this long hangs, and other runs wait meanwhile.
 pub const ANSWER_TIMEOUT: Duration = Duration::from_secs(5);
-/// The same for a snapshot, which has megabytes to carry over whatever network there is.
+/// The same for a snapshot, which has megabytes.
 const WEIGHTS_TIMEOUT: Duration = Duration::from_secs(30);
-/// Bounds of the pause that a learner without work may ask for, so that it gets no flood of queries and loses no evaluator.
+/// Limits of the pause that a learner without work may ask for: the learner gets no flood of queries, and loses no evaluator.
 const PAUSE: [Duration; 2] = [Duration::from_millis(20), Duration::from_secs(60)];
-/// An evaluator that leaves tries this long to deliver its scores, and half as long to hand a job back.
+/// How long a leaving evaluator tries to deliver its scores; it tries half as long to hand a job back.
 const LEAVE: Duration = Duration::from_secs(2);
-/// Scores that the learner answers with an error are then delivered again after this time.
+/// A leaving evaluator delivers scores again this long after the learner answered with an error.
 const AGAIN: Duration = Duration::from_millis(100);
-/// Longest reason that a learner is told, characters: it takes no large messages.
+/// Most characters of a reason that the evaluator sends: the learner accepts no large messages.
 const LONGEST_REASON: usize = 1000;
 
-/// What an evaluator owes a learner. While it owes anything, it claims nothing new.
+/// What an evaluator owes a learner. While it owes anything, it claims no job.
 enum Owed {
     /// The episodes of a job.
     Episodes { job: u64, incarnation: u64 },
@@ -47,16 +47,16 @@ pub struct RunClient {
     metrics: Metrics,
     snapshots: Snapshots,
     listener: Listener,
-    /// Whose answers are believed.
+    /// The process of the learner that this evaluator follows. It ignores answers of others.
     incarnation: u64,
-    /// Of the claim that has no answer yet.
+    /// The number of the claim that has no answer yet.
     attempt: Option<u64>,
     owed: Option<Owed>,
-    /// When it is to be served next.
+    /// When the run is due next.
     pub turn: Turn,
-    /// Since when its learner is gone.
+    /// When the learner disappeared.
     pub gone: Option<Instant>,
-    /// What was last complained about, so that it is not said again and again.
+    /// The last warning, so that it is not repeated.
     complaint: String,
     _token: LivelinessToken,
 }
@@ -95,8 +95,8 @@ impl RunClient {
         Ok(client)
     }
 
-    /// Follows the learner that it follows already, if that is among these lives; else the one that was started first, because
-    /// of two learners of one name the later one stops.
+    /// Chooses which of these processes of a learner to follow: the one that it follows already, else the one that started
+    /// first, because of two learners of one name the later one stops.
     pub fn follow(&mut self, lives: &BTreeSet<u64>) {
         if self.gone.take().is_some() {
             self.turn.wake(Instant::now());
@@ -108,7 +108,7 @@ impl RunClient {
         }
     }
 
-    /// Follows the next of several lives, because this one does not answer.
+    /// Follows the next of several processes, because this one does not answer.
     pub fn follow_next(&mut self, lives: &BTreeSet<u64>) {
         let next = lives.range(self.incarnation.saturating_add(1)..).next().or(lives.first());
         if let Some(&next) = next.filter(|next| **next != self.incarnation) {
@@ -124,14 +124,14 @@ impl RunClient {
         self.turn.wake(Instant::now());
     }
 
-    /// Makes the run ready if its learner has published a snapshot.
+    /// Makes the run due if its learner has published a snapshot.
     pub fn wake_for_snapshot(&mut self) {
         if self.listener.take_news() {
             self.turn.nudge(Instant::now());
         }
     }
 
-    /// Leaves the learner alone for a while, which is longer each time. Says why, unless it is the same as the last time.
+    /// Pauses this run, longer each time. Logs why, unless the reason is the same as the last time.
     pub fn back_off(&mut self, error: &anyhow::Error) {
         let complaint = format!("{error:#}");
         match self.complaint == complaint {
@@ -147,9 +147,9 @@ impl RunClient {
         matches!(self.owed, Some(Owed::Scores(_)))
     }
 
-    /// Asks for a job in one of these environments; `None` when there is none now.
+    /// Claims a job in one of these environments; `None` if there is none now.
     pub async fn claim(&mut self, environments: Vec<String>) -> anyhow::Result<Option<Job>> {
-        // The same number until there is an answer: if only that was lost, the job is not.
+        // The same number until there is an answer: if only the answer was lost, the learner repeats the job.
         let attempt = *self.attempt.get_or_insert_with(|| rand::rng().random());
         let request = encode(&JobRequest::Claim { evaluator: self.evaluator.clone(), attempt, environments })?;
         let (run, incarnation) = (self.run.clone(), self.incarnation);
@@ -169,7 +169,7 @@ impl RunClient {
             JobReply::Wait { milliseconds, .. } => {
                 self.complaint.clear();
                 let pause = Duration::from_millis(milliseconds).clamp(PAUSE[0], PAUSE[1]);
-                // Evaluators that a snapshot has woken together do not come back together.
+                // Spreads out evaluators that a snapshot has woken together.
                 self.turn.done(Instant::now(), pause.mul_f64(rand::random_range(0.5..1.0)));
                 Ok(None)
             }
@@ -177,7 +177,7 @@ impl RunClient {
         }
     }
 
-    /// The snapshot that `job` names: as it was published, or asked for if that was missed.
+    /// The snapshot that `job` names: the published one, or a requested one if the evaluator missed the publication.
     pub async fn snapshot(&self, job: &Job) -> anyhow::Result<Arc<Snapshot>> {
         if let Some(snapshot) = self.snapshots.get(job) {
             return Ok(snapshot);
@@ -189,8 +189,8 @@ impl RunClient {
         Ok(Arc::new(snapshot))
     }
 
-    /// Tells the learner how far `job` is. A message that is lost does not matter: the next one says the same and more. So
-    /// Zenoh drops it when the connection takes nothing, and this call does not wait.
+    /// Reports the progress of `job`. A lost message does no harm, because the next one contains its news. So Zenoh drops the
+    /// message if the connection is full, and this call does not wait.
     pub fn tell(&self, job: &Job, steps_done: u64, episodes_done: u32) {
         let progress = Progress {
             steps_done,
@@ -206,12 +206,12 @@ impl RunClient {
         }
     }
 
-    /// Takes the scores of the job that was claimed, to deliver them.
+    /// Keeps the scores of the claimed job for delivery.
     pub fn keep(&mut self, report: ScoreReport) {
         self.owed = Some(Owed::Scores(report));
     }
 
-    /// Delivers the scores that are kept, to the life of the learner that is followed now. After an error they are still kept.
+    /// Delivers the kept scores to the learner process that this evaluator follows. Keeps them after an error.
     pub async fn deliver(&mut self, timeout: Duration) -> anyhow::Result<()> {
         let Some(Owed::Scores(report)) = &self.owed else { return Ok(()) };
         let incarnation = self.incarnation;
@@ -238,20 +238,20 @@ impl RunClient {
         Ok(())
     }
 
-    /// Hands back the job that was claimed, which could not be done.
+    /// Hands back the claimed job, which this evaluator could not run.
     pub async fn fail(&mut self, reason: &str) {
         self.metrics.job(JobOutcome::Failed);
         self.hand_back(Some(reason.chars().take(LONGEST_REASON).collect())).await;
     }
 
-    /// Settles what is owed before this evaluator ends: delivers the scores, or hands the job back, as well as it can.
+    /// Before this evaluator ends: delivers the scores, or hands the job back, within a time limit.
     pub async fn leave(mut self) {
         let until = Instant::now() + LEAVE;
         let mut answered = false;
         while self.has_scores() {
             let Err(error) = self.deliver(LEAVE / 2).await else { return };
-            // A learner that answers has the scores, and may still save them: if it could not yet, it says why. If the job went
-            // back now, other evaluators would measure it again.
+            // A learner that answers has received the scores, and may still save them; if it could not, it says why. If the
+            // evaluator handed the job back now, others would run it again.
             let unusable = matches!(error.downcast_ref(), Some(AskError::Unusable { .. }));
             answered |= unusable;
             if !unusable || Instant::now() + AGAIN > until {
@@ -284,7 +284,7 @@ impl RunClient {
         }
     }
 
-    /// Stops serving the run; scores that were not acknowledged are lost.
+    /// Stops serving the run, and drops scores that were not acknowledged.
     pub fn give_up(self) {
         self.snapshots.forget(&self.run);
         if let Some(Owed::Scores(report)) = &self.owed {
@@ -294,7 +294,7 @@ impl RunClient {
     }
 }
 
-/// Whether a reply is from the learner that is followed; if not, the metric's label of that.
+/// Whether a reply is from the followed learner; if not, the label of the reason.
 fn is_from(followed: u64, incarnation: u64) -> Result<(), &'static str> {
     if incarnation == followed { Ok(()) } else { Err("other_incarnation") }
 }

@@ -16,40 +16,40 @@ use zenoh::{Session, Wait};
 use super::query::may_block;
 use crate::metrics::Metrics;
 
-/// Most learners that are followed, over all runs and endpoints: it bounds memory, far above any use.
+/// Most learners that an evaluator follows, over all runs and endpoints. The limit bounds memory; it is far above any use.
 const MOST_LEARNERS: usize = 1024;
-/// How often a session is looked at that may have closed.
+/// How often the evaluator checks that a session is still open.
 const GLANCE: Duration = Duration::from_secs(10);
 
-/// A run as one endpoint shows it: the endpoint's place on the command line, and the run's name.
+/// A run at one endpoint: the endpoint's place on the command line, and the run's name.
 ///
-/// A run that two endpoints show is served through both: either may fail on its own.
+/// The evaluator serves a run of two endpoints through both: either may fail on its own.
 pub type RunKey = (usize, Name);
 
-/// A run whose learner is there.
+/// A run whose learner is connected.
 #[derive(Clone)]
 pub struct Found {
     /// The session that reaches it.
     pub session: Session,
-    /// The incarnations that announce themselves, at least one: a learner that was cut off or killed may still seem to be
-    /// there when the next one starts.
+    /// The incarnations that announce themselves, at least one: the token of a learner that was disconnected or killed may
+    /// still exist when the next one starts.
     pub lives: BTreeSet<u64>,
 }
 
-/// The runs that are there.
+/// The runs whose learners are connected.
 pub type Runs = BTreeMap<RunKey, Found>;
 
-/// Watches every endpoint for as long as it lives.
+/// Watches every endpoint as long as it lives.
 pub struct Discovery {
     runs: watch::Receiver<Runs>,
     tasks: JoinSet<anyhow::Result<Infallible>>,
 }
 
 impl Discovery {
-    /// Starts to watch. An endpoint at which nothing listens yet is waited for.
+    /// Starts to watch. If nothing listens at an endpoint, it waits.
     ///
-    /// Each endpoint gets a session of its own, because a Zenoh client keeps one connection: with one session,
-    /// a second learner's endpoint would only be a spare for the first.
+    /// Each endpoint gets a session of its own, because a Zenoh client keeps one connection: in one session, a second endpoint
+    /// would only be a spare for the first.
     pub fn start(endpoints: Vec<String>, certificates: Option<&Certificates>, metrics: &Metrics) -> Discovery {
         let (found, runs) = watch::channel(Runs::new());
         let mut tasks = JoinSet::new();
@@ -59,12 +59,12 @@ impl Discovery {
         Discovery { runs, tasks }
     }
 
-    /// The runs that are there, as they come and go.
+    /// The current runs, as they come and go.
     pub fn runs(&self) -> watch::Receiver<Runs> {
         self.runs.clone()
     }
 
-    /// Waits until an endpoint cannot be watched any more, which only a wrong endpoint or a bug causes.
+    /// Returns only if an endpoint cannot be watched, which means a wrong endpoint or a bug.
     pub async fn failed(&mut self) -> anyhow::Error {
         match self.tasks.join_next().await {
             Some(Ok(Err(error))) => error,
@@ -109,7 +109,7 @@ async fn watch_endpoint(
     }
 }
 
-/// Takes in a token; says whether the runs have changed, or the metric's label of why it is not taken in.
+/// Records a token. Returns whether the runs have changed, or the label of the reason why it was ignored.
 fn take_in(
     runs: &mut Runs,
     (index, session): (usize, &Session),

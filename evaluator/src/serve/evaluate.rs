@@ -1,4 +1,4 @@
-//! Evaluates jobs, one at a time: loads the policy that a job names, runs its episodes, tells the learner how far they are.
+//! Evaluates jobs, one at a time: loads the policy of a job, runs its episodes, reports progress to the learner.
 
 use std::sync::Arc;
 use std::time::Duration;
@@ -14,25 +14,25 @@ use super::policy::load;
 use crate::metrics::Metrics;
 use crate::sim::Environments;
 
-/// Bounds of the time between two reports of progress that a learner may ask for.
+/// Limits of the time between two reports of progress, which a learner chooses.
 const HEARTBEAT: [Duration; 2] = [Duration::from_millis(50), Duration::from_secs(20)];
 
-/// What evaluates jobs.
+/// Evaluates jobs.
 pub struct Evaluator {
-    /// Its name in every run.
+    /// The evaluator's name in every run.
     pub name: Name,
-    /// Where it can act.
+    /// The environments in which it can act.
     pub environments: Arc<dyn Environments>,
     precision: Precision,
     metrics: Metrics,
-    /// The policy of the last job, by its weights and its environment: the next job is often about the same.
+    /// The policy of the last job, with its weights and its environment, which the next job often needs again.
     policy: Option<(Hash, String, Arc<dyn Policy>)>,
-    /// Says that it is not stuck.
+    /// Reports that the evaluator is not stuck.
     pub beat: Beat,
 }
 
 impl Evaluator {
-    /// An evaluator that computes policies in `precision`, as far as they can be.
+    /// An evaluator that computes policies in `precision`, if the CPU supports it.
     pub fn new(
         name: Name,
         environments: Arc<dyn Environments>,
@@ -43,12 +43,12 @@ impl Evaluator {
         Evaluator { name, environments, precision, metrics, policy: None, beat }
     }
 
-    /// Runs all episodes of `job`, which the learner of `client` has given out, on one snapshot.
+    /// Runs all episodes of `job`, which the learner of `client` has given out, with one snapshot.
     pub async fn evaluate(&mut self, job: &Job, client: &RunClient) -> anyhow::Result<ScoreReport> {
         let metrics = self.metrics.clone();
         job::check(job, self.environments.as_ref()).inspect_err(|error| metrics.rejected(error.label()))?;
         let policy = {
-            // The learner grants some time for this, as long as it hears that the evaluator is at it.
+            // The learner grants time for this, as long as the evaluator reports that it works on it.
             client.tell(job, 0, 0);
             let mut loading = std::pin::pin!(self.policy(job, client));
             loop {
@@ -65,13 +65,13 @@ impl Evaluator {
         Ok(ScoreReport::of(job, self.name.clone(), arithmetic, episodes))
     }
 
-    /// The policy that `job` names, from the last job or from a snapshot.
+    /// The policy of `job`, kept from the last job or loaded from a snapshot.
     async fn policy(&mut self, job: &Job, client: &RunClient) -> anyhow::Result<Arc<dyn Policy>> {
         let name = &job.environment;
         if let Some((.., policy)) = self.policy.as_ref().filter(|last| (last.0, &last.1) == (job.weights, name)) {
             return Ok(policy.clone());
         }
-        // Freed before the next one is built: an evaluator holds one policy.
+        // Freed before the next policy is built: an evaluator holds one policy.
         self.policy = None;
         let (snapshot, precision) = (client.snapshot(job).await?, self.precision);
         let (wanted, sizes) = (name.clone(), self.environments.sizes(name));
@@ -81,8 +81,8 @@ impl Evaluator {
         Ok(policy)
     }
 
-    /// Runs the episodes, and tells of progress as long as there is any: the job of a stuck simulation goes to another
-    /// evaluator.
+    /// Runs the episodes, and reports progress as long as there is any: the learner gives the job of a stuck simulation to
+    /// another evaluator.
     async fn roll_out(
         &self,
         job: &Job,
@@ -99,7 +99,7 @@ impl Evaluator {
             if steps > told {
                 self.beat.alive();
             }
-            // That no step is done yet is told, too: the first step of a large policy takes its time.
+            // The evaluator also reports that no step is done yet: the first step of a large policy takes long.
             if steps > told || steps == 0 {
                 told = steps;
                 tell(steps, running.episodes_done());

@@ -1,4 +1,4 @@
-//! What tests of this room are made of.
+//! Data for the tests of this module.
 
 use candle_core::{DType, Device, Tensor};
 use quad_policy::{
@@ -22,7 +22,7 @@ pub fn job() -> Job {
     }
 }
 
-/// A snapshot of this file.
+/// A snapshot with this file.
 pub fn snapshot(file: Vec<u8>) -> Snapshot {
     Snapshot { run: job().run, incarnation: 1, step: 1, hash: Hash::of(&file), file }
 }
@@ -32,7 +32,7 @@ pub fn smallest() -> DiffusionShape {
     DiffusionShape::quad((11, 3), &MlpConfig::mish(&[1]), 1, 1)
 }
 
-/// The file of a diffusion policy for an environment, all zero, that takes the best of so many candidates.
+/// The file of a diffusion policy for an environment, all zero, that takes the best of `candidates`.
 pub fn file(environment: &str, shape: DiffusionShape, candidates: u32) -> Vec<u8> {
     let zeros = |layout: Layout| {
         let values = Tensor::zeros(layout.count(), DType::F32, &Device::Cpu).unwrap();

@@ -11,25 +11,25 @@ use quad_protocol::{EpisodeScore, Job};
 use crate::metrics::{JobOutcome, Metrics};
 use crate::sim::{EnvironmentError, Environments, EpisodeOutcome, Rollout};
 
-/// Most episodes: each is a simulation of its own. A learner gives forty at most.
+/// Most episodes of a job: each is a simulation. A learner gives forty at most.
 const MAX_EPISODES: usize = 256;
-/// Most memory that one network call may take, bytes: far more than the paper's few megabytes, and far less than an evaluator's
-/// container may have (1 GiB, in docker-compose.yml), of which snapshots and policy take their part.
+/// Most memory of one network call, bytes: far more than the paper's few megabytes, and far less than an evaluator's container
+/// has (1 GiB, in docker-compose.yml), which also holds snapshots and the policy.
 const MAX_BYTES: u64 = 256 << 20;
 
-/// Why a job is not run.
+/// Why the evaluator does not run a job.
 #[derive(Debug, thiserror::Error)]
 pub enum JobError {
-    /// It is empty, or larger than this evaluator runs.
+    /// The job is empty, or too large.
     #[error("it has {0} episodes, but must have from 1 to {MAX_EPISODES}")]
     Size(usize),
-    /// Its policy would take more memory than this evaluator gives.
+    /// Its policy would take too much memory.
     #[error("each of its steps takes {0} bytes of memory, more than {MAX_BYTES}")]
     Memory(u64),
-    /// It took too long.
+    /// The job took too long.
     #[error("its episodes did not end within {} s", Job::LONGEST.as_secs())]
     TooLong,
-    /// Its environment is not known.
+    /// The evaluator does not know its environment.
     #[error("this evaluator has no environment \"{0}\"")]
     Environment(String),
 }
@@ -45,7 +45,7 @@ impl JobError {
     }
 }
 
-/// Checks a job from the wire.
+/// Checks a job from the learner.
 pub fn check(job: &Job, environments: &dyn Environments) -> Result<(), JobError> {
     let episodes = job.seeds.len();
     if !(1..=MAX_EPISODES).contains(&episodes) {
@@ -57,13 +57,13 @@ pub fn check(job: &Job, environments: &dyn Environments) -> Result<(), JobError>
     }
 }
 
-/// Checks that a job does not take too much memory with its policy.
+/// Checks that a job with its policy does not take too much memory.
 pub fn check_memory(job: &Job, policy: &dyn Policy) -> Result<(), JobError> {
     let bytes = policy.memory(job.seeds.len());
     if bytes > MAX_BYTES { Err(JobError::Memory(bytes)) } else { Ok(()) }
 }
 
-/// What the thread that runs a job and the task that watches it share.
+/// The state that the thread of a job and the task that watches it share.
 #[derive(Default)]
 struct Shared {
     cancelled: AtomicBool,
@@ -71,7 +71,7 @@ struct Shared {
     steps_done: AtomicU64,
 }
 
-/// A job that is being run. Dropped before its end, it stops within one step of the batch and counts as abandoned.
+/// A running job. Dropped before its end, it stops within one step of the batch and counts as abandoned.
 pub struct Running {
     shared: Arc<Shared>,
     metrics: Metrics,
@@ -85,7 +85,8 @@ impl Running {
         let shared = Arc::new(Shared::default());
         let thread = tokio::task::spawn_blocking({
             let (shared, metrics, job) = (shared.clone(), metrics.clone(), job.clone());
-            // On a thread of rayon's pool: otherwise each parallel part of each step would wake one and wait for it.
+            // On a thread of rayon's pool: any other thread would have to wake one, and wait for it, in each parallel part of
+            // each step.
             move || {
                 let roll_out =
                     |_: &_| roll_out(environments.as_ref(), &job, policy.as_ref(), &shared, &metrics, Job::LONGEST);
@@ -105,7 +106,7 @@ impl Running {
         self.shared.steps_done.load(Relaxed)
     }
 
-    /// Waits up to `patience` for the end; `None` if it is not there yet.
+    /// Waits up to `patience` for the end; `None` if it has not come by then.
     pub async fn finished_within(&mut self, patience: Duration) -> Option<anyhow::Result<Vec<EpisodeScore>>> {
         let thread = self.thread.as_mut()?;
         let joined = tokio::time::timeout(patience, thread).await.ok()?;
@@ -131,8 +132,8 @@ impl Drop for Running {
     }
 }
 
-/// Runs all episodes to their end, or gives `None` when cancelled. Fails if the policy cannot act, an environment breaks down,
-/// or it takes longer than `longest`.
+/// Runs all episodes to their end; `None` if cancelled. Fails if the policy cannot act, an environment fails, or the job takes
+/// longer than `longest`.
 fn roll_out(
     environments: &dyn Environments,
     job: &Job,
@@ -168,7 +169,7 @@ fn roll_out(
     Ok(Some(rollout.into_outcomes()))
 }
 
-/// The job's episodes, at their beginning.
+/// The episodes of the job, at their beginning.
 fn episodes(
     environments: &dyn Environments,
     job: &Job,
@@ -218,7 +219,7 @@ mod tests {
         assert!(matches!(error.downcast_ref(), Some(JobError::TooLong)), "{error}");
     }
 
-    /// Hopper under another name, which remembers the seeds that environments are made with.
+    /// Hopper under another name, which records the seeds of its environments.
     #[derive(Default)]
     struct Renamed(Mutex<Vec<u64>>);
 

@@ -1,19 +1,19 @@
 //! Serving: finds runs, evaluates the snapshots that their learners publish, delivers the scores.
 //!
-//! Owns the sessions, one for each endpoint, and everything that is between this evaluator and the learners; nothing of it must
-//! last. One task does it all in turn, on the main thread; a job's episodes run on a thread of their own and on rayon's,
-//! calls of Zenoh that may block on tokio's, and Zenoh's threads decode what comes in. Only the command line calls it; it uses
-//! `sim`. When the evaluator is told to leave, it hands its job back; if it is killed, the job goes to another evaluator
-//! when the lease runs out.
+//! Owns the sessions, one for each endpoint, and the state of all communication with learners, which need not last. One task
+//! on the main thread does the work in turn. A job's episodes run on a thread of their own and on rayon's, blocking calls of
+//! Zenoh on tokio's, and Zenoh's own threads decode messages. Only the command line calls this module; it uses `sim`. An
+//! evaluator that is told to leave hands its job back; the learner gives the job of a killed evaluator to another when the
+//! lease ends.
 //!
 //! # Layout
 //!
 //! In reading order:
 //!
 //! - `discovery`: finds the runs, by their learners' liveliness tokens.
-//! - `worker`: the main loop, which serves the runs in turn; `scheduler`: whose turn it is.
-//! - `client`: everything that is exchanged with the learner of one run; `query`: a query to a learner.
-//! - `snapshot`: keeps the newest snapshots; `policy`: makes a policy of one.
+//! - `worker`: the main loop, which serves the runs in turn; `scheduler`: chooses the next run.
+//! - `client`: all communication with the learner of one run; `query`: a query to a learner.
+//! - `snapshot`: keeps the newest snapshots; `policy`: makes a policy from one.
 //! - `evaluate`: one job, from its policy to its scores; `job`: all of its episodes, as one batch.
 
 mod client;
@@ -51,18 +51,18 @@ use evaluate::Evaluator;
 use worker::Worker;
 
 const AFTER_HELP: &str = "\
-The evaluator finds all runs at its endpoints, also those that start later, and serves them in turn. Stop it at any time
-(Ctrl-C or SIGTERM): its job goes to another evaluator.
+The evaluator finds all runs at its endpoints, also runs that start later, and serves them in turn. You may stop it at any time
+(Ctrl-C or SIGTERM): the learner gives its job to another evaluator.
 
 Examples:
-  evaluator serve                                       the learner of this machine
+  evaluator serve                                       a learner on this machine
   evaluator serve --connect tcp/learner.example:7447    a learner or router elsewhere
   evaluator serve --connect tls/learner.example:7447 --certificates certificates/box7    the same, by TLS
   evaluator serve --metrics 127.0.0.1:9101              with http://127.0.0.1:9101/metrics
 
-RAYON_NUM_THREADS sets how many processor cores are used; without it, all are.";
+RAYON_NUM_THREADS sets the number of processor cores; the default is all.";
 
-/// Measure the weights that learners publish, until told to stop
+/// Evaluate the snapshots that learners publish, until told to stop
 #[derive(Args, Debug)]
 #[command(after_help = AFTER_HELP)]
 pub struct ServeArgs {
@@ -70,30 +70,29 @@ pub struct ServeArgs {
     /// [default: tcp/127.0.0.1:7447, or tls/… with --certificates]
     #[arg(long, value_name = "ENDPOINT", value_parser = parse_endpoint)]
     pub connect: Vec<String>,
-    /// Folder with ca.pem, cert.pem and key.pem, with which this evaluator proves who it is at endpoints like tls/HOST:PORT
-    /// (docs/security.md)
+    /// Folder with ca.pem, cert.pem and key.pem, for endpoints tls/HOST:PORT (docs/security.md)
     #[arg(long, value_name = "DIR", env = "QUAD_CERTIFICATES")]
     pub certificates: Option<PathBuf>,
-    /// Where to serve /metrics and /healthz; port 0 takes a free one
+    /// Address of /metrics and /healthz; port 0 takes a free one
     #[arg(long, value_name = "ADDR:PORT")]
     pub metrics: Option<SocketAddr>,
     /// Name in scores and metrics, unique among the evaluators of a run [default: HOST-PID-RANDOM]
     #[arg(long, value_parser = |text: &str| Name::new(text))]
     pub name: Option<Name>,
-    /// Arithmetic of the networks, f32 or bf16, which rounds and is faster on CPUs with AMX or AMD's AVX512-BF16
+    /// Precision of the networks: f32, or bf16, which rounds and is faster on CPUs with AMX or AMD's AVX512-BF16
     #[arg(long, value_name = "NAME", default_value = "f32")]
     pub precision: Precision,
 }
 
-/// Where a learner of this machine listens by default.
+/// The default port of a learner on this machine.
 pub(crate) const DEFAULT_PORT: u16 = 7447;
-/// When all is done, the process waits this long for its threads.
+/// How long the process waits for its threads at the end.
 const LEAVE: Duration = Duration::from_secs(1);
 
-/// The evaluator counts as stuck when it has got nowhere for this long. It waits up to half a minute for weights.
+/// The evaluator counts as stuck if it has made no progress for this long. It waits up to half a minute for weights.
 const STUCK: Duration = Duration::from_secs(60);
 
-/// Serves until SIGINT or SIGTERM, with these environments.
+/// Serves these environments until SIGINT or SIGTERM.
 ///
 /// # Errors
 /// An endpoint or a folder of certificates that cannot be used, or a session that closed for good.
@@ -120,7 +119,7 @@ async fn serve_until_stopped(args: ServeArgs, environments: Arc<dyn Environments
         warn!("{}", Precision::UNAVAILABLE);
     }
     let health = Health::default();
-    // Serves for as long as it is held.
+    // Serves as long as this value lives.
     let _server = match args.metrics {
         Some(address) => {
             let server =
@@ -162,16 +161,16 @@ fn endpoints(mut connect: Vec<String>, certificates: Option<&Path>) -> anyhow::R
 
 /// Gives a freed snapshot's memory back to the system at once.
 ///
-/// Left alone, glibc learns from the first freed snapshot to serve the next ones from its heaps, one for each thread,
-/// which keep what they once had: with the paper's networks that is the difference between 50 and 150 MB.
+/// By default glibc learns from the first freed snapshot to serve later ones from its heaps, one per thread, which never
+/// shrink: with the paper's networks the process then has 150 MB instead of 50.
 fn keep_heap_small() {
-    // Snapshots are larger, what a step of a batch needs is smaller.
+    // Snapshots are larger than this; what a step of a batch needs is smaller.
     const LARGE_BLOCK: i32 = 2 << 20;
     // SAFETY: sets a parameter of the allocator, which may be done at any time.
     unsafe { libc::mallopt(libc::M_MMAP_THRESHOLD, LARGE_BLOCK) };
 }
 
-/// Host and process for people, a random part because containers share both.
+/// Host and process for readers, and a random part, because containers may share both.
 fn unique_name() -> anyhow::Result<Name> {
     let host = std::fs::read_to_string("/proc/sys/kernel/hostname").unwrap_or_default();
     let host: String = host.chars().filter(|c| c.is_ascii_alphanumeric() || *c == '-').take(40).collect();

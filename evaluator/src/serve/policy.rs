@@ -1,23 +1,23 @@
-//! Makes of a snapshot the policy that acts in a job's environment.
+//! Makes a policy from a snapshot.
 
 use quad_policy::{Header, Policy, PolicyError, Precision, load_policy};
 use quad_protocol::{Origin, Snapshot};
 
-/// Of the name of an environment that a file says, so much is told to people, in characters.
+/// Most characters of an environment's name from a file that messages show.
 const LONGEST_NAME: usize = 64;
 
 /// Why a snapshot is no policy for an environment.
 #[derive(Debug, thiserror::Error)]
 pub enum LoadError {
-    /// It is for another environment, or has other sizes.
+    /// The snapshot is for another environment, or has other sizes.
     #[error("the snapshot is for {found}, the job's environment is {wanted}")]
     Environment {
-        /// What the snapshot is for.
+        /// The environment of the snapshot.
         found: String,
-        /// What it would have to be for.
+        /// The environment of the job.
         wanted: String,
     },
-    /// Its file is no policy.
+    /// The file is no policy.
     #[error(transparent)]
     Policy(#[from] PolicyError),
 }
@@ -32,7 +32,7 @@ impl LoadError {
     }
 }
 
-/// Loads the policy of `snapshot`, which is to act in the environment `wanted`, whose sizes may be known.
+/// Loads the policy of `snapshot` for the environment `wanted`, whose sizes may be known.
 pub fn load(
     snapshot: &Snapshot,
     (wanted, wanted_sizes): (&str, Option<(usize, usize)>),

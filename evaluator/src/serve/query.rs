@@ -9,24 +9,24 @@ use zenoh::{Session, Wait};
 
 use crate::metrics::Metrics;
 
-/// Most answers to one query that wait to be looked at; one is enough, and few peers answer.
+/// Most answers to one query that wait; one is enough, and few peers answer.
 const MOST_ANSWERS: usize = 64;
-/// Most bytes of a learner's error that are shown.
+/// Most bytes of a learner's error in a message.
 const LONGEST_ERROR: usize = 200;
 
 /// Why a query brought no answer.
 #[derive(Debug, thiserror::Error)]
 pub enum AskError {
-    /// There is no learner or no network, or the answer took too long.
+    /// No learner or no network, or the answer took too long.
     #[error("no answer at {key}")]
     Silent {
-        /// The key that was asked.
+        /// The key of the query.
         key: String,
     },
-    /// A learner answered, but with an error, or with something that is not the answer to this query.
+    /// A learner answered with an error, or with a wrong answer.
     #[error("unusable answer at {key}: {reason}")]
     Unusable {
-        /// The key that was asked.
+        /// The key of the query.
         key: String,
         /// The learner's error, or what is wrong with the answer.
         reason: String,
@@ -34,24 +34,24 @@ pub enum AskError {
     /// Zenoh could not send the query.
     #[error("cannot ask {key}: {reason}")]
     Send {
-        /// The key that was asked.
+        /// The key of the query.
         key: String,
-        /// Zenoh's own words.
+        /// Zenoh's error message.
         reason: String,
     },
 }
 
-/// Runs a call of Zenoh on a thread that may block. Zenoh's `get` and declarations do all their work in the first poll of their
-/// futures, and while a peer does not read, that takes until Zenoh closes the connection: two seconds, in which the task that
-/// awaits them could do nothing else.
+/// Runs a call of Zenoh on a thread that may block. Zenoh's `get` and declarations do all their work in the first poll of
+/// their futures. While a peer does not read, that poll blocks until Zenoh closes the connection after two seconds, and the
+/// awaiting task with it.
 pub async fn may_block<T: Send + 'static>(
     call: impl FnOnce() -> zenoh::Result<T> + Send + 'static,
 ) -> anyhow::Result<T> {
     tokio::task::spawn_blocking(call).await?.map_err(|error| anyhow::anyhow!(error))
 }
 
-/// Sends `question` to every learner at `key` and gives the first answer that can be decoded and is `fitting`, which gives the
-/// metric's label of what is wrong with one that is not. It does not wait for further answers.
+/// Sends `question` to every learner at `key`. Returns the first answer that can be decoded and that `fitting` accepts,
+/// without waiting for further ones; for a wrong answer `fitting` returns the label of the reason.
 pub async fn ask<A: Message + Send + 'static>(
     session: &Session,
     key: String,
@@ -69,15 +69,15 @@ pub async fn ask<A: Message + Send + 'static>(
                     tell.try_send(read(&reply, &metrics, &fitting)).ok();
                 }
             };
-            // All targets: the best matching one would be any peer that claims to be complete. No consolidation, which would
-            // hold answers back until every peer has answered.
+            // All targets: the best matching target would be any peer that claims to be complete. No consolidation, which
+            // would hold answers back until every peer has answered.
             let get = session.get(key).payload(question).timeout(timeout);
             get.target(QueryTarget::All).consolidation(ConsolidationMode::None).callback(callback).wait()
         }
     };
     may_block(get).await.map_err(|error| AskError::Send { key: key.clone(), reason: error.to_string() })?;
     let mut unusable = None;
-    // Zenoh drops the callback, and with it the channel's other end, after the last answer or the timeout.
+    // Zenoh drops the callback, and with it the sender of the channel, after the last answer or the timeout.
     while let Some(answer) = told.recv().await {
         match answer {
             Ok(answer) => return Ok(answer),
@@ -145,7 +145,7 @@ mod tests {
     async fn a_peer_that_does_not_read_does_not_stop_the_task_that_asks() {
         let listen = Endpoints { listen: vec!["tcp/127.0.0.1:0".to_owned()], ..Endpoints::default() };
         let learner = open_session(&listen).await.unwrap();
-        // As long as this callback has not returned, the learner's session reads nothing.
+        // Until this callback returns, the learner's session reads nothing.
         let stalls = Arc::new(AtomicBool::new(true));
         let callback = {
             let stalls = stalls.clone();

@@ -1,11 +1,11 @@
-//! Whose turn it is: the runs are served round-robin, and one that fails is left alone for a while.
+//! Chooses the next run: round-robin, with a pause after a failure.
 
 use std::time::{Duration, Instant};
 
-/// First and longest pause after a learner did not answer though it is connected, or its job came to nothing.
+/// First and longest pause after a connected learner did not answer, or after its job failed.
 const BACK_OFF: [Duration; 2] = [Duration::from_millis(250), Duration::from_secs(5)];
 
-/// When one run is to be served next.
+/// When a run is due next.
 #[derive(Clone, Debug)]
 pub struct Turn {
     ready_at: Instant,
@@ -14,41 +14,41 @@ pub struct Turn {
 }
 
 impl Turn {
-    /// Of a run that has just been found: it is ready.
+    /// The state of a run that was just found: due now.
     pub fn new(now: Instant) -> Turn {
         Turn { ready_at: now, back_off: BACK_OFF[0] }
     }
 
-    /// When the run is ready.
+    /// When the run is due.
     pub fn ready_at(&self) -> Instant {
         self.ready_at
     }
 
-    /// Its learner is there again: the run is ready, whatever went wrong before.
+    /// The learner is back: the run is due, whatever failed before.
     pub fn wake(&mut self, now: Instant) {
         *self = Turn::new(now);
     }
 
-    /// There may be work: the run is ready, unless its last turn failed.
+    /// There may be work: the run is due, unless its last turn failed.
     pub fn nudge(&mut self, now: Instant) {
         if self.back_off == BACK_OFF[0] {
             self.ready_at = self.ready_at.min(now);
         }
     }
 
-    /// A turn went well: the next one comes when every other run that is ready has had its own, and not before `pause` is over.
+    /// After a turn that went well: the next turn comes when every other due run had its turn, and `pause` is over.
     pub fn done(&mut self, now: Instant, pause: Duration) {
         *self = Turn::new(now + pause);
     }
 
-    /// A turn failed: the pause before the next one is longer each time.
+    /// After a turn that failed: each pause is longer than the last.
     pub fn failed(&mut self, now: Instant) {
         self.ready_at = now + self.back_off;
         self.back_off = (2 * self.back_off).min(BACK_OFF[1]);
     }
 }
 
-/// The run that has been ready for longest; `None` if none is.
+/// The run that has been due for longest; `None` if none is due.
 pub fn next<'a, K>(runs: impl Iterator<Item = (K, &'a Turn)>, now: Instant) -> Option<K> {
     let ready = runs.filter(|(_, turn)| turn.ready_at <= now);
     ready.min_by_key(|(_, turn)| turn.ready_at).map(|(key, _)| key)
@@ -58,14 +58,14 @@ pub fn next<'a, K>(runs: impl Iterator<Item = (K, &'a Turn)>, now: Instant) -> O
 mod tests {
     use super::*;
 
-    /// What a run's turns are like.
+    /// How the turns of a run go.
     #[derive(Clone, Copy)]
     enum Kind {
         /// Each takes a second and goes well.
         Works,
-        /// Each takes five seconds, in which no answer comes.
+        /// Each takes five seconds without an answer.
         Silent,
-        /// The learner has no work, and says so at once.
+        /// The learner answers at once that it has no work.
         Idle,
     }
 

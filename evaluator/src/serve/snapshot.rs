@@ -1,4 +1,4 @@
-//! Snapshots: each that a learner publishes is decoded and verified once, when it comes, and the newest are kept.
+//! Keeps the newest snapshots. Each published snapshot is decoded and verified once, when it arrives.
 
 use std::collections::VecDeque;
 use std::sync::atomic::{AtomicBool, AtomicU64, Ordering::Relaxed};
@@ -14,25 +14,25 @@ use zenoh::{Session, Wait};
 use super::query::may_block;
 use crate::metrics::Metrics;
 
-/// Most memory for the snapshots that are kept, of all runs together, bytes; the largest that there may be fits.
+/// Most memory for kept snapshots, of all runs together, bytes; the largest allowed snapshot fits.
 const MOST_BYTES: usize = 256 << 20;
 
-/// Whether `snapshot` is exactly the one that `job` names. Its hash was verified when it was decoded.
+/// Whether `snapshot` is the one that `job` names. Decoding has verified its hash.
 pub fn is_named_by(job: &Job, snapshot: &Snapshot) -> bool {
     let named = (&job.run, job.incarnation, job.step, job.weights);
     named == (&snapshot.run, snapshot.incarnation, snapshot.step, snapshot.hash)
 }
 
-/// The newest snapshot of each run, as far as there is memory. Clones share them.
+/// The newest snapshot of each run, as far as memory allows. Clones share them.
 #[derive(Clone, Default)]
 pub struct Snapshots {
-    /// In the order in which they came.
+    /// In the order of arrival.
     kept: Arc<Mutex<VecDeque<Arc<Snapshot>>>>,
     arrived: Arc<Notify>,
 }
 
 impl Snapshots {
-    /// Keeps a snapshot in place of the run's last one. Where memory is short, those go that came first.
+    /// Keeps a snapshot in place of the run's last one. If memory is short, drops the oldest.
     fn keep(&self, snapshot: Snapshot) {
         self.forget(&snapshot.run);
         let mut kept = self.lock();
@@ -44,7 +44,7 @@ impl Snapshots {
         self.arrived.notify_one();
     }
 
-    /// Frees what is kept of a run.
+    /// Drops the snapshot of a run.
     pub fn forget(&self, run: &Name) {
         self.lock().retain(|snapshot| snapshot.run != *run);
     }
@@ -64,7 +64,7 @@ impl Snapshots {
     }
 }
 
-/// Listens to what the learner of one run publishes, for as long as it lives.
+/// Receives the snapshots of one run's learner as long as it lives.
 pub struct Listener {
     state: Arc<State>,
     _subscriber: Subscriber<()>,
@@ -72,17 +72,17 @@ pub struct Listener {
 
 #[derive(Default)]
 struct State {
-    /// Whose snapshots are kept.
+    /// The learner whose snapshots are kept.
     incarnation: AtomicU64,
     has_news: AtomicBool,
-    /// One bad snapshot is a line in the log; all are counted.
+    /// Whether a bad snapshot was logged as a warning; further ones are only counted.
     warned: AtomicBool,
 }
 
 impl Listener {
-    /// Listens to `quad/<run>/weights` and puts into `snapshots` what the [followed](Self::follow) learner publishes.
+    /// Subscribes to `quad/<run>/weights` and puts the snapshots of the [followed](Self::follow) learner into `snapshots`.
     ///
-    /// Zenoh's thread that receives also decodes and verifies: that takes milliseconds, in which no other message comes in.
+    /// Zenoh's receiving thread also decodes and verifies: that takes milliseconds, in which it receives no other message.
     pub async fn start(
         session: &Session,
         run: Name,
@@ -112,7 +112,7 @@ impl Listener {
         Ok(Listener { state, _subscriber: may_block(declare).await? })
     }
 
-    /// From now on keeps only what this incarnation of the learner publishes.
+    /// From now on, keeps only the snapshots of this incarnation of the learner.
     pub fn follow(&self, incarnation: u64) {
         self.state.incarnation.store(incarnation, Relaxed);
     }
@@ -123,7 +123,7 @@ impl Listener {
     }
 }
 
-/// A snapshot of the learner that is followed; or the metric's label of what is wrong with it, and that in words.
+/// Decodes a snapshot of the followed learner; on failure returns the label of the reason, and a message.
 fn read(sample: &Sample, run: &Name, state: &State) -> Result<Snapshot, (&'static str, String)> {
     let payload = sample.payload();
     let snapshot: Snapshot =

@@ -15,15 +15,15 @@ use super::scheduler;
 use super::snapshot::Snapshots;
 use crate::metrics::Metrics;
 
-/// Scores are kept this long for a learner that is gone, which may be disconnected only for a while.
+/// How long scores are kept for a learner that is gone, perhaps only disconnected.
 const KEEP_SCORES: Duration = Duration::from_secs(600);
 
-/// Serves every run that is found, one job at a time.
+/// Serves all runs, one job at a time.
 pub struct Worker {
     evaluator: Evaluator,
     metrics: Metrics,
     found: watch::Receiver<Runs>,
-    /// The runs that are served, and those whose learner is gone but may come back for its scores.
+    /// The runs that it serves, and runs whose learner is gone but may come back for its scores.
     clients: BTreeMap<RunKey, RunClient>,
     snapshots: Snapshots,
 }
@@ -34,8 +34,8 @@ impl Worker {
         Worker { evaluator, metrics, found, clients: BTreeMap::new(), snapshots: Snapshots::default() }
     }
 
-    /// Serves until `stop` is ready, whose result it gives. A job that is not done then is handed back, and scores that were not
-    /// acknowledged are delivered.
+    /// Serves until `stop` is ready, and returns its result. Then hands an unfinished job back, and delivers scores that were
+    /// not acknowledged.
     pub async fn run(mut self, stop: impl Future<Output = anyhow::Result<()>>) -> anyhow::Result<()> {
         let result = tokio::select! {
             biased;
@@ -67,7 +67,7 @@ impl Worker {
         }
     }
 
-    /// Follows the learners of the runs that it serves, and stops serving those that are gone.
+    /// Follows the learners of its runs, and stops serving runs whose learners are gone.
     fn follow_learners(&mut self) {
         let (found, now) = (self.found.borrow_and_update(), Instant::now());
         let over = |(key, client): (&RunKey, &mut RunClient)| {
@@ -84,7 +84,7 @@ impl Worker {
         }
     }
 
-    /// Attaches to the runs that it does not serve yet.
+    /// Starts to serve new runs.
     async fn attach(&mut self) {
         let found = self.found.borrow().clone();
         for (key, learner) in found.iter().filter(|(key, _)| !self.clients.contains_key(*key)).collect::<Vec<_>>() {
@@ -112,7 +112,7 @@ impl Worker {
         Ok(())
     }
 
-    /// One run's turn.
+    /// Takes one turn of a run.
     async fn turn(&mut self, key: &RunKey) {
         let Some(client) = self.clients.get_mut(key) else { return };
         if let Err(error) = serve(client, &mut self.evaluator).await {
@@ -124,7 +124,7 @@ impl Worker {
     }
 }
 
-/// Delivers scores if there are any, else does one job.
+/// Delivers scores if there are any, else runs one job.
 async fn serve(client: &mut RunClient, evaluator: &mut Evaluator) -> anyhow::Result<()> {
     if !client.has_scores() {
         let Some(job) = client.claim(evaluator.environments.names()).await? else { return Ok(()) };

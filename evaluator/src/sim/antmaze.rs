@@ -6,12 +6,13 @@
 //!   linear and angular velocities, then the joints'. Metres and radians, per second.
 //! - Observation (29): qpos and qvel. The goal is not part of it.
 //! - Action (8): torques of hip and ankle of legs 4, 1, 2 and 3, as fractions of 30 Nm, clipped to ±1; held for 0.1 s.
-//! - An episode begins in the maze's `R` and ends in the step that brings the torso's centre within 0.5 m of the goal. That
-//!   step's reward is 1, every other's 0. Nothing else ends it but the time limit: an ant on its back goes on.
+//! - An episode begins in the maze's `R` and ends in the step that brings the torso's centre within 0.5 m of the goal. The
+//!   reward of that step is 1, of every other 0. Only the goal and the time limit end an episode: an ant on its back
+//!   continues.
 //! - The goal lies around the corner of cell `G`: on each axis max(0, the cell's centre + U(0, 1) + U(0, 0.5)), drawn when
 //!   the table says ([`Goal`]).
 //!
-//! As in the locomotion tasks, a simulation that diverged and an action that is not a number end the episode, with reward 0.
+//! As in the locomotion tasks, a simulation that diverges and an action that is not a number end the episode, with reward 0.
 
 use quad_dataset::environment::{EnvironmentSpec, Goal};
 use rand::{Rng, SeedableRng};
@@ -21,7 +22,7 @@ use super::environment::{EnvironmentError, Step};
 use super::physics::{self, Noise, Physics};
 use super::simulation::{GOAL_STREAM, Simulation};
 
-/// The ant on its floor; the walls go where it has [`WALLS`].
+/// The ant on its floor; [`WALLS`] marks the place of the walls.
 const ANT: &str = include_str!("../../assets/ant.xml");
 const WALLS: &str = "<!-- walls -->";
 /// Side of a maze's cell, metres.
@@ -100,7 +101,8 @@ pub(super) struct AntMaze {
 }
 
 impl AntMaze {
-    /// An ant that waits for its first [`reset`](Simulation::reset). `environment_seed` is that of a goal that is kept.
+    /// An ant that waits for its first [`reset`](Simulation::reset). `environment_seed` is the seed of a goal that all
+    /// episodes share.
     pub fn new(maze: &'static Maze, spec: &EnvironmentSpec, environment_seed: u64) -> Result<Self, EnvironmentError> {
         let model = physics::model(maze.name, || maze.mjcf())?;
         Ok(Self {

@@ -1,11 +1,11 @@
-//! What an environment is: the seam between a policy and whatever moves the task, in this program or in another language.
+//! What an environment is: the interface between a policy and a simulation, in this program or in another language.
 
 use quad_dataset::EnvironmentSpec;
 use thiserror::Error;
 
 use super::simulation::Simulation;
 
-/// What one step of an environment gave.
+/// The result of one step of an environment.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Step {
     /// The reward of this step.
@@ -16,12 +16,12 @@ pub struct Step {
     pub truncated: bool,
 }
 
-/// A place to act in, as a rollout needs it.
+/// An environment, as a rollout needs it.
 pub trait Environment: Send {
-    /// Starts an episode, which is a function of its seed and its actions alone.
+    /// Starts an episode, which is a function of its seed and its actions only.
     ///
     /// # Errors
-    /// The environment broke down. So may each of the next two.
+    /// The environment failed; so may the next two methods.
     fn reset(&mut self, seed: u64) -> Result<(), EnvironmentError>;
 
     /// Applies an action for one control period.
@@ -33,23 +33,23 @@ pub trait Environment: Send {
     /// The current observation.
     fn observation(&self) -> &[f64];
 
-    /// The score of the episode that has ended, given the undiscounted sum of its rewards.
+    /// The score of the ended episode, given the undiscounted sum of its rewards.
     ///
     /// # Errors
     /// As [`Self::reset`].
     fn score(&mut self, episode_return: f64) -> Result<f64, EnvironmentError>;
 }
 
-/// What an evaluator can make environments of.
+/// Makes environments for an evaluator.
 pub trait Environments: Send + Sync {
     /// The names that learners may ask for.
     fn names(&self) -> Vec<String>;
 
-    /// Numbers in an observation and in an action, where they are known before there is an environment.
+    /// The sizes of an observation and of an action, if they are known before an environment exists.
     fn sizes(&self, name: &str) -> Option<(usize, usize)>;
 
-    /// Makes an environment. `environment_seed` is that of what it draws once and keeps over all episodes, if there is any
-    /// such thing.
+    /// Makes an environment. `environment_seed` is the seed of what the environment draws once and keeps over all episodes, if
+    /// anything.
     ///
     /// # Errors
     /// The name is none of [`Self::names`], or the environment cannot be made.
@@ -81,26 +81,26 @@ impl Environment for Simulated {
     }
 }
 
-/// Why there is no environment, or none any more.
+/// Why an environment is missing or failed.
 #[derive(Debug, Error)]
 pub enum EnvironmentError {
     /// The name is known to the dataset crate, but this evaluator has no simulation of it.
     #[error("this evaluator cannot simulate the environment \"{0}\"")]
     NotSimulated(String),
-    /// It gave an observation of another size than the policy takes.
+    /// The environment gave an observation of another size than the policy takes.
     #[error("an observation has {found} numbers, but the policy takes {wanted}")]
     Observation {
-        /// Numbers that it gave.
+        /// Size of the observation.
         found: usize,
-        /// Numbers that the policy takes.
+        /// Size that the policy takes.
         wanted: usize,
     },
-    /// It broke down, in its own words.
+    /// The environment failed, with its own message.
     #[error("the environment \"{name}\" failed: {reason}")]
     Failed {
-        /// Which.
+        /// The environment.
         name: String,
-        /// Why.
+        /// The message.
         reason: String,
     },
     /// MuJoCo refused the embedded model: the library is not the version that this program was built for.
@@ -108,7 +108,7 @@ pub enum EnvironmentError {
     Model {
         /// Whose model.
         simulation: &'static str,
-        /// MuJoCo's own words.
+        /// MuJoCo's error message.
         reason: String,
     },
     /// MuJoCo could not allocate the state of a simulation.

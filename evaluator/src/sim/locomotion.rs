@@ -1,17 +1,17 @@
-//! Hopper, HalfCheetah and Walker2d: robots in a vertical plane, paid for running along x.
+//! Hopper, HalfCheetah and Walker2d: robots in a vertical plane, rewarded for running along x.
 //!
 //! They are D4RL's locomotion-v2 tasks, gym's "-v2" and Gymnasium's "-v4", and differ in a model and a few constants:
 //!
 //! - qpos: x, z and pitch of the torso, then the joints from the hip down (HalfCheetah: the back leg first; Walker2d:
 //!   the right one); qvel: their velocities. Metres and radians, per second.
-//! - Observation: qpos without x, then qvel, clipped to ±10 but for HalfCheetah's.
+//! - Observation: qpos without x, then qvel, clipped to ±10 (not for HalfCheetah).
 //! - Action: torques of the joints in that order, as fractions of the motors' strongest, clipped to ±1.
-//! - Reward: x's mean velocity over the control period, plus 1 for Hopper and Walker2d, minus `control_cost` · Σ a², with
-//!   the clipped action. The 1 is paid at every step, also at the one that ends the episode.
-//! - The episode is terminated where the robot is not healthy any more, and truncated after `max_episode_steps`.
+//! - Reward: x's mean velocity over the control period, plus 1 for Hopper and Walker2d, minus `control_cost` · Σ a², with the
+//!   clipped action. Every step earns the 1, also the step that ends the episode.
+//! - The episode terminates when the robot is not healthy, and is truncated after `max_episode_steps`.
 //!
-//! Two cases that Gymnasium does not handle end the episode here, with no reward for that step: a simulation that diverged,
-//! and an action that is not a number (which is not applied). So a return is finite whatever the policy does.
+//! Gymnasium does not handle two cases, which here end the episode without reward for that step: a simulation that diverges,
+//! and an action that is not a number (which is not applied). So every return is finite.
 
 use quad_dataset::environment::EnvironmentSpec;
 
@@ -19,7 +19,7 @@ use super::environment::{EnvironmentError, Step};
 use super::physics::{self, Noise, Physics};
 use super::simulation::Simulation;
 
-/// What tells one robot from another.
+/// What distinguishes the robots.
 pub(super) struct Robot {
     /// The simulation's name in the table of environments.
     pub name: &'static str,
@@ -29,13 +29,13 @@ pub(super) struct Robot {
     frame_skip: usize,
     /// Noise on the initial state.
     noise: Noise,
-    /// Paid at every step.
+    /// Reward of every step.
     alive_bonus: f64,
-    /// The price of a squared action.
+    /// Cost of a squared action.
     control_cost: f64,
-    /// Bound on each velocity as it is observed.
+    /// Limit of each observed velocity.
     observed_velocity: f64,
-    /// Whether the episode goes on, given qpos and qvel. False for what is not a number: no comparison with it holds.
+    /// Whether the episode continues, given qpos and qvel. False for NaN, because no comparison with NaN holds.
     is_healthy: fn(&[f64], &[f64]) -> bool,
 }
 

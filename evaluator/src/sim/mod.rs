@@ -1,13 +1,13 @@
-//! Simulation: the tasks that a policy acts in, and whole batches of their episodes.
+//! Simulation: environments, and batches of episodes.
 //!
 //! Owns the compiled MuJoCo models, which the process shares. Everything runs on the calling thread; a rollout shares the
-//! physics among rayon's threads. `serve` and `tools` call it; it calls neither, and knows nothing of the network.
+//! physics among rayon's threads. `serve` and `tools` call this module; it calls neither, and knows nothing of the network.
 //!
 //! # Layout
 //!
 //! In reading order:
 //!
-//! - `environment`: what an environment is, whatever moves it; `simulation`: one that this program simulates.
+//! - `environment`: the traits of an environment; `simulation`: an environment that this program simulates.
 //! - `locomotion` (Hopper, HalfCheetah, Walker2d), `antmaze`: the tasks, with the rules that D4RL's scores are defined by;
 //!   `physics`: drives MuJoCo for them.
 //! - `simulations`: makes an environment by its name in the dataset crate's table.

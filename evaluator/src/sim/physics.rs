@@ -14,7 +14,7 @@ use rand_distr::{Distribution, StandardNormal};
 use super::environment::EnvironmentError;
 use super::simulation::RESET_STREAM;
 
-/// The model of a simulation, compiled from the text that `mjcf` writes if the process does not have it yet.
+/// The compiled model of a simulation. If the process does not have it yet, it is compiled from the text that `mjcf` writes.
 pub(super) fn model(simulation: &'static str, mjcf: impl FnOnce() -> String) -> Result<Arc<MjModel>, EnvironmentError> {
     static MODELS: Mutex<BTreeMap<&str, Arc<MjModel>>> = Mutex::new(BTreeMap::new());
     static LOGGING: Once = Once::new();
@@ -22,14 +22,14 @@ pub(super) fn model(simulation: &'static str, mjcf: impl FnOnce() -> String) -> 
     if let Some(model) = models.get(simulation) {
         return Ok(Arc::clone(model));
     }
-    // SAFETY: every use of MuJoCo in this program starts with a compiled model, so none runs before this has.
+    // SAFETY: every use of MuJoCo in this program starts with a compiled model, so none runs before this.
     LOGGING.call_once(|| unsafe { set_log_handler(log) });
     let model = MjModel::from_xml_string(&mjcf())
         .map_err(|error| EnvironmentError::Model { simulation, reason: error.to_string() })?;
     Ok(Arc::clone(models.entry(simulation).or_insert(Arc::new(model))))
 }
 
-/// Writes MuJoCo's messages to this program's log. MuJoCo's own handler appends to `MUJOCO_LOG.TXT` in the working directory.
+/// Sends MuJoCo's messages to this program's log. MuJoCo's own handler appends to `MUJOCO_LOG.TXT` in the working directory.
 fn log(message: &MjLogMessage) {
     tracing::debug!(target: "mujoco", "{}", message.subject());
 }
@@ -50,7 +50,7 @@ pub(super) struct Physics {
 }
 
 impl Physics {
-    /// A simulation in which one control is held for `frame_skip` of the model's time steps.
+    /// A simulation that holds each control for `frame_skip` of the model's time steps.
     pub(super) fn new(model: Arc<MjModel>, frame_skip: usize) -> Result<Self, EnvironmentError> {
         let data = MjData::try_new(model).map_err(|error| EnvironmentError::Allocation(error.to_string()))?;
         Ok(Self { data, frame_skip })
@@ -74,7 +74,7 @@ impl Physics {
         self.data.ctrl()
     }
 
-    /// Starts anew from the model's initial state and a noise drawn from `seed`.
+    /// Restarts from the model's initial state with noise drawn from `seed`.
     pub(super) fn reset(&mut self, seed: u64, noise: Noise) {
         let mut random = ChaCha8Rng::seed_from_u64(seed);
         random.set_stream(RESET_STREAM);
@@ -96,7 +96,7 @@ impl Physics {
         });
     }
 
-    /// Starts anew from a given state.
+    /// Restarts from a given state.
     pub(super) fn set_state(&mut self, qpos: &[f64], qvel: &[f64]) {
         self.start(|positions, velocities| {
             positions.copy_from_slice(qpos);
@@ -104,13 +104,13 @@ impl Physics {
         });
     }
 
-    /// Starts anew from the state that `init` makes of the model's initial `(qpos, qvel)`.
+    /// Restarts from the state that `init` makes of the model's initial `(qpos, qvel)`.
     ///
-    /// The accelerations are computed here as Gymnasium does after a reset: they warm-start the solver, so the first
-    /// step depends on them, if by a hair.
+    /// As in Gymnasium, this computes the accelerations after a reset: they warm-start the solver, so the first step depends
+    /// on them slightly.
     fn start(&mut self, init: impl FnOnce(&mut [f64], &mut [f64])) {
         self.data.reset();
-        // SAFETY: MuJoCo allocates both arrays, apart from each other and of these lengths, for the life of `data`.
+        // SAFETY: MuJoCo allocates both arrays, separately and with these lengths, for the life of `data`.
         let (qpos, qvel) = unsafe {
             let (nq, nv) = (self.data.qpos().len(), self.data.qvel().len());
             let raw = self.data.ffi_mut();
@@ -120,10 +120,10 @@ impl Physics {
         self.data.forward();
     }
 
-    /// Holds `action` for one control period; ±1, to which it is clipped, are the ends of each motor's control range.
+    /// Holds `action` for one control period. It is clipped to ±1, the ends of each motor's control range.
     ///
-    /// False if the step failed: an action that is not a number is not applied at all; and when a simulation diverges, MuJoCo
-    /// puts the initial state in the place of the one that it could not integrate.
+    /// False if the step failed: an action that is not a number is not applied; when a simulation diverges, MuJoCo replaces
+    /// the state by the initial one.
     #[must_use]
     pub(super) fn step(&mut self, action: &[f32]) -> bool {
         if action.iter().any(|value| value.is_nan()) {

@@ -1,4 +1,4 @@
-//! Episodes of one job, run as one batch.
+//! Runs the episodes of one job as one batch.
 
 use std::time::{Duration, Instant};
 
@@ -8,14 +8,14 @@ use super::environment::{Environment, EnvironmentError};
 
 /// A batch of episodes that advance together: one policy call and one control period per [`step`](Rollout::step).
 ///
-/// Episodes that ended leave the batch, so the policy only ever sees live ones. An episode's outcome is a function of
-/// its seed and the policy, whatever else is in the batch, as long as the policy treats its rows independently. For that,
-/// each episode has its own `S`: what the policy carries through it.
+/// Episodes that have ended leave the batch, so the policy sees only live ones. An episode's outcome is a function of its seed
+/// and the policy, whatever else is in the batch, as long as the policy treats its rows independently. For that, each episode
+/// has its own `S`: what the policy carries from step to step.
 pub struct Rollout<S> {
-    /// Numbers in an observation and in an action.
+    /// Sizes of an observation and of an action.
     sizes: (usize, usize),
     live: Vec<Episode>,
-    /// Row i belongs to `live[i]`, as in the next two.
+    /// Row i belongs to `live[i]`, also in the next two fields.
     states: Vec<S>,
     /// live × numbers in an observation
     observations: Vec<f32>,
@@ -36,10 +36,10 @@ struct Episode {
     ended: bool,
 }
 
-/// What one episode came to.
+/// The result of one episode.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct EpisodeOutcome {
-    /// The episode's place among the seeds the rollout was made from.
+    /// The index of the episode's seed among the rollout's seeds.
     pub index: usize,
     /// The seed of its initial state and of the policy's noise.
     pub seed: u64,
@@ -47,13 +47,13 @@ pub struct EpisodeOutcome {
     pub episode_return: f64,
     /// Its number of steps.
     pub length: u32,
-    /// Its score, as the environment says: D4RL's normalised one in the environments of this program.
+    /// Its score, from the environment: D4RL-normalised in the environments of this program.
     pub score: f64,
 }
 
 impl<S> Rollout<S> {
-    /// Begins an episode for each seed, in an environment of its own that `make` makes. `sizes` are the numbers in an
-    /// observation and in an action of the policy; `begin` makes what the policy carries through the episode of a seed.
+    /// Begins an episode for each seed, in an environment of its own that `make` makes. `sizes` are the policy's sizes of an
+    /// observation and of an action; `begin` makes the policy's state for the episode of a seed.
     ///
     /// # Errors
     ///
@@ -85,12 +85,12 @@ impl<S> Rollout<S> {
 
     /// Advances every live episode by one control period.
     ///
-    /// `select` is called once, with the observations of n episodes in a row, the states of the same episodes, and the room for
-    /// their actions, which it is to fill in.
+    /// Calls `select` once, with the observations of n episodes in a row, the policy's states of the same episodes, and the
+    /// buffer for their actions, which it must fill.
     ///
     /// # Errors
     ///
-    /// That of `select`; no episode has advanced then. Or an environment broke down, after which the batch is of no use.
+    /// `select` failed, and no episode has advanced; or an environment failed, and the batch is unusable.
     pub fn step<E: From<EnvironmentError>>(
         &mut self,
         select: impl FnOnce(&[f32], &mut [S], &mut [f32]) -> Result<(), E>,

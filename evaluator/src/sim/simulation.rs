@@ -1,4 +1,4 @@
-//! A simulated task of this program: it cannot fail, and its state can be set and read.
+//! A task that this program simulates: it cannot fail, and its state can be set and read.
 
 use super::environment::Step;
 
@@ -11,17 +11,17 @@ pub(super) const GOAL_STREAM: u64 = 4;
 ///
 /// Positions `qpos`, velocities `qvel` and observations are MuJoCo's own `f64`; a rollout rounds them to `f32` for the policy.
 pub trait Simulation: Send {
-    /// Starts an episode. The noise on the initial state is drawn from a stream of `seed`'s own, so an episode is a function of
-    /// its seed and its actions alone.
+    /// Starts an episode. The noise on the initial state comes from a stream of `seed`, so an episode is a function of its
+    /// seed and its actions only.
     fn reset(&mut self, seed: u64);
 
     /// Starts an episode in a given state (`nq` positions, `nv` velocities).
     fn set_state(&mut self, qpos: &[f64], qvel: &[f64]);
 
-    /// Puts the goal somewhere (x and y, metres) until it is drawn again; does nothing in a task without a goal.
+    /// Moves the goal (x and y, metres) until it is drawn again; does nothing in a task without a goal.
     fn set_goal(&mut self, _goal: &[f64]) {}
 
-    /// Where the goal is (x and y, metres), in a task that has one.
+    /// The position of the goal (x and y, metres), in a task that has one.
     fn goal(&self) -> Option<&[f64]> {
         None
     }
@@ -29,7 +29,7 @@ pub trait Simulation: Send {
     /// Applies `action` (`action_dim` values, clipped to [-1, 1]) for one control period.
     fn step(&mut self, action: &[f32]) -> Step;
 
-    /// Simulated seconds of a step.
+    /// Simulated time of a step, seconds.
     fn control_period(&self) -> f64;
 
     /// The current observation, `observation_dim` values.

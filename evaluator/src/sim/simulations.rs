@@ -8,7 +8,7 @@ use super::environment::{Environment, EnvironmentError, Environments, Simulated}
 use super::locomotion::{Locomotion, ROBOTS, Robot};
 use super::simulation::Simulation;
 
-/// How an environment moves.
+/// What simulates an environment.
 enum Kind {
     Locomotion(&'static Robot),
     AntMaze(&'static Maze),
@@ -23,18 +23,18 @@ impl Kind {
     }
 }
 
-/// The environments of the table that [`make`] makes.
+/// The environments of the table that [`make`] can make.
 pub fn simulated() -> impl Iterator<Item = &'static EnvironmentSpec> {
     environment::all().iter().filter(|spec| Kind::of(spec).is_ok())
 }
 
-/// Makes the simulation of an environment. Those of one model share one compiled model, so the second costs little.
+/// Makes the simulation of an environment. Simulations of one model share the compiled model, so a second one costs little.
 ///
-/// `environment_seed` is that of what the environment draws once and keeps over all episodes, if there is any such thing.
+/// `environment_seed` is the seed of what the environment draws once and keeps over all episodes, if anything.
 ///
 /// # Errors
 ///
-/// There is no simulation of the environment, or MuJoCo fails.
+/// This program does not simulate the environment, or MuJoCo fails.
 pub fn make(spec: &EnvironmentSpec, environment_seed: u64) -> Result<Box<dyn Simulation>, EnvironmentError> {
     Ok(match Kind::of(spec)? {
         Kind::Locomotion(robot) => Box::new(Locomotion::new(robot, spec)?),
@@ -63,7 +63,7 @@ impl Environments for Simulations {
 /// The MJCF text that an environment's model is compiled from.
 ///
 /// # Errors
-///
+/// This program does not simulate the environment.
 /// There is no simulation of the environment.
 pub fn mjcf(spec: &EnvironmentSpec) -> Result<String, EnvironmentError> {
     Ok(match Kind::of(spec)? {

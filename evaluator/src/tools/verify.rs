@@ -1,4 +1,4 @@
-//! Replays a recorded file one step at a time from its own states, and says how far the simulation is from it.
+//! Replays a recorded file one step at a time from its own states, and measures how far the simulation is from it.
 
 use std::path::{Path, PathBuf};
 
@@ -12,41 +12,41 @@ use thiserror::Error;
 
 use crate::sim::{self, EnvironmentError, Simulation};
 
-/// Rewards differ when they are further apart than this, relative to 1 or to the recorded one, whichever is larger, and
-/// further than the next observation.
+/// Rewards differ if their distance is larger than this (relative to 1 or to the recorded reward, whichever is larger) and
+/// larger than that of the next observation.
 ///
-/// Files hold float32. A state rounded to it moves the reward of a step by 1e-6; in a rare one, where a contact begins or
-/// ends on the edge, by up to 1e-2, and a velocity by far more (row 40816 of a Walker2d file: 8e-3 and 0.17). Another rule
-/// moves the reward of many a step whose next observation is right.
+/// Files hold float32. Rounding a state to it changes the reward of a step by 1e-6; in a rare step, where a contact begins or
+/// ends, by up to 1e-2, and a velocity by far more (row 40816 of a Walker2d file: 8e-3 and 0.17). Another reward rule changes
+/// the reward of many steps whose next observation is right.
 const REWARD_TOLERANCE: f64 = 1e-3;
 
 /// How a file compares with the simulation.
 #[derive(Debug, Serialize)]
 pub struct Report {
-    /// Environment that it was replayed in.
+    /// Environment of the replay.
     pub environment: &'static str,
     /// Rows replayed.
     pub transitions: usize,
-    /// Rows whose next observation is known. In a file without next_observations it is that of the following row, so it is
-    /// not known where an episode ends.
+    /// Rows whose next observation is known. In a file without next_observations it is the observation of the following row,
+    /// so it is unknown where an episode ends.
     pub compared: usize,
     /// The largest error of each compared row's next observation, over its values.
     pub obs_error: ObservationError,
     /// Errors of the rewards.
     pub reward_error: RewardError,
-    /// Rows whose reward is not the recorded one, beyond what float32 explains.
+    /// Rows whose reward differs from the recorded one by more than float32 explains.
     pub rewards_differ: usize,
-    /// Rows that are terminal in one and not in the other. A step that the time limit cuts off is often not recorded as
-    /// terminal though it is, which is no difference.
+    /// Rows that are terminal only in the file or only in the simulation. A terminal step at the time limit is often recorded
+    /// as a timeout only, which is no difference.
     pub terminals_differ: usize,
 }
 
 /// Absolute errors of the next observation.
 #[derive(Debug, Serialize)]
 pub struct ObservationError {
-    /// Half of the rows are below it.
+    /// Half of the rows have a smaller error.
     pub median: f64,
-    /// 99 % of the rows are below it.
+    /// 99 % of the rows have a smaller error.
     pub p99: f64,
     /// The worst row.
     pub max: f64,
@@ -68,23 +68,23 @@ pub enum VerifyError {
     /// The environment could not be made.
     #[error(transparent)]
     Environment(#[from] EnvironmentError),
-    /// There is nothing to replay.
+    /// The file has no row to replay.
     #[error("{0}: no rows with a next observation")]
     Empty(PathBuf),
-    /// It says that it was recorded in an environment that is not known.
+    /// The file names an unknown environment.
     #[error("{path}: recorded in another environment")]
     Unknown {
         /// The file.
         path: PathBuf,
-        /// Its name.
+        /// The environment's name.
         source: UnknownEnvironment,
     },
-    /// It does not say where it was recorded, and its sizes do not tell.
+    /// The file names no environment, and its sizes fit several or none.
     #[error("{path}: does not say which environment it was recorded in, and its sizes fit {}", sizes(fitting))]
     Unnamed {
         /// The file.
         path: PathBuf,
-        /// Names of the environments of its sizes.
+        /// Names of the environments of these sizes.
         fitting: Vec<&'static str>,
     },
 }
@@ -104,7 +104,7 @@ fn sizes(fitting: &[&str]) -> String {
     if fitting.is_empty() { "none".to_owned() } else { fitting.join(", ") }
 }
 
-/// The environment that a file was recorded in: what it says or, where it says nothing, the only one of its sizes.
+/// The environment of a file: the one that it names or, if it names none, the only one of its sizes.
 pub fn environment_of(path: &Path) -> Result<&'static EnvironmentSpec, VerifyError> {
     if let Some(name) = recorded_environment(path)? {
         return find(&name).map_err(|source| VerifyError::Unknown { path: path.into(), source });
@@ -118,7 +118,7 @@ pub fn environment_of(path: &Path) -> Result<&'static EnvironmentSpec, VerifyErr
     }
 }
 
-/// Replays every row of the file at `path`: from its qpos and qvel, with its action, for one step.
+/// Replays every row of the file at `path`: sets its qpos and qvel, and takes one step with its action.
 pub fn verify(path: &Path, spec: &'static EnvironmentSpec) -> Result<Report, VerifyError> {
     let rows = RecordedRows::read(path, spec)?;
     let threads = rayon::current_num_threads();
@@ -163,7 +163,7 @@ fn replay(environment: &mut dyn Simulation, row: &Row<'_>, goal: Option<&[f64]>)
     }
 }
 
-/// None without any row to compare.
+/// `None` if there is no row to compare.
 fn summarise(spec: &'static EnvironmentSpec, errors: &[RowError]) -> Option<Report> {
     let mut sorted: Vec<f64> = errors.iter().filter_map(|row| row.observation).collect();
     sorted.sort_by(f64::total_cmp);

@@ -1,6 +1,6 @@
 //! Learning algorithms, one file each, to be read beside its paper.
 //!
-//! Whatever an algorithm does, the rest of the learner sees what `algorithm` describes. A new one is a file here, a line in
+//! `algorithm` is all that the rest of the learner sees of an algorithm. A new algorithm is a file here, a line in
 //! [`ALGORITHMS`] and its values for each task in `presets/`.
 
 mod algorithm;

@@ -18,14 +18,14 @@ pub use sweep::{Shard, SweepArgs};
 pub use train::TrainArgs;
 
 const FETCH_NOTE: &str = "\
-The file goes where D4RL keeps it: $D4RL_DATASET_DIR, or ~/.d4rl/datasets. The learner tries $QUAD_DATASETS_URL, the address of
-a folder, first. It continues what a broken connection left, also the next time.";
+The learner writes the file into D4RL's cache folder: $D4RL_DATASET_DIR, or ~/.d4rl/datasets. It tries $QUAD_DATASETS_URL, the
+address of a folder, first. After a broken connection it continues the fetch, also the next time.";
 
 const DOCTOR_NOTE: &str = "\
-The learner prints a line per check: ok, warn or FAIL, with a hint where you can do something. The exit code is 1 if a check
+The learner prints a line per check: ok, warn or FAIL, with a hint if you can do something. The exit code is 1 if a check
 failed.";
 
-/// Trains a diffusion policy and a critic ensemble from a file of transitions.
+/// Trains policies offline, from a file of transitions.
 #[derive(Debug, Parser)]
 #[command(name = "learner", version, arg_required_else_help = true)]
 pub struct Cli {
@@ -37,28 +37,29 @@ pub struct Cli {
 /// What the learner can do.
 #[derive(Debug, Subcommand)]
 pub enum Command {
-    /// Train on a dataset, publish snapshots, hand out evaluations, keep the run in a folder
+    /// Train on a dataset, publish snapshots, give evaluators their jobs, and keep the run in a folder
     #[command(after_help = train::EXAMPLES)]
     Train(Box<TrainArgs>),
-    /// Do all runs of a study: many methods, tasks and seeds, several at a time, resumed by the same command
+    /// Train all runs of a study (tasks, methods and seeds), several at a time; the same command continues an interrupted
+    /// study
     #[command(after_help = sweep::EXAMPLES)]
     Sweep(SweepArgs),
-    /// List tasks and algorithms, or print every value that an algorithm has for a task
+    /// List tasks and algorithms, or print every value of an algorithm for a task
     Presets(PresetsArgs),
-    /// Datasets: list the names, fetch one, inspect a file
+    /// List datasets, fetch one, or inspect a file
     #[command(subcommand)]
     Datasets(DatasetsCommand),
-    /// List all runs: what each is, how far it is, its last score, its size, and whether a learner is at work on it
+    /// List runs with their state, last score and size, and whether a learner is at work on them
     List(ListArgs),
-    /// Serve a page on which a browser lists all runs, finished and at work, and compares those that are ticked
+    /// Serve a web page that lists all runs, also while they train, and compares those that you tick
     Page(PageArgs),
-    /// Print the scores of finished or running runs, statistics over seeds and tasks, and the paper's tables with ours beside them
+    /// Print scores of runs, statistics over seeds and tasks, and the paper's tables with your runs in them
     Report(ReportArgs),
-    /// Check by a run's folder alone that each episode is scored once, with the weights that are kept there
+    /// Check in a run's folder that each episode is scored once, with the weights in that folder
     Verify(VerifyArgs),
-    /// Check that this machine is fit for a run, and say how to mend what is not
+    /// Check this machine before a run, and say how to fix what is wrong
     Doctor(DoctorArgs),
-    /// Print a script by which a shell completes this program's arguments
+    /// Print a script that lets a shell complete this program's arguments
     Completions {
         /// The shell
         shell: Shell,
@@ -68,26 +69,26 @@ pub enum Command {
 /// Arguments of `learner presets`.
 #[derive(Debug, Args)]
 pub struct PresetsArgs {
-    /// Print every value for this task, or for what a file changes of one, as a file of your own could have them
+    /// Print every value for this task, or for a preset file of your own, as a complete preset file
     #[arg(value_name = "TASK|FILE", value_parser = parse_preset)]
     pub preset: Option<String>,
-    /// Algorithm whose values these are [default: quad, or what the file says]
+    /// Algorithm [default: quad, or the one in the file]
     #[arg(long, value_name = "NAME", value_parser = parse_algorithm, requires = "preset")]
     pub algorithm: Option<String>,
 }
 
-/// What can be done with datasets.
+/// What `learner datasets` can do.
 #[derive(Debug, Subcommand)]
 pub enum DatasetsCommand {
-    /// Print the names that there are, and which of the files are on this machine
+    /// Print all names, and which files are on this machine
     List,
-    /// Fetch a dataset unless it is there already, verify it, print its path
+    /// Fetch a dataset unless it is on this machine, verify it, and print its path
     #[command(after_help = FETCH_NOTE)]
     Fetch {
         /// A name of `learner datasets list`
         name: String,
     },
-    /// Print what is in a dataset and what is wrong with it, before you spend a day of training on it
+    /// Print what a dataset contains and what is wrong with it, before you train on it
     Inspect(InspectArgs),
 }
 
@@ -97,10 +98,10 @@ pub struct InspectArgs {
     /// A file or folder of any format, a name of `learner datasets list`, or minari:ID
     #[arg(value_name = "FILE|NAME")]
     pub dataset: String,
-    /// Environment that it is for: sizes, time limit and scores are that one's [default: what the dataset says it is from]
+    /// Environment that gives sizes, time limit and reference scores [default: the one that the dataset names]
     #[arg(long, value_name = "NAME", value_parser = environment::find)]
     pub env: Option<&'static EnvironmentSpec>,
-    /// Print JSON instead of a page
+    /// Print JSON instead of text
     #[arg(long)]
     pub json: bool,
 }
@@ -108,10 +109,10 @@ pub struct InspectArgs {
 /// Arguments of `learner verify`.
 #[derive(Debug, Args)]
 pub struct VerifyArgs {
-    /// Folder of a run that has reached its end
+    /// Folder of a complete run
     #[arg(value_name = "DIR")]
     pub dir: PathBuf,
-    /// Folder of a run of the same configuration: what both have scored must be equal, bit for bit
+    /// Folder of another run of the same configuration: it must have each score of DIR, bit for bit and of the same weights
     #[arg(long, value_name = "DIR")]
     pub same_as: Option<PathBuf>,
 }
@@ -120,16 +121,16 @@ pub struct VerifyArgs {
 #[derive(Debug, Args)]
 #[command(after_help = DOCTOR_NOTE)]
 pub struct DoctorArgs {
-    /// The router that the run is to join; without it, the learner checks that it can listen at its usual port
+    /// Router that the run will join; without it, the learner checks that it can listen at its usual port
     #[arg(long, value_name = "ENDPOINT", value_parser = parse_endpoint)]
     pub connect: Option<String>,
-    /// Folder of the run that is to begin or to go on
+    /// Folder of the run, new or existing
     #[arg(long, value_name = "DIR", default_value = "runs")]
     pub run_dir: PathBuf,
     /// Folder with ca.pem, cert.pem and key.pem, for endpoints tls/HOST:PORT (docs/security.md)
     #[arg(long, value_name = "DIR", env = "QUAD_CERTIFICATES")]
     pub certificates: Option<PathBuf>,
-    /// Print a JSON array of objects with verdict, check, what and, where there is something to do, hint
+    /// Print a JSON array of objects with verdict, check, what and (if you can do something) hint
     #[arg(long)]
     pub json: bool,
 }
@@ -151,7 +152,7 @@ pub struct PageArgs {
     /// Run folder, or folder with runs below it
     #[arg(long, value_name = "DIR", default_value = "runs")]
     pub runs: PathBuf,
-    /// Serve it here; port 0 takes a free one
+    /// Address of the page; port 0 takes a free one
     #[arg(long, value_name = "ADDR:PORT", default_value = "127.0.0.1:8080")]
     pub listen: SocketAddr,
 }
@@ -159,26 +160,26 @@ pub struct PageArgs {
 /// Arguments of `learner report`.
 #[derive(Debug, Args)]
 pub struct ReportArgs {
-    /// Run folders, or folders with runs below them, whose evaluations are summarised only
+    /// Run folders, or folders with runs below them
     #[arg(value_name = "DIR", required = true)]
     pub dirs: Vec<PathBuf>,
     /// Print JSON instead of tables
     #[arg(long, group = "style")]
     pub json: bool,
-    /// Print the summaries as Markdown
+    /// Print the tables as Markdown
     #[arg(long, group = "style")]
     pub markdown: bool,
-    /// Print the summaries as LaTeX, whose tables need its package booktabs
+    /// Print the tables as LaTeX, which needs the package booktabs
     #[arg(long, group = "style")]
     pub latex: bool,
-    /// Print the summaries as CSV: tables after one another, with what is said of them as comments
+    /// Print the tables as CSV, one after another, with notes as comments
     #[arg(long, group = "style")]
     pub csv: bool,
-    /// Which evaluations of a run are its score
+    /// Which evaluations make a run's score
     #[arg(long, value_enum, default_value = "last")]
     pub select: Select,
-    /// Also write one file with everything, to send or to print: tables, figures, settings, data, films that are in the runs' folders
-    /// (film.gif and film.png), and the commands that make the runs again
+    /// Also write one HTML file to send or to print: tables, figures, settings, data, films in the runs' folders (film.gif and
+    /// film.png), and the commands that make the runs again
     #[arg(long, value_name = "FILE.html")]
     pub html: Option<PathBuf>,
     /// Also draw learning curves, performance profiles and scores over τ into this folder, each as SVG and PNG

@@ -7,44 +7,44 @@ use quad_service::parse_endpoint;
 
 pub(super) const EXAMPLES: &str = "\
 Examples:
-  # All runs of a study, as many at a time as the machine has room for.
+  # All runs of a study, as many at a time as this machine has cores for.
   learner sweep studies/demo.toml
 
-  # Which runs there are, and how far they are.
+  # List the runs and their states.
   learner sweep studies/demo.toml --list
 
-  # A third of them, on each of three machines.
+  # A third of the runs, on each of three machines.
   learner sweep studies/demo.toml --shard 1/3
 
-  # One of them, as a task of an array job.
+  # One run, as a task of an array job.
   learner sweep studies/demo.toml --index $SLURM_ARRAY_TASK_ID
 
 Each run is a `learner train` of one thread (RAYON_NUM_THREADS changes that) and logs to runs/STUDY/RUN/learner.log. A run that
-fails does not end the others. The same command goes on with what is not complete. The exit code is 0 when all is complete, 1
-when a run has failed, 75 when the same command goes on.";
+fails does not end the others. The same command continues the runs that are not complete. The exit code is 0 if all runs are
+complete, 1 if a run has failed, 75 if runs are left for the same command.";
 
 /// Arguments of `learner sweep`.
 #[derive(Debug, Args)]
 pub struct SweepArgs {
-    /// What to run: axes whose values are combined, and which combinations (studies/README.md)
+    /// The study: axes whose values are combined, and which combinations are runs (studies/README.md)
     #[arg(value_name = "STUDY.toml")]
     pub study: PathBuf,
-    /// Folder of all studies: each run has the folder DIR/STUDY/RUN
+    /// Parent folder of all studies: each run has the folder DIR/STUDY/RUN
     #[arg(long, value_name = "DIR", default_value = "runs")]
     pub runs: PathBuf,
     /// Print number, name and state of each run, and start none
     #[arg(long)]
     pub list: bool,
-    /// Only the run of this number, as --list prints it
+    /// Train only the run with this number, as --list prints it
     #[arg(long, value_name = "N", conflicts_with = "shard")]
     pub index: Option<usize>,
-    /// Only the I-th of N equal parts, e.g. 1/3, 2/3 and 3/3 on three machines
+    /// Train only the I-th of N equal parts, e.g. 1/3, 2/3 and 3/3 on three machines
     #[arg(long, value_name = "I/N", value_parser = parse_shard)]
     pub shard: Option<Shard>,
-    /// Runs at a time [default: three of four cores, the fourth being for evaluators]
+    /// Runs at a time [default: uses three of four cores, and leaves the fourth for evaluators]
     #[arg(long, value_name = "N", value_parser = value_parser!(u16).range(1..))]
     pub jobs: Option<u16>,
-    /// Start so many evaluators, which serve all runs and log to DIR/STUDY [default: the cores that no learner has]
+    /// Number of evaluators to start; they serve all runs and log to DIR/STUDY [default: the cores that no learner has]
     #[arg(long, value_name = "N", conflicts_with = "connect")]
     pub evaluators: Option<usize>,
     /// Use the evaluators at this Zenoh router instead, e.g. tcp/router:7447
@@ -55,14 +55,14 @@ pub struct SweepArgs {
 /// A part of a study's runs.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Shard {
-    /// Which, from 0.
+    /// Index of the part, from 0.
     part: usize,
-    /// Of how many.
+    /// Number of parts.
     parts: usize,
 }
 
 impl Shard {
-    /// Whether it has the run of this number.
+    /// Whether this part includes the run of this number.
     pub fn has(self, index: usize) -> bool {
         index % self.parts == self.part
     }

@@ -15,7 +15,7 @@ use crate::config::tables::{self, parse_assignment};
 
 pub(super) const EXAMPLES: &str = "\
 Examples:
-  # One box, two evaluators beside the learner.
+  # One machine: the learner and two evaluators.
   learner train --task hopper-demo --dataset data/hopper-demo.hdf5 --evaluators 2
 
   # Another algorithm on the same data.
@@ -24,86 +24,87 @@ Examples:
   # QUAD without guidance, which is behaviour cloning.
   learner train --task hopper-demo --agent guidance=none --dataset data/hopper-demo.hdf5
 
-  # What will that be, and what will it take?
+  # Print all values of the run, and the time, memory and disk that it will take.
   learner train --task hopper-demo --dataset data/hopper-demo.hdf5 --dry-run
 
-  # Go on after a crash or Ctrl-C: the same command again.
+  # Continue after a crash or Ctrl-C: the same command again.
 
-At Ctrl-C or SIGTERM the learner saves a checkpoint and ends with exit code 75; at a second one it ends at once. The same
-command goes on from the run folder's newest checkpoint. On the same machine a run that was interrupted ends with the same
-weights, bit for bit, as one that was not.";
+At Ctrl-C or SIGTERM the learner saves a checkpoint and ends with exit code 75; at a second signal it ends at once. The same
+command continues from the newest checkpoint in the run's folder. On the same machine an interrupted run ends with the same
+weights, bit for bit, as a run without interruption.";
 
 /// Arguments of `learner train`.
 #[derive(Debug, Args)]
 pub struct TrainArgs {
-    /// What to learn: environment, dataset, and the algorithm's values for them (`learner presets` lists tasks)
+    /// The task: an environment, a dataset, and the algorithm's values for them (`learner presets` lists tasks)
     #[arg(long, value_name = "NAME", value_parser = parse_task, required_unless_present = "preset")]
     task: Option<String>,
-    /// What learns it (`learner presets` lists algorithms) [default: quad]
+    /// The algorithm (`learner presets` lists algorithms) [default: quad]
     #[arg(long, value_name = "NAME", value_parser = parse_algorithm)]
     algorithm: Option<String>,
-    /// The same as --task NAME; or a file of your own, which may name `task` and `algorithm`, and changes what it names
+    /// A task, as --task NAME; or a file of your own with `task`, `algorithm` and the values to change
     #[arg(long, value_name = "NAME|FILE.toml", value_parser = parse_preset, conflicts_with = "task")]
     preset: Option<String>,
-    /// A file (`evaluator collect` records one), a name of `learner datasets list`, fetched if it is not there yet,
-    /// or minari:ID [default: the task's]
+    /// A file (`evaluator collect` records one), a name of `learner datasets list` (fetched if it is missing), or minari:ID
+    /// [default: the task's]
     #[arg(long, value_name = "FILE|NAME")]
     dataset: Option<String>,
     /// Scale actions from their least and largest value to ±1, states to mean 0 and standard deviation 1, or both; the policy
-    /// takes and gives the data's own units all the same
+    /// still takes and gives the data's own units
     #[arg(long, value_name = "actions,states", value_delimiter = ',', value_parser = ["actions", "states"], hide_possible_values = true)]
     scale: Vec<String>,
-    /// Folder of this run; its last part names the run. A run of the same configuration that is there already goes on
+    /// Folder of the run; its last part names the run. If it contains a run of the same configuration, that run continues
     /// [default: runs/TASK-VARIANT-seedSEED]
     #[arg(long, value_name = "DIR")]
     pub run_dir: Option<PathBuf>,
-    /// Seconds between two checkpoints, which is what a crash may cost; more where saving would take 1 % of the time
+    /// Seconds between two checkpoints; a crash loses at most the training since the last one. The learner waits longer if
+    /// saving would take 1 % of the time
     #[arg(long, value_name = "N", default_value_t = 30, value_parser = value_parser!(u64).range(..=31_536_000))]
     pub checkpoint_seconds: u64,
-    /// Begin anew: a run that is in the folder already is kept under another name
+    /// Start a new run; a run that is already in the folder is kept under another name
     #[arg(long)]
     pub fresh: bool,
-    /// Print every value of the run, and what it takes of time, memory and disk by a second's measurement; train nothing and
-    /// leave no folder. A dataset that is not there yet is fetched
+    /// Print every value of the run, and the time, memory and disk that it will take, measured in a second; train nothing and
+    /// leave no folder. A missing dataset is fetched
     #[arg(long)]
     pub dry_run: bool,
-    /// Listen for evaluators here, e.g. tcp/127.0.0.1:7447, or tls/0.0.0.0:7447 for other machines
-    /// [default: tcp/127.0.0.1:7447, or tls/… with --certificates; any free port if that is taken, or with --eval-interval 0]
+    /// Listen for evaluators here, e.g. tcp/127.0.0.1:7447, or tls/0.0.0.0:7447 for other machines [default:
+    /// tcp/127.0.0.1:7447, or tls/… with --certificates; a free port if that one is taken, or with --eval-interval 0]
     #[arg(long, value_name = "ENDPOINT", value_parser = parse_endpoint, conflicts_with = "connect")]
     pub listen: Option<String>,
-    /// Join a Zenoh router instead, where evaluators are found, e.g. tcp/router:7447
+    /// Join a Zenoh router instead, at which evaluators are found, e.g. tcp/router:7447
     #[arg(long, value_name = "ENDPOINT", value_parser = parse_endpoint)]
     pub connect: Option<String>,
-    /// Start so many evaluators on this machine, which end with the learner; they log to DIR/evaluator-1.log and so on
+    /// Number of evaluators to start on this machine; they end with the learner, and log to DIR/evaluator-1.log and so on
     #[arg(long, value_name = "N", default_value_t = 0, conflicts_with = "certificates")]
     pub evaluators: usize,
-    /// Threads that train; while they do, each keeps a core busy [default: RAYON_NUM_THREADS, or one a core, but 16 at most]
+    /// Training threads, each of which keeps a core busy [default: RAYON_NUM_THREADS, or one per core, at most 16]
     #[arg(long, value_name = "N")]
     pub threads: Option<NonZero<usize>>,
-    /// Folder with ca.pem, cert.pem and key.pem: evaluators must show a certificate of the same authority, and endpoints
-    /// are tls/HOST:PORT (docs/security.md)
+    /// Folder with ca.pem, cert.pem and key.pem: evaluators must show a certificate of the same authority, and endpoints are
+    /// tls/HOST:PORT (docs/security.md)
     #[arg(long, value_name = "DIR", env = "QUAD_CERTIFICATES")]
     pub certificates: Option<PathBuf>,
-    /// Serve /metrics and /healthz here; port 0 takes a free one (see DIR/endpoints.json)
+    /// Address of the page, /metrics and /healthz; port 0 takes a free one (see DIR/endpoints.json)
     #[arg(long, value_name = "ADDR:PORT", default_value = "127.0.0.1:0")]
     pub metrics: SocketAddr,
     /// Also write metrics and scores for TensorBoard, into DIR/RUN, every ten seconds
     #[arg(long, value_name = "DIR")]
     pub tensorboard: Option<PathBuf>,
-    /// Train on the CPU, or on the first Nvidia GPU, which needs a learner that deploy/cuda.sh has built
+    /// Train on the CPU, or on the first Nvidia GPU (with a learner that deploy/cuda.sh has built)
     #[arg(long, value_name = "cpu|cuda", value_enum, hide_possible_values = true, default_value_t)]
     pub device: Device,
-    /// Another value of a hyper-parameter of the algorithm, in TOML's notation: guidance=dac, tau=0.5; repeatable
+    /// Change a hyper-parameter of the algorithm, in TOML's notation: guidance=dac, tau=0.5; repeatable
     #[arg(long, value_name = "KEY=VALUE", value_parser = |text: &str| parse_assignment(&format!("agent.{text}")))]
     agent: Vec<Table>,
-    /// The same of any key: batch_size=64, environment=my-robot; repeatable
+    /// Change any other key: batch_size=64, environment=my-robot; repeatable
     #[arg(long, value_name = "KEY=VALUE", value_parser = parse_assignment)]
     set: Vec<Table>,
     #[command(flatten)]
     overrides: OverrideArgs,
 }
 
-/// Flags that take the place of the algorithm's value for the task.
+/// Flags that replace the algorithm's value for the task.
 #[derive(Debug, Args)]
 #[command(next_help_heading = "Instead of the algorithm's value for the task")]
 struct OverrideArgs {
@@ -116,23 +117,23 @@ struct OverrideArgs {
     /// Episodes per evaluation
     #[arg(long, value_name = "N", value_parser = value_parser!(i64).range(1..))]
     episodes: Option<i64>,
-    /// Seed of initial weights, batches, noise and the evaluations' episodes
+    /// Seed of initial weights, batches, noise and the episodes of evaluations
     #[arg(long, value_name = "N", value_parser = value_parser!(i64).range(0..))]
     seed: Option<i64>,
-    /// Precision of forward passes without gradient, f32 or bf16, which rounds and is faster on CPUs with AMX or AVX512-BF16
+    /// Precision of forward passes without gradient: f32, or bf16, which rounds and is faster on CPUs with AMX or AVX512-BF16
     #[arg(long, value_name = "NAME")]
     precision: Option<Precision>,
 }
 
 impl TrainArgs {
-    /// What the run begins from: the name of a task, or the path of a file.
+    /// What the run starts from: the name of a task, or the path of a file.
     pub fn preset(&self) -> &str {
         // clap sees to it that there is one of them.
         self.task.as_deref().or(self.preset.as_deref()).unwrap_or_default()
     }
 
-    /// What the command line changes in that. Where it says a value twice, `--agent` wins over `--set`, and a flag of its
-    /// own over both.
+    /// The values that the command line changes. If it gives a value twice, `--agent` wins over `--set`, and a flag of its own
+    /// over both.
     pub fn changes(&self) -> Table {
         let flags = &self.overrides;
         let number = |value: Option<i64>| value.map(Value::from);

@@ -10,10 +10,10 @@ use crate::data;
 /// Where a learner listens by default.
 const PORT: u16 = 7447;
 
-/// Does all checks.
+/// Runs all checks.
 ///
 /// # Errors
-/// The checks cannot be done; what they find is no error.
+/// A check cannot run; a finding is no error.
 pub fn examine(args: &DoctorArgs) -> anyhow::Result<Findings> {
     let mut findings = Findings::default();
     doctor::threads(&mut findings);

@@ -1,4 +1,4 @@
-//! `learner train --dry-run`: what a run is and what it takes, as a file of the user's own that begins with comments.
+//! `learner train --dry-run`: prints a run's values as a preset file, and its cost as comments at the top.
 
 use std::fs;
 use std::path::Path;
@@ -10,10 +10,10 @@ use quad_service::print;
 use crate::config::RunConfig;
 use crate::train::Price;
 
-/// Measures and prints it.
+/// Measures the cost and prints the file.
 ///
 /// # Errors
-/// The run could not begin with these transitions.
+/// The run cannot start with these transitions.
 pub fn foretell(path: &Path, config: &RunConfig, transitions: Transitions) -> anyhow::Result<()> {
     let (experiment, steps) = (&config.experiment, config.experiment.steps);
     let price = Price::measure(experiment, config.run.device, transitions)?;
@@ -29,7 +29,7 @@ pub fn foretell(path: &Path, config: &RunConfig, transitions: Transitions) -> an
     ))
 }
 
-/// The most memory that this process has had, bytes.
+/// The peak memory of this process, bytes.
 fn peak_memory() -> Option<u64> {
     let status = fs::read_to_string("/proc/self/status").ok()?;
     let peak = status.lines().find_map(|line| line.strip_prefix("VmHWM:"))?;

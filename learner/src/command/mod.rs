@@ -1,4 +1,4 @@
-//! The learner's commands, from the command line to the exit. All of it runs on the main thread.
+//! The learner's commands, from the parsed command line to the exit code. All of them run on the main thread.
 
 mod doctor;
 mod dry_run;
@@ -25,10 +25,10 @@ use crate::data::{Source, cache};
 use crate::report::{Report, Style, Table, draw_all, export_all, list, runs_in, write_html};
 use crate::run::{RunDirError, verify};
 
-/// Does what the command line says.
+/// Runs the command.
 ///
 /// # Errors
-/// It cannot, or what it had to check is not as it must be.
+/// The command failed, or a check failed.
 pub fn run(cli: &Cli) -> anyhow::Result<()> {
     let done = match &cli.command {
         Command::Train(args) => train::train(args),
@@ -77,7 +77,7 @@ fn print_preset(preset: &Preset, algorithm: Option<&str>) -> anyhow::Result<()> 
 
 fn report(args: &ReportArgs) -> anyhow::Result<()> {
     let report = Report::read(&args.dirs, args.select)?;
-    // What else lies beside runs, where a user writes `runs/*`, does not keep them from being read.
+    // Other files beside runs, which `runs/*` includes, do not prevent the report.
     for other in args.dirs.iter().filter(|dir| runs_in(dir).is_empty()) {
         warn!("there is no run in {}", other.display());
     }
@@ -145,7 +145,7 @@ fn datasets(command: &DatasetsCommand) -> anyhow::Result<()> {
     }
 }
 
-/// Problems are part of the result: only what cannot be read at all is an error.
+/// Problems are part of the result; only an unreadable dataset is an error.
 fn inspect(args: &InspectArgs) -> anyhow::Result<()> {
     let source = Source::parse(&args.dataset)?;
     let environment = args.env.or_else(|| environment::find(&source.entry()?.environment).ok());

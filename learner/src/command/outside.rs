@@ -1,4 +1,4 @@
-//! What a run has to do with the world outside: where it meets evaluators, and those that it starts itself.
+//! A run's connections: where it meets evaluators, and the evaluators that it starts itself.
 
 use std::thread::available_parallelism;
 
@@ -8,26 +8,26 @@ use tracing::{info, warn};
 use crate::cli::TrainArgs;
 use crate::service::{LocalEvaluators, Opening, open_network};
 
-/// Where evaluators look by default.
+/// The port at which evaluators look by default.
 const DEFAULT_PORT: u16 = 7447;
-/// For a run that needs no known port: several of them may run at a time.
+/// For a run that needs no known port, so that several can run at a time.
 const ANY_PORT: u16 = 0;
 
-/// What was asked for.
+/// What the command line asks for.
 pub(super) struct Outside {
-    /// Where it listens or connects.
+    /// Where the learner listens or connects.
     pub endpoints: Endpoints,
-    /// What it is to start.
+    /// The evaluators that the learner starts.
     pub evaluators: LocalEvaluators,
-    /// Whether the user has left it to the learner where to listen.
+    /// Whether the command line does not say where to listen.
     is_default: bool,
 }
 
 impl Outside {
-    /// As the command line says.
+    /// Reads the command line.
     ///
     /// # Errors
-    /// Endpoints or certificates that cannot be used, or no program to start.
+    /// Endpoints or certificates that cannot be used, or no `evaluator` program to start.
     pub fn new(args: &TrainArgs, eval_interval: u64) -> anyhow::Result<Self> {
         Ok(Self {
             endpoints: endpoints(args, eval_interval)?,
@@ -36,7 +36,7 @@ impl Outside {
         })
     }
 
-    /// Starts to open the session. Where the usual port is taken, as on a machine that several learners share, it takes another.
+    /// Starts to open the session. If another learner on this machine has the usual port, it takes a free one.
     ///
     /// # Errors
     /// The learner cannot listen.
@@ -53,7 +53,7 @@ impl Outside {
     }
 }
 
-/// Where the learner listens or connects, as the command line says.
+/// Where the learner listens or connects.
 fn endpoints(args: &TrainArgs, eval_interval: u64) -> anyhow::Result<Endpoints> {
     let certificates = args.certificates.as_deref().map(|folder| Certificates::read(folder, Role::Learner));
     let certificates = certificates.transpose().hint_of(CertificatesError::hint)?;

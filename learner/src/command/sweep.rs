@@ -1,4 +1,4 @@
-//! `learner sweep`, from the command line to the sentence about all runs.
+//! `learner sweep`, from the parsed command line to the summary of all runs.
 
 use std::collections::{BTreeMap, VecDeque};
 use std::env;
@@ -17,10 +17,10 @@ use crate::report::{State, Style, Table};
 use crate::service::LocalEvaluators;
 use crate::sweep::{Cost, Ended, PlannedRun, Study, Sweep};
 
-/// Runs, and how far each is.
+/// Runs and their states.
 type Runs = Vec<(PlannedRun, State)>;
 
-/// Does it; an error is a run that is not complete.
+/// Runs the sweep; a run that is not complete is an error.
 pub fn sweep(args: &SweepArgs) -> anyhow::Result<()> {
     let study = Study::read(&args.study)?;
     let folder = args.runs.join(&study.name);
@@ -37,7 +37,7 @@ pub fn sweep(args: &SweepArgs) -> anyhow::Result<()> {
     conclude(&folder, count, ended)
 }
 
-/// The runs that were asked for, and how far each is.
+/// The runs that the command line selects, and their states.
 fn chosen(study: &Study, args: &SweepArgs, folder: &Path) -> anyhow::Result<Runs> {
     let runs = study.runs.len();
     if let Some(index) = args.index.filter(|index| *index >= runs) {
@@ -59,18 +59,18 @@ fn list(runs: &Runs) -> String {
     table.render(Style::Text)
 }
 
-/// How the machine is shared.
+/// How the runs share the machine.
 struct Machine {
     /// Runs at a time.
     jobs: usize,
     /// Threads of each learner.
     threads: usize,
-    /// Evaluators for all of them.
+    /// The evaluators of all runs.
     evaluators: LocalEvaluators,
 }
 
 impl Machine {
-    /// For so many runs: what the command line does not say follows from the cores that this process may use.
+    /// The shares for `runs` runs. What the command line does not say follows from the cores that this process may use.
     fn share(args: &SweepArgs, runs: usize) -> anyhow::Result<Self> {
         let cores = available_parallelism()?.get();
         let threads = env::var("RAYON_NUM_THREADS").ok().and_then(|threads| threads.parse().ok()).unwrap_or(1);
@@ -84,7 +84,7 @@ impl Machine {
 
 fn work(args: &SweepArgs, folder: &Path, left: Runs) -> anyhow::Result<Ended> {
     let Machine { jobs, threads, mut evaluators } = Machine::share(args, left.len())?;
-    // Once, not by each learner.
+    // Here once, not in each learner.
     let mut datasets = BTreeMap::<Option<String>, PathBuf>::new();
     for (run, _) in &left {
         let dataset = &run.experiment.dataset;
@@ -93,13 +93,13 @@ fn work(args: &SweepArgs, folder: &Path, left: Runs) -> anyhow::Result<Ended> {
         }
     }
     let mut step_seconds = BTreeMap::new();
-    // A single run, as of an array job, begins at once and foretells its time itself.
+    // A single run, such as a task of an array job, starts at once and prints its own forecast.
     if args.index.is_none() {
         let cost = Cost::measure(&left, |run| &*datasets[&run.experiment.dataset])?;
         info!("{}", cost.text(jobs));
         step_seconds = cost.step_seconds;
     }
-    // The tasks of an array job do not write into each other's logs.
+    // Tasks of an array job must not write into each other's logs.
     let logs = args.index.map_or(folder.to_owned(), |_| folder.join(&left[0].0.name));
     fs::create_dir_all(&logs).with_context(|| format!("cannot make the folder {}", logs.display()))?;
 
@@ -124,7 +124,7 @@ fn work(args: &SweepArgs, folder: &Path, left: Runs) -> anyhow::Result<Ended> {
     ended
 }
 
-/// Tells how all runs have ended.
+/// Prints how all runs have ended.
 fn conclude(folder: &Path, count: usize, ended: Ended) -> anyhow::Result<()> {
     let Ended { unfinished: stopped, failed } = ended;
     if !failed.is_empty() {

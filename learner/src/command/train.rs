@@ -1,4 +1,4 @@
-//! `learner train`, from the command line to the report.
+//! `learner train`, from the parsed command line to the report.
 
 use std::num::NonZero;
 use std::path::{Path, PathBuf};
@@ -23,13 +23,13 @@ use crate::report::{RunReport, of_run};
 use crate::run::{self, Begun, Log, Past, RunDir};
 use crate::service::{Display, Ending, Life, Live, MainLoop, Metrics, Run, STUCK, Threads};
 
-/// Most threads that train unless more are asked for: a gradient step of the paper is cut into tiles, twenty with one next action a
-/// state, and threads that wait for one keep their cores busy.
+/// Default limit of training threads: a gradient step of the paper is cut into tiles (twenty with one next action per state),
+/// and threads that wait for a tile keep their cores busy.
 const MOST_THREADS: usize = 16;
-/// How long a run that has failed may write its report.
+/// How long a failed run may take to write its report.
 const REPORT_PATIENCE: Duration = Duration::from_secs(5);
 
-/// Does it; an error is a run that did not come to its end.
+/// Trains; a run that does not complete is an error.
 pub fn train(args: &TrainArgs) -> anyhow::Result<()> {
     let preset = Preset::read(args.preset())?;
     let experiment = preset.resolve(&args.changes())?;
@@ -74,26 +74,26 @@ pub fn train(args: &TrainArgs) -> anyhow::Result<()> {
         return dry_run::foretell(&path, &config, transitions);
     }
 
-    // Zenoh and the training thread have threads of their own; this runtime serves the metrics and the main loop.
+    // Zenoh and training have threads of their own; this runtime serves the metrics and the main loop.
     let mut runtime = tokio::runtime::Builder::new_multi_thread();
     let runtime = runtime.worker_threads(2).on_thread_start(stay_in_background).enable_all().build()?;
     let ended = runtime.block_on(run_to_its_end(args, outside, &path, begun, name, &config, transitions));
     let concluded = ended.and_then(|(run_dir, ending)| conclude(&run_dir, &config, ending));
-    // Without waiting for a thread that waits for a broken disk.
+    // Does not wait for a thread that a broken disk blocks.
     runtime.shutdown_background();
     concluded
 }
 
-/// Starts the threads that train.
+/// Starts rayon's threads for training.
 fn start_pool(asked: Option<NonZero<usize>>) -> anyhow::Result<()> {
     let cores = std::thread::available_parallelism().map_or(1, NonZero::get);
-    // Of 0, rayon looks into RAYON_NUM_THREADS.
+    // With 0, rayon reads RAYON_NUM_THREADS.
     let usual = if std::env::var_os("RAYON_NUM_THREADS").is_some() { 0 } else { cores.min(MOST_THREADS) };
     let pool = rayon::ThreadPoolBuilder::new().thread_name(|_| "training".to_owned());
     Ok(pool.num_threads(asked.map_or(usual, NonZero::get)).build_global()?)
 }
 
-/// What to do where there is no dataset.
+/// A hint for a run without a dataset.
 pub(super) fn record_hint(Experiment { environment: name, .. }: &Experiment) -> String {
     let is_recorded = environment::find(name).is_ok_and(|spec| spec.goal.is_none());
     let other = match is_recorded {
@@ -122,10 +122,10 @@ async fn run_to_its_end(
     let server = server.hint_of(BindError::hint)?;
     info!("page: http://{}/", server.address);
     let opening = outside.open().await?;
-    // From here on nothing outside can be wrong any more, so a refused start leaves no folder behind.
+    // All checks are done, so a start that is refused leaves no folder behind.
     let (run_dir, scores, past) = take_up(path, begun, args.fresh, config)?;
     let (tell, events) = mpsc::unbounded_channel();
-    // A later start has a larger number; the low bits tell two apart that start in the same millisecond.
+    // A later start has a larger number; the low bits distinguish two that start in the same millisecond.
     let life = Life { run: name, incarnation: now()? << 16 | u64::from(rand::random::<u16>()) };
     let checkpoint_every = Duration::from_secs(args.checkpoint_seconds);
     let tensorboard = args.tensorboard.as_deref();
@@ -148,7 +148,7 @@ async fn run_to_its_end(
     Ok((run_dir, main_loop.run(opening).await))
 }
 
-/// The run's folder, and what is in it already.
+/// Opens or makes the run's folder, and reads what it contains.
 fn take_up(path: &Path, begun: Option<Begun>, fresh: bool, config: &RunConfig) -> anyhow::Result<(RunDir, Log, Past)> {
     match begun {
         Some(begun) if !fresh => return begun.go_on(&config.experiment),
@@ -164,11 +164,11 @@ fn now() -> anyhow::Result<u64> {
     Ok(SystemTime::now().duration_since(UNIX_EPOCH)?.as_millis() as u64)
 }
 
-/// Writes the report, however the run ended; a run that did not complete is an error.
+/// Writes the report after any ending; a run that did not complete is an error.
 fn conclude(run_dir: &RunDir, config: &RunConfig, ending: Ending) -> anyhow::Result<()> {
     let folder = run_dir.path().display();
     let reported = match &ending {
-        // Perhaps of a disk that hangs.
+        // The run may have failed because its disk hangs.
         Ending::Failed(_) => {
             let run_dir = run_dir.clone();
             within(REPORT_PATIENCE, move || summarise(&run_dir))
@@ -199,7 +199,7 @@ fn conclude(run_dir: &RunDir, config: &RunConfig, ending: Ending) -> anyhow::Res
     Err(error)
 }
 
-/// That no episode was given up.
+/// Checks that no episode was given up.
 fn all_scored(report: RunReport) -> anyhow::Result<()> {
     let missing: usize = report.missing.iter().map(|missing| missing.episodes).sum();
     if missing == 0 {
@@ -209,7 +209,7 @@ fn all_scored(report: RunReport) -> anyhow::Result<()> {
     Err(anyhow!("training is complete, but {missing} episodes have no score")).hint(hint)
 }
 
-/// Does it on another thread, which is not waited for any longer.
+/// Runs `work` on another thread, and stops waiting for it after a limit.
 fn within<T: Send + 'static>(
     patience: Duration,
     work: impl FnOnce() -> anyhow::Result<T> + Send + 'static,
@@ -237,7 +237,7 @@ fn default_run_dir(label: &str, experiment: &Experiment) -> anyhow::Result<PathB
     Ok(Path::new("runs").join(format!("{label}-{variant}-seed{}", experiment.seed)))
 }
 
-/// The folder's name, which is also the run's place in Zenoh's key space.
+/// The run's name: the folder's name, which is also part of its Zenoh keys.
 fn run_name(path: &Path) -> anyhow::Result<Name> {
     let folder = path.file_name().and_then(|name| name.to_str()).unwrap_or_default();
     Name::new(folder)
@@ -245,7 +245,7 @@ fn run_name(path: &Path) -> anyhow::Result<Name> {
         .hint("its last part must be 1 to 64 letters, digits, dots, dashes or underscores")
 }
 
-/// The CPU and what of it training uses.
+/// Names the CPU and the instructions that training uses.
 fn machine(precision: Precision) -> String {
     let cpu = std::fs::read_to_string("/proc/cpuinfo").unwrap_or_default();
     let name = cpu.lines().find_map(|line| line.strip_prefix("model name")?.split_once(": "));

@@ -1,14 +1,13 @@
-//! What a run was asked to do: an algorithm's values for a task with the command line's changes on top, resolved once and
-//! checked.
+//! The settings of a run: an algorithm's values for a task, changed by the command line, resolved once and checked.
 //!
-//! Owns the embedded tasks and the format of a run's `config.toml`. It has no state and no thread: every room above may
-//! call it, from any thread. It imports the list of [`algorithms`](crate::algorithms), whose hyper-parameters it checks, and
-//! nothing else of the learner.
+//! Owns the embedded tasks and the format of a run's `config.toml`. It has no state and no thread: every module above may call
+//! it, from any thread. Of the learner it imports only the list of [`algorithms`](crate::algorithms), whose hyper-parameters
+//! it checks.
 //!
-//! In reading order: `tasks` are what can be learnt, `hyperparameters` an algorithm's values for them, `presets` what a user
-//! begins from, by name or in a file; `experiment` is all of that, resolved; `run_config` is what a run's folder says of
-//! itself; `schedule` tells which steps are evaluated; `settings` compares two runs key by key; `device`, `nearest` and
-//! `tables` are small parts of these.
+//! In reading order: `tasks` are the tasks, `hyperparameters` an algorithm's values for them, `presets` the task or file from
+//! which a user starts; `experiment` is all of that, resolved; `run_config` is the content of `config.toml`; `schedule` tells
+//! which steps are evaluated; `settings` compares two runs key by key; `device`, `nearest` and `tables` are small parts of
+//! these.
 
 mod device;
 mod experiment;

@@ -1,11 +1,11 @@
-//! The page that shows runs to a browser: of a learner its own run while it works, of `learner page` all runs below a folder.
+//! The web page of runs: a learner shows its own run while it works, `learner page` shows all runs below a folder.
 //!
 //! Owns the page's files, which are part of the program, and a thread that reads run folders. The web server's tasks ask that
-//! thread, which answers from memory what it has read a moment ago, so that neither a slow disk nor a busy browser costs
-//! training anything. It imports `report` and `run`.
+//! thread, which answers from memory what it read a moment ago, so neither a slow disk nor a busy browser slows down training.
+//! It imports `report` and `run`.
 //!
-//! In reading order: `reader` reads the runs, `history` is what it keeps of one's metrics. The browser's side is
-//! `assets/page`: it shows whatever metrics a run's algorithm has.
+//! In reading order: `reader` reads the runs, `history` keeps the metrics of one. The browser's side is `assets/page`: it
+//! shows the metrics of any algorithm.
 
 mod history;
 mod reader;

@@ -1,20 +1,19 @@
-//! What runs achieved: their evaluations, summaries over seeds, what is published for the same tasks, and pictures.
+//! The results of runs: evaluations, summaries over seeds, published figures of the same tasks, and pictures.
 //!
-//! Owns nothing: it reads run folders, which a learner may be writing, and gives text, JSON, HTML, SVG, PNG and event files. It
-//! runs on the thread of its caller: `learner report`, `list`, and `train` at the end of a run, all on the main thread;
-//! `tensorboard` during a run; and the page's. It imports `config`, `run`
-//! and the list of algorithms.
+//! Owns nothing: it reads run folders, which a learner may be writing, and makes text, JSON, HTML, SVG, PNG and event files.
+//! It runs on its caller's thread: `learner report`, `list`, and `train` at the end of a run call it on the main thread,
+//! `tensorboard` during a run, and the page. It imports `config`, `run` and the list of algorithms.
 //!
 //! The protocol is the paper's (section 5.1 and appendix B): the score of a run is the mean of its last 5 evaluations, or of
-//! those in its last 50,000 steps; several seeds give mean ± standard deviation. That of its best one counts only where a user
-//! asks for it, and the report says so. A run that is not complete has no score.
+//! the evaluations in its last 50,000 steps; several seeds give mean ± standard deviation. If the user asks for it, a run's
+//! best evaluation counts instead, and the report says so. A run that is not complete has no score.
 //!
-//! In reading order: `run` reads a run; `seeds` puts runs together that differ in their seed alone; `statistics` are
-//! definitions, which `study` applies to methods over tasks and seeds; `published` are the paper's figures, `departures` is how
-//! a run differs from what the paper ran, `lambda` what QUAD's λ was in a run; `paper` has the paper's tables with ours beside
-//! them; `summary` is the whole report; `figures` are its pictures, which `plot` draws; `html` is all of that in one file, with
-//! the commands of `remake`. `selection`, `spread` and `table` are small parts of these. `state` is how far a run is, `list`
-//! says so of all runs, `tensorboard` copies a run to an event file.
+//! In reading order: `run` reads a run; `seeds` groups runs that differ only in their seed; `statistics` has the definitions,
+//! which `study` applies to methods over tasks and seeds; `published` has the paper's figures, `departures` the differences
+//! between a run and the paper's, `lambda` a summary of QUAD's λ; `paper` makes the paper's tables with our figures in them;
+//! `summary` is the whole report; `figures` are its pictures, which `plot` draws; `html` puts all of it into one file, with
+//! the commands of `remake`. `selection`, `spread` and `table` are small parts of these. `state` is the state of a run, `list`
+//! a table of all runs, `tensorboard` copies a run to an event file.
 
 mod departures;
 mod figures;

@@ -1,11 +1,11 @@
-//! The folder of a run: everything that is kept of it, how a run goes on in it, and how it is checked.
+//! The folder of a run: its files, how a run continues in it, and how `learner verify` checks it.
 //!
-//! The room runs on the threads that call it: `snapshots` writes snapshots, checkpoints and `metrics.jsonl`, `scores` writes
-//! `scores.jsonl`, the main thread everything else, and commands that only read may do so at any time. A learner at work
-//! holds a lock on `scores.jsonl`.
+//! It runs on its callers' threads: `snapshots` writes snapshots, checkpoints and `metrics.jsonl`, `scores` writes
+//! `scores.jsonl`, the main thread everything else. Commands that only read may run at any time. A learner at work holds a
+//! lock on `scores.jsonl`.
 //!
-//! In reading order: `folder`, `lines` (what its files say), `log` (files that only grow), `checkpoints`, `durable` (files
-//! that are whole whatever happens), `error`, `resume` (a run goes on), `verify` (a run is checked by its folder alone).
+//! In reading order: `folder`, `lines` (of its files), `log` (files that only grow), `checkpoints`, `durable` (files that are
+//! written whole or not at all), `error`, `resume` (continues a run), `verify` (checks a run).
 
 mod checkpoints;
 mod durable;

@@ -1,7 +1,7 @@
-//! Who has which job, and what is scored: the scoreboard and the evaluators behind one lock.
+//! Which evaluator has which job, and which episodes are scored: the scoreboard and the evaluators behind one lock.
 //!
-//! Every thread may call it. The lock is held for microseconds, never across input or output: what takes time, like writing
-//! scores down, the caller does between two calls.
+//! Every thread may call it. It holds the lock for microseconds, never during input or output: the caller does slow work, like
+//! writing scores, between two calls.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
@@ -19,12 +19,12 @@ use crate::evaluation::{
     Claim, Claimed, Earlier, HandedBack, Lost, OtherWeights, Refusal, Rules, Scoreboard, Validated,
 };
 
-/// Of what an evaluator says about a job that it could not do, so much is passed on, in characters.
+/// Most characters of an evaluator's error message that the learner logs.
 const LONGEST_REASON: usize = 300;
-/// Most names of which it is told that two evaluators use them.
+/// Most evaluator names for which the learner reports that two evaluators use them.
 const MOST_NAMES_TOLD: usize = 100;
 
-/// Which episodes each evaluation of a run has.
+/// The episodes of each evaluation of a run.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct EvaluationPlan {
     /// Seed of the run.
@@ -33,7 +33,7 @@ pub(crate) struct EvaluationPlan {
     pub episodes: u32,
 }
 
-/// Reaches the state. Clones share it.
+/// A handle to the shared state. Clones share it.
 #[derive(Clone, Debug)]
 pub(crate) struct Coordinator {
     state: Arc<Mutex<State>>,
@@ -48,14 +48,14 @@ pub(crate) struct Coordinator {
 struct State {
     scoreboard: Scoreboard,
     evaluators: Evaluators,
-    /// Steps of which it was told that a job failed.
+    /// Steps for which a failed job was reported.
     failures_told: BTreeSet<u64>,
-    /// Names of which it was told that two evaluators use them.
+    /// Names for which it was reported that two evaluators use them.
     names_told: BTreeSet<Name>,
 }
 
 impl Coordinator {
-    /// Without evaluations; see [`Scoreboard::new`].
+    /// A coordinator without evaluations; see [`Scoreboard::new`].
     pub fn new(
         rules: Rules,
         plan: EvaluationPlan,
@@ -73,17 +73,17 @@ impl Coordinator {
         Self { state: Arc::new(Mutex::new(state)), plan, incarnation, environment, metrics, events }
     }
 
-    /// The environment that policies are evaluated in.
+    /// The environment in which evaluators run the policies.
     pub fn environment(&self) -> &str {
         &self.environment
     }
 
-    /// Whether an evaluator is connected that has this environment.
+    /// Whether an evaluator with this environment is connected.
     pub fn any_fits(&self) -> bool {
         self.lock().evaluators.any_fits()
     }
 
-    /// Each evaluator that is connected, and what it does, as the page shows it.
+    /// Each connected evaluator and its job, for the page.
     pub fn evaluators(&self) -> Vec<EvaluatorAtWork> {
         let state = self.lock();
         let present = state.evaluators.present();
@@ -96,7 +96,7 @@ impl Coordinator {
         at_work.collect()
     }
 
-    // A thread that panicked here ends the run.
+    // A panic with the lock held ends the run.
     fn lock(&self) -> MutexGuard<'_, State> {
         self.state.lock().unwrap_or_else(PoisonError::into_inner)
     }
@@ -115,17 +115,17 @@ impl Coordinator {
         Ok(())
     }
 
-    /// Hash of the snapshot of a step that is evaluated.
+    /// Hash of the snapshot that is evaluated for a step.
     pub fn weights(&self, step: u64) -> Option<Hash> {
         self.lock().scoreboard.weights(step)
     }
 
-    /// Episodes that have no score yet, and may still get one.
+    /// Episodes that have no score, but may still get one.
     pub fn pending(&self) -> usize {
         self.lock().scoreboard.pending()
     }
 
-    /// Answers an evaluator that asks for a job or hands one back.
+    /// Answers a claim or a hand-back.
     pub fn job(&self, request: &JobRequest) -> JobReply {
         let mut state = self.lock();
         match request {
@@ -173,19 +173,19 @@ impl Coordinator {
         }
     }
 
-    /// Takes in how far an evaluator is.
+    /// Records an evaluator's progress.
     pub fn progress(&self, progress: Progress) -> Result<(), Rejection> {
         let (mut state, now) = (self.lock(), Instant::now());
         state.scoreboard.progress(&progress, now)?;
         state.evaluators.heard(progress, now)
     }
 
-    /// An evaluator has connected.
+    /// Records that an evaluator has connected.
     pub fn joined(&self, evaluator: Name) -> Result<(), Rejection> {
         self.lock().evaluators.joined(evaluator)
     }
 
-    /// An evaluator has left: its job goes to others.
+    /// Records that an evaluator has left; its job becomes free for others.
     pub fn left(&self, evaluator: &Name) {
         let mut state = self.lock();
         let lost = state.scoreboard.evaluator_gone(evaluator, Instant::now());
@@ -193,18 +193,18 @@ impl Coordinator {
         self.lost(&state, lost);
     }
 
-    /// What is new in each of some reports, which changes nothing yet.
+    /// Checks reports and finds the new scores in each. Changes nothing.
     pub fn validate<'a>(&self, reports: impl Iterator<Item = &'a ScoreReport>) -> Vec<Result<Validated, Refusal>> {
         let state = self.lock();
         reports.map(|report| state.scoreboard.validate(report)).collect()
     }
 
-    /// Lets an evaluator keep its job whose scores have come but are not on the disk yet.
+    /// Extends the lease of a job whose scores have arrived but are not on the disk yet.
     pub fn keep(&self, report: &ScoreReport) {
         self.lock().scoreboard.keep(report, Instant::now());
     }
 
-    /// Counts scores that are on the disk. Gives the acknowledgement of each report.
+    /// Counts scores that are on the disk. Returns the acknowledgement of each report.
     pub fn record<'a>(&self, reports: impl Iterator<Item = (&'a ScoreReport, &'a Validated)>) -> Vec<ScoreReply> {
         let mut state = self.lock();
         let replies = reports.map(|(report, validated)| self.record_one(&mut state, report, validated)).collect();
@@ -226,13 +226,13 @@ impl Coordinator {
         ScoreReply::Recorded { incarnation: self.incarnation, new: new.len() as u32, duplicates: *duplicates }
     }
 
-    /// The answer to a report that is never accepted.
+    /// The answer to a report that the learner will never accept.
     pub fn refused(&self, refusal: Refusal) -> ScoreReply {
         ScoreReply::Refused { incarnation: self.incarnation, reason: refusal.to_string() }
     }
 
-    /// Takes back jobs whose lease has run out, and forgets evaluators that are long gone; to be called several times a
-    /// second. Gives what people are to be told.
+    /// Takes back jobs whose lease has expired, and forgets evaluators that left long ago. Returns lines for the log. Call it
+    /// several times a second.
     pub fn tick(&self) -> Vec<String> {
         let (mut state, now) = (self.lock(), Instant::now());
         let mut lines = state.evaluators.tick(now);
@@ -245,7 +245,7 @@ impl Coordinator {
         lines
     }
 
-    /// An evaluator could not do a job, which is told once for each step.
+    /// Reports a job that an evaluator could not run, once for each step.
     fn failed(&self, state: &mut State, step: u64, evaluator: &Name, reason: &str) {
         self.metrics.evaluation.jobs_failed.inc();
         let reason: String = reason.chars().filter(|c| !c.is_control()).take(LONGEST_REASON).collect();
@@ -274,7 +274,7 @@ impl Coordinator {
         self.metrics.evaluation.episodes_pending.set(state.scoreboard.pending() as i64);
     }
 
-    /// Lets the metrics show a complete evaluation, if it is the newest.
+    /// Sets the metrics to a complete evaluation, if it is the newest.
     fn show(&self, step: u64, scores: &[EpisodeScore]) {
         let evaluation = &self.metrics.evaluation;
         if let Ok(step) = i64::try_from(step)

@@ -1,5 +1,5 @@
-//! How the disk takes what a thread writes: `/healthz` and a metric say so for as long as it refuses, display and log now and
-//! then.
+//! Whether the disk accepts what a thread writes. While it does not, `/healthz` and a metric say so; display and log repeat it
+//! from time to time.
 
 use std::time::{Duration, Instant};
 
@@ -10,26 +10,26 @@ use tracing::warn;
 use super::events::{Event, Events, Saved};
 use super::metrics::DiskMetrics;
 
-/// A disk that stays in trouble is spoken of this often.
+/// How often the log repeats that the disk is in trouble.
 const REMIND: Duration = Duration::from_secs(60);
 
-/// How the disk takes what one thread writes.
+/// Whether the disk accepts what one thread writes.
 #[derive(Debug)]
 pub(crate) struct DiskStatus {
     what: Saved,
     gauge: IntGauge,
     events: Events,
-    /// Since when it does not, and when that was last said.
+    /// When the trouble began, and when it was last logged.
     trouble: Option<(Instant, Instant)>,
 }
 
 impl DiskStatus {
-    /// No trouble yet.
+    /// A status without trouble.
     pub fn new(what: Saved, metrics: &DiskMetrics, events: Events) -> Self {
         Self { what, gauge: metrics.trouble(what), events, trouble: None }
     }
 
-    /// The disk has refused something.
+    /// Records that the disk refused a write.
     pub fn refused(&mut self, beat: &Beat, error: &str) {
         let (now, what) = (Instant::now(), self.what);
         beat.set_trouble(Some(format!("{} cannot be saved: {error}", what.name())));
@@ -44,10 +44,10 @@ impl DiskStatus {
         }
     }
 
-    /// The disk has taken something.
+    /// Records that the disk accepted a write.
     pub fn well(&mut self, beat: &Beat) {
         beat.set_trouble(None);
-        // The main loop sets it, too, while this thread hangs.
+        // The main loop sets the gauge, too, while this thread hangs.
         self.gauge.set(0);
         if self.trouble.take().is_some() {
             self.events.send(Event::DiskWell(self.what)).ok();

@@ -1,4 +1,4 @@
-//! What a person sees while the learner works: a bar with the figures on a terminal, plain log lines otherwise.
+//! What the user sees while the learner works: a bar with figures on a terminal, plain log lines otherwise.
 
 use std::collections::VecDeque;
 use std::time::{Duration, Instant};
@@ -12,32 +12,32 @@ use super::metrics::Metrics;
 const REDRAW: Duration = Duration::from_millis(250);
 /// How often a log gets a line.
 const LINE: Duration = Duration::from_secs(5);
-/// The rate is measured over so long.
+/// Window over which the rate is measured.
 const RATE_WINDOW: Duration = Duration::from_secs(15);
-/// After so long it is told how long the whole training takes.
+/// How long training runs before the forecast of its duration.
 const FORETELL: Duration = Duration::from_secs(3);
 /// How many of the newest evaluations are shown.
 const SCORES_SHOWN: usize = 3;
 
-/// The display.
+/// Shows the progress of a run.
 pub(crate) struct Display {
     metrics: Metrics,
     steps: u64,
-    /// `None` where stderr is no terminal, or one that cannot draw (`TERM=dumb`).
+    /// `None` if stderr is no terminal, or one that cannot draw (`TERM=dumb`).
     bar: Option<ProgressBar>,
     samples: VecDeque<(Instant, u64)>,
     /// Newest last: gradient step and mean score.
     scores: VecDeque<(u64, f64)>,
     last_line: Instant,
-    /// Whether the whole training's length was told.
+    /// Whether the forecast has been printed.
     foretold: bool,
 }
 
 impl Display {
-    /// Starts it, for so many gradient steps.
+    /// Starts the display of a run with `steps` gradient steps.
     pub fn start(metrics: Metrics, steps: u64) -> Self {
         let bar = ProgressBar::with_draw_target(Some(steps), ProgressDrawTarget::stderr());
-        // Without a style of ours the bar still works, with less beside it.
+        // Without our style the bar still works, but shows less.
         if let Ok(style) = ProgressStyle::with_template("{bar:40} {pos}/{len} gradient steps\n{msg}") {
             bar.set_style(style);
         }
@@ -57,7 +57,7 @@ impl Display {
         REDRAW
     }
 
-    /// An event, as a line of its own.
+    /// Prints an event as a line.
     pub fn say(&self, text: &str) {
         match &self.bar {
             Some(bar) => bar.println(text),
@@ -65,7 +65,7 @@ impl Display {
         }
     }
 
-    /// A new evaluation result.
+    /// Adds the result of an evaluation.
     pub fn scored(&mut self, step: u64, mean: f64) {
         self.scores.push_back((step, mean));
         if self.scores.len() > SCORES_SHOWN {
@@ -73,7 +73,7 @@ impl Display {
         }
     }
 
-    /// Brings the figures up to date.
+    /// Updates the figures.
     pub fn tick(&mut self, now: Instant) {
         let step = self.metrics.training.gradient_steps.get();
         let training = step < self.steps;
@@ -97,7 +97,7 @@ impl Display {
         }
     }
 
-    /// Says once how long it takes, if that is longer than a minute: the user may have meant fewer steps.
+    /// Prints once how long training will take, if that is more than a minute: the user may have meant fewer steps.
     fn foretell(&mut self, step: u64, now: Instant) {
         let Some(&(begin, first)) = self.samples.front() else { return };
         let rate = self.rate();
@@ -111,7 +111,7 @@ impl Display {
         }
     }
 
-    /// Takes the bar away.
+    /// Removes the bar.
     pub fn finish(&mut self) {
         if let Some(bar) = self.bar.take() {
             bar.finish_and_clear();

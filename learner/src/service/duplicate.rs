@@ -1,4 +1,4 @@
-//! Two learners of one run name would answer each other's evaluators. The second one stops.
+//! Two learners with one run name would answer each other's evaluators, so the second learner stops.
 
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant};
@@ -12,27 +12,27 @@ use zenoh::sample::{Sample, SampleKind};
 
 use super::events::{Event, Events};
 
-/// The token of a learner that was cut off lasts for as long as Zenoh takes to notice: five seconds.
+/// Zenoh takes five seconds to remove the token of a learner that lost its connection.
 const PATIENCE: Duration = Duration::from_secs(8);
-/// So long after the start an earlier learner of the name ends this one: tokens of learners that start together have
-/// arrived by then.
+/// For this long after its start, a learner ends if it sees an earlier learner of the same name. By then the tokens of
+/// learners that started together have arrived.
 const TOGETHER: Duration = Duration::from_secs(10);
-/// How often it is looked for meanwhile, and how long an answer may take.
+/// How often the learner looks for another one, and how long an answer may take.
 const LOOK_AGAIN: Duration = Duration::from_millis(500);
 
-/// Which life of which run's learner this is.
+/// Identifies one process of a run's learner.
 #[derive(Clone, Debug)]
 pub(crate) struct Life {
     pub run: Name,
-    /// Which start of its learner: a later one has a larger number.
+    /// The start of this process: a later start has a larger number.
     pub incarnation: u64,
 }
 
-/// Returns when no other learner of the run is there.
+/// Returns when no other learner of the run is connected.
 ///
 /// # Errors
 ///
-/// One is still there when a dead one's token would have gone.
+/// Another learner is still connected when the token of a dead one would be gone.
 pub(super) async fn wait_until_gone(session: &Session, life: &Life) -> anyhow::Result<()> {
     let deadline = Instant::now() + PATIENCE;
     let mut said = false;
@@ -61,7 +61,7 @@ async fn another(session: &Session, life: &Life) -> anyhow::Result<Option<u64>> 
     Ok(None)
 }
 
-/// Ends the run when a learner shows up soon that was started a little earlier. (A later one stops by itself.)
+/// Ends the run if a learner appears that started a little earlier. (A later learner stops by itself.)
 pub(super) async fn watch(session: &Session, life: &Life, events: &Events) -> anyhow::Result<()> {
     let (mine, events, told) = (life.clone(), events.clone(), AtomicBool::new(false));
     let callback = move |token: Sample| {

@@ -1,4 +1,4 @@
-//! Which evaluators are connected, when each last told its progress, and what people are told of that.
+//! Which evaluators are connected, when each last reported progress, and the log lines about them.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::mem;
@@ -11,18 +11,18 @@ use super::rejection::Rejection;
 
 /// The metrics of an evaluator that has left are dropped this long after its last progress message.
 const FORGET_AFTER: Duration = Duration::from_secs(600);
-/// Most evaluators that the learner tracks: far above any real pool, to bound the memory that made-up names take.
+/// Most evaluators that the learner tracks: far above any real pool. The limit bounds the memory that made-up names take.
 const MOST_EVALUATORS: usize = 1024;
-/// So many are told one by one in each period, the rest as a number at its end.
+/// So many evaluators per period get a log line of their own; the rest are one line with a number.
 const ONE_BY_ONE: usize = 20;
 const PERIOD: Duration = Duration::from_secs(10);
 
-/// Those that are connected, and those that were heard of not long ago.
+/// The connected evaluators, and those whose last message is recent.
 #[derive(Debug)]
 pub(super) struct Evaluators {
     metrics: EvaluatorMetrics,
     present: BTreeSet<Name>,
-    /// Those of them that have the run's environment.
+    /// The connected evaluators that have the run's environment.
     fitting: BTreeSet<Name>,
     last_seen: BTreeMap<Name, Instant>,
     news: News,
@@ -34,30 +34,30 @@ impl Evaluators {
         Self { metrics, present: BTreeSet::new(), fitting: BTreeSet::new(), last_seen: BTreeMap::new(), news }
     }
 
-    /// How many are connected.
+    /// The number of connected evaluators.
     pub fn count(&self) -> usize {
         self.present.len()
     }
 
-    /// Whether one is connected that has the run's environment.
+    /// Whether a connected evaluator has the run's environment.
     pub fn any_fits(&self) -> bool {
         !self.fitting.is_empty()
     }
 
-    /// Those that are connected: whether each has the run's environment, and when it was last heard of.
+    /// The connected evaluators: whether each has the run's environment, and when its last message came.
     pub fn present(&self) -> impl Iterator<Item = (&Name, bool, Option<Instant>)> {
         let seen = |evaluator: &Name| self.last_seen.get(evaluator).copied();
         self.present.iter().map(move |evaluator| (evaluator, self.fitting.contains(evaluator), seen(evaluator)))
     }
 
-    /// One asked for a job, and has the run's environment.
+    /// Records that an evaluator asked for a job, and has the run's environment.
     pub fn fits(&mut self, evaluator: &Name) {
         if self.present.contains(evaluator) && !self.fitting.contains(evaluator) {
             self.fitting.insert(evaluator.clone());
         }
     }
 
-    /// One is connected.
+    /// Records that an evaluator is connected.
     pub fn joined(&mut self, evaluator: Name) -> Result<(), Rejection> {
         if self.present.len() >= MOST_EVALUATORS && !self.present.contains(&evaluator) {
             return Err(Rejection::Crowd);
@@ -70,7 +70,7 @@ impl Evaluators {
         Ok(())
     }
 
-    /// One has left; `jobs` of it were taken back.
+    /// Records that an evaluator has left; the learner took back `jobs` of its jobs.
     pub fn left(&mut self, evaluator: &Name, jobs: usize) {
         if !self.present.remove(evaluator) {
             return;
@@ -86,7 +86,7 @@ impl Evaluators {
         }
     }
 
-    /// One told its progress.
+    /// Records an evaluator's progress message.
     pub fn heard(&mut self, progress: Progress, now: Instant) -> Result<(), Rejection> {
         if self.last_seen.len() >= MOST_EVALUATORS && !self.last_seen.contains_key(&progress.evaluator) {
             return Err(Rejection::Crowd);
@@ -96,7 +96,7 @@ impl Evaluators {
         Ok(())
     }
 
-    /// Forgets those that are long gone. Gives what people are to be told since the last time.
+    /// Forgets evaluators that left long ago. Returns the log lines since the last call.
     pub fn tick(&mut self, now: Instant) -> Vec<String> {
         let (present, metrics) = (&self.present, &self.metrics);
         self.last_seen.retain(|evaluator, seen| {
@@ -110,7 +110,7 @@ impl Evaluators {
     }
 }
 
-/// What is to be told: each of a few that come or go, and how many there were of many.
+/// Log lines about evaluators that come and go: one for each of a few, a number for many.
 #[derive(Debug)]
 struct News {
     since: Instant,
@@ -121,7 +121,7 @@ struct News {
 }
 
 impl News {
-    /// Whether it may be told by itself.
+    /// Whether this one gets a line of its own.
     fn tell(&mut self, line: String) -> bool {
         self.told += 1;
         let may = self.told <= ONE_BY_ONE;

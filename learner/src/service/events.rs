@@ -1,38 +1,39 @@
-//! What the threads tell the main loop.
+//! What the other threads report to the main loop.
 
 use quad_protocol::{EpisodeScore, Name};
 use tokio::sync::mpsc::UnboundedSender;
 
 use crate::train::Outcome;
 
-/// Where events go. What the network can cause is told once for each step, name or period, so the queue stays short.
+/// The sender of events. Events that the network can cause are sent once for each step, name or period, so the queue stays
+/// short.
 pub(crate) type Events = UnboundedSender<Event>;
 
-/// Something that happened.
+/// A report to the main loop.
 #[derive(Debug)]
 pub(crate) enum Event {
     /// A snapshot of this step is ready to be evaluated.
     Published { step: u64 },
-    /// An evaluator could not do a job, and why, in its words; told once for each step.
+    /// An evaluator could not run a job; its error message. Sent once for each step.
     JobFailed { step: u64, evaluator: Name, reason: String },
-    /// Episodes, by step and seed, that are not handed out any more: too many evaluators were lost with them or could not do
+    /// Episodes, by step and seed, that the learner has given up: too many evaluators were lost with them or could not run
     /// them.
     GivenUp(Vec<(u64, u64)>),
-    /// An evaluator that has a job has asked for another one; told once for each name.
+    /// An evaluator that has a job has asked for another one; sent once for each name.
     SameName(Name),
     /// All episodes of an evaluation are scored; the scores are in the order of the evaluation's seeds.
     Evaluated { step: u64, scores: Vec<EpisodeScore> },
-    /// No gradient step will follow, and everything that training made is on the disk.
+    /// No gradient step will follow, and all output of training is on the disk.
     TrainingEnded(Outcome),
-    /// The disk does not take that; what it says.
+    /// The disk refuses this output; its error message.
     DiskTrouble(Saved, String),
-    /// The disk takes it again.
+    /// The disk accepts this output again.
     DiskWell(Saved),
-    /// The run cannot go on.
+    /// The run cannot continue.
     Failed(anyhow::Error),
 }
 
-/// What a thread writes to the disk.
+/// Output of a thread on the disk.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) enum Saved {
     /// Snapshots, checkpoints and metrics.
@@ -52,7 +53,7 @@ impl Saved {
         }
     }
 
-    /// For people.
+    /// The name in messages.
     pub fn name(self) -> &'static str {
         match self {
             Self::Run => "the run",
@@ -60,7 +61,7 @@ impl Saved {
         }
     }
 
-    /// The thread that writes it.
+    /// The name of the thread that writes this output.
     pub fn thread(self) -> &'static str {
         match self {
             Self::Run => "snapshots",

@@ -1,4 +1,4 @@
-//! What a learner does at this moment, as its page shows it.
+//! The learner's current state, as its page shows it.
 
 use std::sync::{Arc, OnceLock};
 
@@ -11,24 +11,24 @@ use super::coordinator::Coordinator;
 use super::metrics::Metrics;
 use super::threads::Threads;
 
-/// Tells it. Clones are the same.
+/// A handle to the state. Clones share it.
 #[derive(Clone)]
 pub(crate) struct Live {
     run: Name,
     steps: u64,
     metrics: Metrics,
     health: Health,
-    /// There as soon as the threads are.
+    /// Set once the threads run.
     coordinator: Arc<OnceLock<Coordinator>>,
 }
 
-/// An evaluator that is connected.
+/// A connected evaluator.
 #[derive(Debug, Serialize)]
 pub(super) struct EvaluatorAtWork {
     pub name: String,
-    /// Whether it has the run's environment, as far as is known.
+    /// Whether it has the run's environment, if known.
     pub fits: bool,
-    /// Since its last message about its progress.
+    /// Time since its last progress message.
     pub seconds_ago: Option<f64>,
     pub job: Option<JobAtWork>,
 }
@@ -45,17 +45,17 @@ pub(super) struct JobAtWork {
 }
 
 impl Live {
-    /// Of a run of so many gradient steps that is about to begin.
+    /// The state of a run of `steps` gradient steps that is about to begin.
     pub fn new(run: Name, steps: u64, metrics: Metrics, health: Health) -> Self {
         Self { run, steps, metrics, health, coordinator: Arc::default() }
     }
 
-    /// The run has begun.
+    /// Records that the run has begun.
     pub fn begun(&self, threads: &Threads) {
         self.coordinator.set(threads.services.coordinator.clone()).ok();
     }
 
-    /// As JSON.
+    /// The state as JSON.
     pub fn tell(&self) -> Value {
         json!({
             "run": self.run.as_str(),

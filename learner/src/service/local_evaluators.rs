@@ -1,4 +1,4 @@
-//! Evaluators that the learner starts itself, and that end with it: `learner train --evaluators N`, and those of a sweep.
+//! Evaluators that the learner or a sweep starts itself, and that end with it: `--evaluators N`.
 
 use std::fs::File;
 use std::io;
@@ -13,12 +13,12 @@ use rustix::process::{Pid, Signal, kill_process, set_parent_process_death_signal
 
 /// The program.
 const EVALUATOR: &str = "evaluator";
-/// An evaluator delivers what it has and leaves within two seconds; one that takes this long is killed.
+/// An evaluator delivers its scores and leaves within two seconds; the learner kills it after this time.
 const LEAVE: Duration = Duration::from_secs(4);
 const GLANCE: Duration = Duration::from_millis(20);
 
-/// Makes a process that will end when the thread that starts it does, and that hears nothing of a terminal's Ctrl-C: that is
-/// for its parent, which tells it to leave.
+/// Sets up a command so that its process ends with the thread that starts it. The process does not get a terminal's Ctrl-C; its
+/// parent tells it to leave.
 fn end_with_parent(command: &mut Command) {
     command.stdin(Stdio::null()).process_group(0);
     // SAFETY: the new process makes one system call, which may be made between fork and exec.
@@ -28,25 +28,25 @@ fn end_with_parent(command: &mut Command) {
     }
 }
 
-/// Keeps the user's certificates from a program that connects to an endpoint without encryption, which would refuse them.
+/// Hides the user's certificates from a program that connects to an endpoint without encryption, which would refuse them.
 pub(crate) fn not_encrypted(command: &mut Command, endpoint: &str) {
     if endpoint.starts_with("tcp/") {
         command.env_remove("QUAD_CERTIFICATES");
     }
 }
 
-/// Starts a process that ends with this thread, with all that it says at the end of a file.
+/// Starts a process that ends with this thread, and appends all its output to a file.
 pub(crate) fn spawn_logged(command: &mut Command, log: &Path) -> io::Result<Child> {
     end_with_parent(command);
     let file = File::options().create(true).append(true).open(log)?;
     command.stdout(file.try_clone()?).stderr(file).spawn()
 }
 
-/// What is to be started, and what was.
+/// The evaluators to start, and those that run.
 #[derive(Default)]
 pub(crate) struct LocalEvaluators {
     count: usize,
-    /// Cores for all of them together.
+    /// Cores for all evaluators together.
     cores: usize,
     program: PathBuf,
     started: Vec<Started>,
@@ -55,15 +55,15 @@ pub(crate) struct LocalEvaluators {
 struct Started {
     process: Child,
     log: PathBuf,
-    /// It is known that it has ended.
+    /// Whether the learner knows that it has ended.
     ended: bool,
 }
 
 impl LocalEvaluators {
-    /// So many, which are not started yet, with so many cores for all of them together.
+    /// Prepares `count` evaluators, which share `cores` cores. Does not start them.
     ///
     /// # Errors
-    /// There is no evaluator beside this program, nor on the PATH.
+    /// There is no program `evaluator` beside this program, nor on the PATH.
     pub fn new(count: usize, cores: usize) -> anyhow::Result<Self> {
         if count == 0 {
             return Ok(Self::default());
@@ -89,12 +89,12 @@ impl LocalEvaluators {
         Ok(Self { count, cores, program, started: Vec::new() })
     }
 
-    /// Starts them. They connect to the first of these endpoints, and write their logs into a folder.
+    /// Starts the evaluators. They connect to the first of these endpoints, and write their logs into a folder.
     ///
-    /// To be called by a thread that lives as long as the learner: the system ends them when that thread ends.
+    /// Call it on a thread that lives as long as the learner: the system ends the evaluators with that thread.
     ///
     /// # Errors
-    /// A process or its log cannot be made.
+    /// A process or its log file cannot be made.
     pub fn start(&mut self, reachable_at: &[String], folder: &Path) -> anyhow::Result<()> {
         for number in 1..=self.count {
             let log = folder.join(format!("evaluator-{number}.log"));
@@ -118,7 +118,7 @@ impl LocalEvaluators {
         command
     }
 
-    /// What people are to be told of those that have ended by themselves.
+    /// Log lines about evaluators that have ended by themselves.
     pub fn news(&mut self) -> Vec<String> {
         let ended = |started: &mut Started| {
             let status = started.process.try_wait().ok().flatten().filter(|_| !started.ended)?;
@@ -128,7 +128,7 @@ impl LocalEvaluators {
         self.started.iter_mut().filter_map(ended).collect()
     }
 
-    /// Lets them leave, and waits for that.
+    /// Tells the evaluators to leave, and waits until they have.
     pub async fn end(&mut self) {
         let until = Instant::now() + LEAVE;
         for started in self.started.iter_mut().filter(|started| !started.ended) {

@@ -1,4 +1,4 @@
-//! The main loop of a run: shows what happens, and decides when the run is over.
+//! The main loop of a run: reports events, and decides when the run is over.
 
 use std::time::{Duration, Instant};
 
@@ -22,52 +22,52 @@ use crate::report::Spread;
 use crate::run::RunDir;
 use crate::train::Outcome;
 
-/// Longest time to close the session in, should the network hang.
+/// Time limit for closing the session, if the network hangs.
 const CLOSE_PATIENCE: Duration = Duration::from_secs(5);
-/// When a run has failed, what still waits for the disk is given up after this time: the disk may be in trouble, too.
+/// After this time a failed run gives up output that waits for the disk: the disk may be in trouble, too.
 const LAST_WRITES: Duration = Duration::from_secs(15);
 
 /// How a run ended.
 #[derive(Debug)]
 pub(crate) enum Ending {
-    /// Trained, and every score is there that may still come.
+    /// Training is complete, and every episode has a score or was given up.
     Complete,
     /// The user asked to stop (SIGINT or SIGTERM).
     Interrupted,
-    /// Trained, but no evaluator came that has the run's environment.
+    /// Training is complete, but no evaluator with the run's environment came.
     Unscored,
-    /// It could not go on.
+    /// The run could not continue.
     Failed(anyhow::Error),
 }
 
-/// What the loop watches over.
+/// What the loop needs.
 pub(crate) struct MainLoop {
     pub life: Life,
     pub run_dir: RunDir,
     pub metrics: Metrics,
-    /// Where its metrics are served.
+    /// The address of `/metrics`.
     pub metrics_address: String,
-    /// Where it listens or connects, as it was asked to.
+    /// Where the learner listens or connects, as the command line asks.
     pub endpoints: Endpoints,
     pub events: UnboundedReceiver<Event>,
     pub threads: Threads,
     pub display: Display,
     pub health: Health,
-    /// Says that this loop is alive: it would not be if nothing took what it prints.
+    /// Reports that this loop is alive. It is not if a full pipe blocks its output.
     pub beat: Beat,
-    /// Evaluators that it is to start.
+    /// The evaluators that it starts.
     pub evaluators: LocalEvaluators,
 }
 
-/// How far the run is, as far as the loop has heard.
+/// The state of the run, as far as the loop knows.
 #[derive(Default)]
 struct Progress {
     trained: bool,
     interrupted: bool,
     wire: Option<Wire>,
-    /// Where evaluators find the run; empty until it is online.
+    /// Where evaluators can reach the run; empty until it is online.
     reachable_at: Vec<String>,
-    /// What hangs, as far as it was told.
+    /// Outputs whose disk hangs, as reported.
     hangs: Vec<Saved>,
     patience: Patience,
 }
@@ -89,7 +89,7 @@ impl MainLoop {
         end(self.threads, &ending).await;
         while let Ok(event) = self.events.try_recv() {
             match (event, &ending) {
-                // Why the run has failed is known already.
+                // The reason of the failure is known already.
                 (Event::Failed(_), Ending::Failed(_)) => {}
                 (Event::Failed(error), _) => ending = Ending::Failed(error),
                 (event, _) => tell(event, &mut self.display),
@@ -97,7 +97,7 @@ impl MainLoop {
         }
         self.evaluators.end().await;
         if let Some(wire) = progress.wire {
-            // An evaluator that misses the goodbye notices the lost connection.
+            // An evaluator that misses this message notices the lost connection.
             timeout(CLOSE_PATIENCE, tokio::spawn(wire.close())).await.ok();
         }
         ending
@@ -124,7 +124,7 @@ impl MainLoop {
                 Some(event) = self.events.recv() => match event {
                     Event::Failed(error) => return Ending::Failed(error),
                     Event::TrainingEnded(Outcome::Stopped { .. }) => return Ending::Interrupted,
-                    // Told to stop during the last step: the scores are not waited for.
+                    // The stop came during the last step; the run does not wait for scores.
                     Event::TrainingEnded(Outcome::Completed) if progress.interrupted => return Ending::Interrupted,
                     Event::TrainingEnded(Outcome::Completed) => {
                         progress.trained = true;
@@ -190,7 +190,7 @@ impl MainLoop {
         verdict
     }
 
-    /// A thread that writes and says nothing for long waits for the disk.
+    /// A thread that writes and has not reported for long waits for the disk.
     fn watch_disk(&self, told: &mut Vec<Saved>) {
         let problems = self.health.problems();
         let silent = |what: &Saved| {
@@ -218,7 +218,7 @@ impl MainLoop {
     }
 }
 
-/// What to do when no evaluator is there that has the run's environment.
+/// A hint for a run without an evaluator that has its environment.
 fn how_to_evaluate(name: &str, endpoint: &str) -> String {
     match environment::find(name) {
         Ok(_) => format!("no evaluator is here; start one with: evaluator serve --connect {endpoint}"),
@@ -229,7 +229,7 @@ fn how_to_evaluate(name: &str, endpoint: &str) -> String {
     }
 }
 
-/// Shows what has happened.
+/// Reports an event.
 fn tell(event: Event, display: &mut Display) {
     let text = match event {
         Event::Published { step } => format!("step {step}: snapshot handed to evaluation"),
@@ -261,7 +261,7 @@ fn tell(event: Event, display: &mut Display) {
     display.say(&text);
 }
 
-/// Ends the threads. Those of a run that has failed get some time for it, in which its user is told why.
+/// Ends the threads. Those of a failed run get limited time; meanwhile the user reads why it failed.
 async fn end(threads: Threads, ending: &Ending) {
     let mut ended = tokio::task::spawn_blocking(|| threads.join());
     let Ending::Failed(error) = ending else { return drop(ended.await) };

@@ -1,4 +1,4 @@
-//! What Prometheus can ask the learner; docs/metrics.md explains each of them.
+//! The learner's Prometheus metrics; docs/metrics.md explains each of them.
 
 use std::collections::HashMap;
 use std::time::{SystemTime, UNIX_EPOCH};
@@ -11,22 +11,22 @@ use super::events::Saved;
 use crate::algorithms::Metric;
 use crate::train::{Registrar, TrainingMetrics};
 
-/// All metrics of one learner. Cheap to clone; updating one is an atomic store.
+/// All metrics of one learner. Clones are cheap; an update is an atomic store.
 #[derive(Clone, Debug)]
 pub(crate) struct Metrics {
-    /// Of the gradient steps.
+    /// Metrics of the gradient steps.
     pub training: TrainingMetrics,
-    /// Of snapshots, jobs and scores.
+    /// Metrics of snapshots, jobs and scores.
     pub evaluation: EvaluationMetrics,
-    /// Of what the evaluators say about themselves.
+    /// Metrics from the evaluators' progress messages.
     pub evaluators: EvaluatorMetrics,
-    /// Of what is kept on disk.
+    /// Metrics of checkpoints and the disk.
     pub disk: DiskMetrics,
-    /// Messages from the wire that were not accepted.
+    /// Messages that the learner did not accept.
     pub rejected: IntCounterVec,
 }
 
-/// Snapshots, jobs and scores.
+/// Metrics of snapshots, jobs and scores.
 #[derive(Clone, Debug)]
 pub(crate) struct EvaluationMetrics {
     pub snapshots_published: IntCounter,
@@ -44,7 +44,7 @@ pub(crate) struct EvaluationMetrics {
     pub step: IntGauge,
 }
 
-/// Checkpoints, and how the disk takes them.
+/// Metrics of checkpoints and the disk.
 #[derive(Clone, Debug)]
 pub(crate) struct DiskMetrics {
     pub checkpoint_step: IntGauge,
@@ -53,7 +53,7 @@ pub(crate) struct DiskMetrics {
     trouble: IntGaugeVec,
 }
 
-/// What the evaluators' progress messages say, labelled by evaluator.
+/// Metrics from the evaluators' progress messages, labelled by evaluator.
 #[derive(Clone, Debug)]
 pub(crate) struct EvaluatorMetrics {
     pub present: IntGauge,
@@ -63,7 +63,7 @@ pub(crate) struct EvaluatorMetrics {
 }
 
 impl Metrics {
-    /// Makes them all, in a registry that labels each with the run.
+    /// Makes all metrics, in a registry that labels each with the run.
     pub fn new(run: &Name, target_steps: u64, measured: &'static [Metric]) -> prometheus::Result<(Self, Registry)> {
         let labels = HashMap::from([("run".to_owned(), run.to_string())]);
         let registry = Registry::new_custom(None, Some(labels))?;
@@ -83,7 +83,7 @@ impl Metrics {
         Ok((metrics, registry))
     }
 
-    /// Counts a message that was not accepted.
+    /// Counts a message that the learner did not accept.
     pub fn reject(&self, reason: &str) {
         self.rejected.with_label_values(&[reason]).inc();
     }
@@ -121,14 +121,14 @@ impl DiskMetrics {
             checkpoint_bytes: make.count("checkpoint_bytes", "Size of the newest checkpoint")?,
             trouble: make.counts("disk_trouble", trouble, "what")?,
         };
-        // From the beginning, so that the first trouble is a change.
+        // Set from the start, so that the first trouble is a change.
         for what in Saved::ALL {
             metrics.trouble(what);
         }
         Ok(metrics)
     }
 
-    /// Whether the disk does not take that.
+    /// The gauge that is 1 while the disk refuses this output.
     pub fn trouble(&self, what: Saved) -> IntGauge {
         self.trouble.with_label_values(&[what.label()])
     }
@@ -147,7 +147,7 @@ impl EvaluatorMetrics {
         })
     }
 
-    /// Takes in what an evaluator says about itself.
+    /// Records an evaluator's progress message.
     pub fn observe(&self, progress: &Progress) {
         let label = [progress.evaluator.as_str()];
         let count = |value: u64| i64::try_from(value).unwrap_or(i64::MAX);
@@ -157,10 +157,10 @@ impl EvaluatorMetrics {
         self.last_seen.with_label_values(&label).set(now.as_secs_f64());
     }
 
-    /// Drops the series of an evaluator that is long gone.
+    /// Drops the series of an evaluator that left long ago.
     pub fn forget(&self, evaluator: &Name) {
         let label = [evaluator.as_str()];
-        // An error means that there was no such series, which is what is wanted.
+        // An error means that there is no such series, which is the goal.
         self.episodes.remove_label_values(&label).ok();
         self.environment_steps.remove_label_values(&label).ok();
         self.last_seen.remove_label_values(&label).ok();

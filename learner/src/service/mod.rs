@@ -1,20 +1,20 @@
-//! A run at work: its threads, its main loop, and everything that it says and hears on Zenoh.
+//! A run at work: its threads, its main loop, and all its communication over Zenoh.
 //!
-//! The main loop ([`MainLoop`]) runs on the main thread: it shows what happens and decides when the run is over. It alone is
-//! told by the others, through one queue of [`events`](Event). The table of all threads is in docs/architecture.md. The
-//! room `command` starts a run, and nothing below calls this room.
+//! The main loop ([`MainLoop`]) runs on the main thread: it reports events and decides when the run is over. The other threads
+//! report to it alone, through one queue of [`events`](Event). docs/architecture.md has a table of all threads. The module
+//! `command` starts a run; no module below calls this one.
 //!
 //! In reading order:
 //!
-//! - `threads` starts (by `spawn`) and ends the threads; `events` is what they tell the main loop, `main_loop`; `network` gets the run
-//!   online meanwhile, `duplicate` looks for another learner of the same name.
-//! - `snapshots` is the thread that writes what training makes and publishes it by `weights`.
-//! - `wire` declares everything on Zenoh, `services` says which thread answers what: a `pool`, or the thread `scores`, which
-//!   writes scores down. A query until it is answered is one of the `requests`.
-//! - `coordinator` is the state that they share: the scoreboard and the `evaluators`. `rejection` says why a message is not
-//!   accepted.
-//! - `metrics` are for Prometheus, `tensorboard` is the thread that copies the run to an event file, `disk` is what is told of a
-//!   disk that refuses something, `display` what a person sees on a terminal, `live` what the page shows.
+//! - `threads` starts (with `spawn`) and ends the threads; `events` are their reports to `main_loop`; `network` opens the
+//!   session meanwhile, and `duplicate` looks for another learner of the same name.
+//! - `snapshots` is the thread that writes the output of training, and publishes snapshots through `weights`.
+//! - `wire` declares everything on Zenoh; `services` assigns each kind of message to a `pool` of threads or to the thread
+//!   `scores`, which writes scores. `requests`: queries that wait for their answer.
+//! - `coordinator` is the state that the threads share: the scoreboard and the `evaluators`. `rejection`: why the learner does
+//!   not accept a message.
+//! - `metrics` are for Prometheus; `tensorboard` is the thread that copies the run to an event file; `disk` reports a disk
+//!   that refuses writes; `display` is the terminal, `live` the state for the page.
 
 mod coordinator;
 mod disk;

@@ -1,4 +1,4 @@
-//! How a run gets online: the session is opened while training begins, and everything is declared on it.
+//! Brings a run online: opens the session while training begins, and declares everything on it.
 
 use std::time::Duration;
 
@@ -14,7 +14,7 @@ use super::snapshots::RETRY;
 use super::wire::Wire;
 use crate::run::{RunDir, RunEndpoints};
 
-/// Listening takes milliseconds. A session that takes longer waits for a router; training starts without it.
+/// Listening takes milliseconds. If the session takes longer, it waits for a router, and training starts without it.
 const SESSION_PATIENCE: Duration = Duration::from_secs(1);
 
 /// A Zenoh session that may still wait for a router.
@@ -23,7 +23,7 @@ pub(crate) enum Opening {
     Waits(JoinHandle<Result<Session, SessionError>>),
 }
 
-/// Starts to open the session. What cannot work, like listening at a port in use, is an error at once.
+/// Starts to open the session. An error at once means that it cannot work, like a port that is in use.
 pub(crate) async fn open_network(endpoints: &Endpoints) -> anyhow::Result<Opening> {
     let endpoints = endpoints.clone();
     let mut opening = tokio::spawn(async move { quad_service::open_session(&endpoints).await });
@@ -36,12 +36,12 @@ pub(crate) async fn open_network(endpoints: &Endpoints) -> anyhow::Result<Openin
 /// A run that evaluators can find.
 pub(super) struct Online {
     pub wire: Wire,
-    /// Where they find it.
+    /// Where evaluators can reach it.
     pub reachable_at: Vec<String>,
 }
 
-/// Declares the run as soon as the session is open, and says in its folder where it is. It is to run as a task of its own:
-/// to be sure that there is no other learner of the name takes seconds, and Zenoh may keep a task waiting.
+/// Declares the run as soon as the session is open, and writes its addresses into its folder. Run this as a task of its own:
+/// the search for another learner of the name takes seconds, and Zenoh may block a task.
 pub(super) async fn go_online(
     opening: Opening,
     endpoints: Endpoints,
@@ -64,7 +64,7 @@ pub(super) async fn go_online(
     Ok(Online { wire, reachable_at })
 }
 
-/// Writes where the learner can be reached, as soon as the disk takes it. Nothing but the user's scripts needs it.
+/// Writes where the learner can be reached, as soon as the disk accepts it. Only the user's scripts need the file.
 async fn write_endpoints(run_dir: RunDir, endpoints: RunEndpoints) {
     let mut said = false;
     loop {

@@ -1,30 +1,30 @@
-//! How long a run that is trained waits for evaluators.
+//! How long a trained run waits for evaluators.
 
 use std::time::{Duration, Instant};
 
-/// After this time the user is told what to do.
+/// After this time the learner says what to do.
 const ADVISE: Duration = Duration::from_secs(10);
 /// After this time the run ends without its scores; the same command waits again.
 const GIVE_UP: Duration = Duration::from_secs(600);
 
-/// Since when no evaluator has been there that could score anything.
+/// How long no evaluator has been connected that could score the run.
 #[derive(Default)]
 pub(super) struct Patience {
     since: Option<Instant>,
     advised: bool,
 }
 
-/// What is to be done about it.
+/// What the main loop should do.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(super) enum Verdict {
     Wait,
-    /// Once for each time that there is none.
+    /// Say what to do: once in each period without such an evaluator.
     Advise,
     GiveUp,
 }
 
 impl Patience {
-    /// Looks whether there is one now.
+    /// Checks whether an evaluator is connected.
     pub fn look(&mut self, there: bool, now: Instant) -> Verdict {
         if there {
             *self = Self::default();

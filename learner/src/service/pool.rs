@@ -1,5 +1,5 @@
-//! A few threads that answer queries. To send an answer may take until the peer reads, or up to two seconds, after which
-//! Zenoh closes the connection; so no thread does it that others wait for. What waits for these threads is bounded.
+//! Threads that answer queries. An answer may block until the peer reads, or for up to two seconds, after which Zenoh closes
+//! the connection; so only threads on which no others wait send answers. The queue for these threads is bounded.
 
 use std::sync::mpsc::{Receiver, SyncSender, sync_channel};
 use std::sync::{Arc, Mutex, PoisonError};
@@ -11,14 +11,14 @@ use super::spawn::spawn;
 
 type Task = Box<dyn FnOnce() + Send>;
 
-/// Reaches the threads. They end when the last clone is dropped.
+/// A handle to the threads. They end when the last clone is dropped.
 #[derive(Clone)]
 pub(super) struct Pool {
     tasks: SyncSender<Task>,
 }
 
 impl Pool {
-    /// Starts so many threads, for which so many tasks may wait.
+    /// Starts the threads, with a queue of limited length.
     pub fn start(name: &'static str, threads: usize, most_waiting: usize, events: &Events) -> std::io::Result<Self> {
         let (tasks, waiting) = sync_channel(most_waiting);
         let waiting = Arc::new(Mutex::new(waiting));
@@ -35,14 +35,13 @@ impl Pool {
         Ok(Self { tasks })
     }
 
-    /// Leaves a task, unless too many wait already. Never waits.
+    /// Queues a task; false if the queue is full. Never waits.
     pub fn give(&self, task: impl FnOnce() + Send + 'static) -> bool {
         self.tasks.try_send(Box::new(task)).is_ok()
     }
 }
 
-/// The next task, as soon as there is one; nothing when none can come any more. One thread waits for it, the others for
-/// that one.
+/// Waits for the next task; `None` when no more can come. One thread waits on the queue, the others on its lock.
 fn next(waiting: &Mutex<Receiver<Task>>) -> Option<Task> {
     waiting.lock().unwrap_or_else(PoisonError::into_inner).recv().ok()
 }

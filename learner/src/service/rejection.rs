@@ -1,10 +1,10 @@
-//! Why a message from the wire was not accepted.
+//! Why the learner did not accept a message.
 
 use quad_protocol::CodecError;
 
 use crate::evaluation::Refusal;
 
-/// Why a message from the wire was not accepted.
+/// Why the learner did not accept a message.
 #[derive(Debug, thiserror::Error)]
 pub(super) enum Rejection {
     #[error("the message is empty")]

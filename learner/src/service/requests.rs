@@ -1,4 +1,4 @@
-//! A query that came in over Zenoh, until it is answered.
+//! A Zenoh query that waits for its answer.
 
 use std::mem;
 
@@ -11,35 +11,35 @@ use zenoh::query::Query;
 use super::metrics::Metrics;
 use super::rejection::Rejection;
 
-/// Largest message to the learner, bytes; a score report of the largest job is 1.4 KB. A learner that listens hears of none
-/// that Zenoh sends in several pieces, which begins at 32,700 bytes at the earliest.
+/// Largest message to the learner, bytes; a score report of the largest job has 1.4 KB. A learner that listens receives no
+/// fragmented messages, which begin at 32,700 bytes at the earliest.
 const MOST_BYTES: usize = 30 * 1024;
 
-/// A query and the message that came with it.
+/// A query and its message.
 pub(super) struct Request {
     query: Query,
     payload: ZBytes,
 }
 
 impl Request {
-    /// Keeps nothing of a query that is larger than a message may be.
+    /// Drops the message if it is larger than allowed.
     pub fn new(mut query: Query) -> Self {
         drop(query.attachment_mut().map(mem::take));
         let payload = query.payload_mut().map(mem::take).unwrap_or_default();
         Self { query, payload }
     }
 
-    /// What it asks for.
+    /// The query's key.
     pub fn key(&self) -> &str {
         self.query.key_expr().as_str()
     }
 
-    /// What came with it; it is not kept.
+    /// The query's message; the request does not keep it.
     pub fn message<M: Message>(&mut self) -> Result<M, Rejection> {
         read(&mem::take(&mut self.payload))
     }
 
-    /// Answers it.
+    /// Sends an answer.
     pub fn reply<M: Message>(self, message: &M) {
         match encode(message) {
             Ok(bytes) => self.send(bytes.into()),
@@ -47,7 +47,7 @@ impl Request {
         }
     }
 
-    /// Answers it with what is encoded already.
+    /// Sends an answer that is already encoded.
     pub fn send(self, bytes: ZBytes) {
         let key = self.query.key_expr().clone();
         if let Err(error) = self.query.reply(key, bytes).wait() {
@@ -55,7 +55,7 @@ impl Request {
         }
     }
 
-    /// Counts it as not accepted, and says why.
+    /// Counts the query as not accepted, and answers with the reason.
     pub fn reject(self, rejection: &Rejection, metrics: &Metrics) {
         debug!(%rejection, "a message was not accepted");
         metrics.reject(rejection.label());

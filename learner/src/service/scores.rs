@@ -1,7 +1,7 @@
-//! The thread `scores`: writes scores down, and only then counts and acknowledges them.
+//! The thread `scores`: writes scores to the disk, then counts and acknowledges them.
 //!
-//! All reports that have come while it was at the last ones go together, in one write and one synchronisation. A slow disk
-//! delays the acknowledgements, and nothing else.
+//! All reports that arrived during the last write go together, in one write and one synchronisation. A slow disk delays only
+//! acknowledgements.
 
 use std::collections::BTreeSet;
 use std::sync::mpsc::{Receiver, RecvTimeoutError};
@@ -20,7 +20,7 @@ use crate::run::{Log, ScoreLine};
 /// Most reports that are written together.
 const MOST_TOGETHER: usize = 256;
 
-/// An evaluator's report, and the query that it came with; nothing when no more will come that is to be waited for.
+/// An evaluator's report with its query; `None` marks the last one to wait for.
 pub(super) type Delivery = Option<(Request, ScoreReport)>;
 
 /// State of the thread.
@@ -34,7 +34,7 @@ pub(super) struct Scores {
 }
 
 impl Scores {
-    /// The thread's work, until it is told that nothing more will come.
+    /// The thread's work, until the last report.
     pub fn run(mut self, beat: &Beat) -> anyhow::Result<()> {
         let mut ended = false;
         while !ended {
@@ -58,8 +58,8 @@ impl Scores {
         Ok(())
     }
 
-    /// Handles some reports together. Gives those back that have an episode that another one of them has, too: they are
-    /// looked at once the other one is counted.
+    /// Handles reports together. If two of them contain the same episode, returns the second for the next round, when the
+    /// first is counted.
     fn take_in(&mut self, reports: Vec<(Request, ScoreReport)>, beat: &Beat) -> Vec<(Request, ScoreReport)> {
         let mut seen = BTreeSet::new();
         let (now, later): (Vec<_>, Vec<_>) = reports.into_iter().partition(|(_, report)| {
@@ -79,7 +79,7 @@ impl Scores {
                 }
             }
         }
-        // What is on the disk already does not wait for it.
+        // Scores that are already on the disk need not wait for it.
         let (new, known): (Vec<_>, Vec<_>) =
             accepted.into_iter().partition(|(_, _, validated)| !validated.new.is_empty());
         self.acknowledge(known);
@@ -87,7 +87,7 @@ impl Scores {
         later
     }
 
-    /// Writes the new scores of reports, and answers each.
+    /// Writes the new scores of reports, and answers each report.
     fn write(&mut self, reports: Vec<(Request, ScoreReport, Validated)>, beat: &Beat) {
         let of = |(_, report, validated): &(_, ScoreReport, Validated)| {
             validated.new.iter().map(|score| ScoreLine::new(report, score)).collect::<Vec<_>>()
@@ -105,7 +105,7 @@ impl Scores {
         self.acknowledge(reports);
     }
 
-    /// Counts the scores of reports, which are on the disk, and answers each.
+    /// Counts the scores of reports, which are on the disk, and answers each report.
     fn acknowledge(&self, reports: Vec<(Request, ScoreReport, Validated)>) {
         let replies = self.coordinator.record(reports.iter().map(|(_, report, validated)| (report, validated)));
         for ((request, ..), reply) in reports.into_iter().zip(replies) {
@@ -113,7 +113,7 @@ impl Scores {
         }
     }
 
-    /// Nothing is counted, so the scores are new again when the evaluators deliver them once more.
+    /// Counts no score, so the scores are still new when the evaluators deliver them again.
     fn refuse(&self, reports: Vec<(Request, ScoreReport, Validated)>, error: &str) {
         for (request, report, _) in reports {
             self.coordinator.keep(&report);

@@ -1,4 +1,4 @@
-//! What becomes of each kind of message: which thread answers it.
+//! Which thread answers each kind of message.
 
 use std::sync::mpsc::{Receiver, SyncSender, sync_channel};
 
@@ -15,18 +15,18 @@ use super::requests::{Request, read};
 use super::scores::Delivery;
 use super::weights::Weights;
 
-/// Threads that answer claims, and queries that may wait for them. Evaluators ask again if there is no room.
+/// Threads that answer claims. Evaluators ask again if the queue is full.
 const ANSWER_THREADS: usize = 4;
-/// Threads that answer with weights: megabytes, which may have to be read from a disk that hangs.
+/// Threads that answer with weights: megabytes, which may come from a disk that hangs.
 const WEIGHTS_THREADS: usize = 4;
 const MOST_WAITING: usize = 1024;
 
-/// What answers queries.
+/// The threads that answer queries.
 #[derive(Clone)]
 pub(super) struct Services {
     pub coordinator: Coordinator,
     pub weights: Weights,
-    /// Reaches the thread `scores`.
+    /// The queue of the thread `scores`.
     pub deliveries: SyncSender<Delivery>,
     pub answers: Pool,
     pub weights_answers: Pool,
@@ -35,7 +35,7 @@ pub(super) struct Services {
 }
 
 impl Services {
-    /// Starts the threads that answer. What is to go to the thread `scores` comes out of the queue.
+    /// Starts the threads that answer. Returns the queue that the thread `scores` must read.
     pub fn start(
         coordinator: Coordinator,
         weights: Weights,
@@ -60,7 +60,7 @@ impl Services {
     pub fn report(&self, mut request: Request) {
         let accepted = match request.message::<ScoreReport>() {
             Ok(report) => {
-                // Until its scores are on the disk.
+                // Extends the lease of the job until its scores are on the disk.
                 self.coordinator.keep(&report);
                 self.deliveries.try_send(Some((request, report))).is_ok()
             }

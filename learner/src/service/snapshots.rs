@@ -1,5 +1,5 @@
-//! The thread `snapshots`: writes what training makes to the disk, then opens the evaluations of snapshots that are to be
-//! evaluated, then publishes these.
+//! The thread `snapshots`: writes the output of training to the disk, then opens the evaluation of each snapshot, then
+//! publishes the snapshot.
 
 use std::collections::BTreeMap;
 use std::time::{Duration, SystemTime, UNIX_EPOCH};
@@ -16,7 +16,7 @@ use crate::evaluation::OtherWeights;
 use crate::run::{Checkpoint, Log, RunDir, RunDirError};
 use crate::train::{Outbox, TrainedPolicy, Work};
 
-/// How long the disk is left alone after it has refused something.
+/// Pause after the disk has refused a write.
 pub(super) const RETRY: Duration = Duration::from_secs(2);
 
 /// State of the thread.
@@ -28,13 +28,14 @@ pub(super) struct Snapshots {
     pub weights: Weights,
     pub metrics: Metrics,
     pub events: Events,
-    /// Snapshots of an earlier life, by step: training may come by them again.
+    /// Snapshots of earlier processes, by step: training may reach their steps again.
     pub known: BTreeMap<u64, Hash>,
     pub disk: DiskStatus,
 }
 
 impl Snapshots {
-    /// The thread's work, until the outbox is closed and empty. What the disk refuses is tried again until it is taken.
+    /// The thread's work, until the outbox is closed and empty. It repeats a write that the disk refuses until the disk
+    /// accepts it.
     pub fn run(mut self, beat: &Beat) -> anyhow::Result<()> {
         while let Some(work) = self.outbox.next(beat) {
             match self.carry_out(&work) {
@@ -65,7 +66,7 @@ impl Snapshots {
         }
     }
 
-    /// Writes a snapshot; only then is its evaluation opened and the snapshot published.
+    /// Writes a snapshot, then opens its evaluation and publishes it.
     fn snapshot(&mut self, trained: &TrainedPolicy) -> anyhow::Result<()> {
         let TrainedPolicy { step, file, evaluate } = trained;
         let hash = Hash::of(file);
@@ -73,7 +74,7 @@ impl Snapshots {
         match self.known.get(step) {
             None => self.run_dir.write_snapshot(*step, file)?,
             Some(known) if *known == hash => {}
-            // It has scores already: neither overwritten nor published.
+            // The step has scores already: the snapshot is neither overwritten nor published.
             Some(known) => {
                 return Err(OtherWeights { step: *step, found: hash, scored: known.to_string() }.into());
             }
@@ -99,7 +100,7 @@ impl Snapshots {
     }
 }
 
-/// With what to do about it.
+/// Adds a hint.
 fn with_hint(error: anyhow::Error) -> anyhow::Error {
     if let Some(hint) = error.downcast_ref().map(RunDirError::hint) {
         return hinted(error, hint);

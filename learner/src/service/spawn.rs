@@ -1,4 +1,4 @@
-//! How a thread of a run is started.
+//! Starts the threads of a run.
 
 use std::any::Any;
 use std::panic::{AssertUnwindSafe, catch_unwind};
@@ -10,7 +10,7 @@ use tracing::debug;
 
 use super::events::{Event, Events};
 
-/// Starts a thread that says that it is alive, and when it is done. If it panics its health says so.
+/// Starts a thread that reports that it is alive, and when it is done. If it panics, `/healthz` says so.
 pub(super) fn spawn_alive(
     name: &'static str,
     events: &Events,
@@ -24,8 +24,8 @@ pub(super) fn spawn_alive(
     })
 }
 
-/// Starts a thread. If it fails or panics, the main loop is told, and the run ends: without it the process would look alive
-/// and do nothing.
+/// Starts a thread. If it fails or panics, the main loop ends the run: without that thread the process would look alive and do
+/// nothing.
 pub(super) fn spawn(
     name: &'static str,
     events: &Events,

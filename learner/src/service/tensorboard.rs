@@ -1,4 +1,4 @@
-//! The thread `tensorboard`: copies what the run has written to TensorBoard's event file. Nothing waits for it for long.
+//! The thread `tensorboard`: copies the run's metrics and scores to TensorBoard's event file. No thread waits long for it.
 
 use std::io;
 use std::sync::mpsc::{Receiver, RecvTimeoutError, Sender, channel};
@@ -9,21 +9,21 @@ use tracing::warn;
 
 use crate::report::Exporter;
 
-/// How often it copies.
+/// How often the thread copies.
 const EVERY: Duration = Duration::from_secs(10);
-/// How long the end of a run waits for the last copy: its disk may hang.
+/// How long the end of a run waits for the last copy, whose disk may hang.
 const PATIENCE: Duration = Duration::from_secs(3);
 
 /// The running thread.
 pub(super) struct TensorBoard {
-    /// Nothing is sent: the thread ends when this is dropped.
+    /// Never sent to: the thread ends when this is dropped.
     stop: Sender<()>,
-    /// Nothing is received: the thread drops the other side when it has ended.
+    /// Never received from: the thread drops the other end when it has ended.
     ended: Receiver<()>,
 }
 
 impl TensorBoard {
-    /// Starts it.
+    /// Starts the thread.
     pub fn start(mut exporter: Exporter) -> io::Result<Self> {
         let (stop, stopped) = channel::<()>();
         let (ending, ended) = channel::<()>();
@@ -48,7 +48,7 @@ impl TensorBoard {
         Ok(Self { stop, ended })
     }
 
-    /// Ends it after a last copy.
+    /// Ends the thread after a last copy.
     pub fn end(self) {
         drop(self.stop);
         if self.ended.recv_timeout(PATIENCE) == Err(RecvTimeoutError::Timeout) {

@@ -27,28 +27,29 @@ use crate::report::Exporter;
 use crate::run::{Log, Past, RunDir};
 use crate::train::{Outbox, Training};
 
-/// Most episodes in one job: two evaluators share an evaluation of ten. And most if hundreds wait.
+/// Most episodes in one job, so that two evaluators share an evaluation of ten; and most when hundreds wait.
 const JOB_EPISODES: [usize; 2] = [5, 40];
-/// An evaluator tells its progress three times meanwhile or more often, and Zenoh notices a lost one after about 5 s.
+/// Lease of a job. An evaluator reports progress at least three times in it, and Zenoh notices a lost evaluator after about 5
+/// s.
 const LEASE: Duration = Duration::from_secs(15);
-/// A thread that answers others, or writes to the disk, is stuck if it has said nothing for so long.
+/// A thread that answers or writes is stuck if it has not reported for this long.
 pub(crate) const STUCK: Duration = Duration::from_secs(30);
-/// So is training, whose slowest steps take seconds.
+/// The same for training, whose slowest steps take seconds.
 const TRAINING_STUCK: Duration = Duration::from_secs(300);
 
-/// What a run is, and how far it is.
+/// A run and its state.
 pub(crate) struct Run<'a> {
     pub life: Life,
     pub config: &'a RunConfig,
-    /// Its folder.
+    /// The run's folder.
     pub dir: &'a RunDir,
-    /// Its scores, to be appended to.
+    /// The run's scores, open for appending.
     pub scores: Log,
-    /// What earlier learners have reached.
+    /// What earlier processes of this run have reached.
     pub past: Past,
     /// Least time between two checkpoints.
     pub checkpoint_every: Duration,
-    /// Where TensorBoard's event files go, if there are to be any.
+    /// Folder for TensorBoard's event files, if there are any.
     pub tensorboard: Option<&'a Path>,
 }
 
@@ -64,7 +65,7 @@ pub(crate) struct Threads {
 }
 
 impl Threads {
-    /// Starts them all.
+    /// Starts all threads.
     pub fn start(
         run: Run<'_>,
         transitions: Transitions,
@@ -92,7 +93,7 @@ impl Threads {
         let step = checkpoint.as_ref().map_or(0, |checkpoint| checkpoint.step);
         metrics.training.gradient_steps.inc_by(step);
         let (rows, seconds_before) = dir.metrics_log(step)?;
-        // What training will repeat is cut off now, so the event file will not have it.
+        // Cuts off what training will repeat now, so that the event file does not contain it.
         let tensorboard =
             tensorboard.map(|folder| TensorBoard::start(Exporter::new(dir.path(), folder))).transpose()?;
         let outbox = Outbox::default();
@@ -131,7 +132,7 @@ impl Threads {
         self.stop.store(true, Ordering::Relaxed);
     }
 
-    /// Ends them: what was handed over is on disk afterwards. A thread that failed has told the main loop so.
+    /// Ends the threads: their output is on the disk afterwards. A thread that failed has told the main loop.
     pub fn join(self) {
         self.stop_training();
         self.training.join().ok();
@@ -145,7 +146,7 @@ impl Threads {
     }
 }
 
-/// Who has which job, at the start of this life of the run.
+/// The shared state of jobs and scores, at the start of this process.
 fn coordinator(
     life: &Life,
     experiment: &Experiment,

@@ -1,4 +1,4 @@
-//! Snapshots on the wire: each is published once, and evaluators that have missed it can ask for it.
+//! Sends snapshots: the learner publishes each once, and evaluators that missed it can ask for it.
 
 use std::sync::{Arc, Mutex, OnceLock, PoisonError};
 
@@ -13,16 +13,16 @@ use super::coordinator::Coordinator;
 use super::rejection::Rejection;
 use crate::run::RunDir;
 
-/// What all snapshots of a run have in common, and where they are. Clones share it.
+/// What all snapshots of a run share, and where they are. Clones share it.
 #[derive(Clone)]
 pub(super) struct Weights {
     run: Name,
     incarnation: u64,
     run_dir: RunDir,
     coordinator: Coordinator,
-    /// There as soon as the learner is online.
+    /// Set once the learner is online.
     session: Arc<OnceLock<Session>>,
-    /// The newest, by step, ready to be sent; older ones are read from the disk.
+    /// The newest snapshot with its step, ready to send; older ones come from the disk.
     newest: Arc<Mutex<Option<(u64, ZBytes)>>>,
 }
 
@@ -31,7 +31,7 @@ impl Weights {
         Self { run, incarnation, run_dir, coordinator, session: Arc::default(), newest: Arc::default() }
     }
 
-    /// From now on snapshots are published.
+    /// Sets the session, so that later snapshots are published.
     pub fn online(&self, session: &Session) {
         self.session.set(session.clone()).ok();
     }
@@ -39,14 +39,15 @@ impl Weights {
     /// Opens the evaluation of a snapshot that is on the disk, and publishes it.
     ///
     /// # Errors
-    /// It is too large to be sent, or the step is known with other weights.
+    /// The snapshot is too large to be sent, or the step is known with other weights.
     pub fn publish(&self, step: u64, hash: Hash, file: Vec<u8>) -> anyhow::Result<()> {
         let bytes = self.message(step, hash, file)?;
         *self.newest.lock().unwrap_or_else(PoisonError::into_inner) = Some((step, bytes.clone()));
-        // The jobs must exist first: evaluators ask for one as soon as the snapshot arrives.
+        // The jobs must exist first: evaluators claim one as soon as the snapshot arrives.
         self.coordinator.open(step, hash)?;
         if let Some(session) = self.session.get() {
-            // An evaluator that does not read loses the snapshot instead of delaying the others. It asks when it gets a job.
+            // An evaluator that does not read loses the snapshot instead of delaying others. It asks for it when it gets a
+            // job.
             let put = session.put(keys::weights(&self.run), bytes).congestion_control(CongestionControl::Drop);
             if let Err(error) = put.wait() {
                 debug!(%error, step, "the snapshot could not be published");

@@ -1,5 +1,5 @@
-//! Everything the learner declares on Zenoh, in one place. The callbacks run on Zenoh's threads, where waiting would delay all
-//! that its connection brings: they hand queries over to threads of ours, and take in what is said without an answer.
+//! Everything that the learner declares on Zenoh. The callbacks run on Zenoh's threads and must not wait, which would delay
+//! their whole connection: they pass queries to our threads, and record messages that need no answer.
 
 use quad_protocol::keys;
 use tracing::debug;
@@ -21,12 +21,12 @@ pub(super) struct Wire {
 }
 
 impl Wire {
-    /// Declares the queryables, then the subscribers, and last the learner's liveliness token, so that an evaluator that
-    /// sees the token finds everything else in place.
+    /// Declares the queryables, then the subscribers, and last the learner's liveliness token, so that an evaluator that sees
+    /// the token finds everything else ready.
     ///
     /// # Errors
     ///
-    /// Another learner has the run's name, which takes some seconds to be sure of; or Zenoh fails.
+    /// Another learner has the run's name, which takes some seconds to find out; or Zenoh fails.
     pub async fn declare(session: Session, life: &Life, services: &Services) -> anyhow::Result<Self> {
         duplicate::wait_until_gone(&session, life).await?;
         let run = &life.run;
@@ -46,12 +46,12 @@ impl Wire {
             evaluators.callback(move |token| told.evaluator(&token)).await.map_err(anyhow::Error::from_boxed)?;
         let token = session.liveliness().declare_token(keys::live_learner(run, life.incarnation)).await;
         let token = token.map_err(anyhow::Error::from_boxed)?;
-        // Of two that start at once, neither may have seen the other.
+        // Of two learners that start at once, neither may have seen the other.
         duplicate::watch(&session, life, &services.events).await?;
         Ok(Self { session, _queryables: queryables, _subscribers: [progress, evaluators], _token: token })
     }
 
-    /// Closes the session; answers that were sent before are still delivered.
+    /// Closes the session; Zenoh still delivers earlier answers.
     pub async fn close(self) {
         if let Err(error) = self.session.close().await {
             debug!(%error, "the session did not close");
@@ -67,6 +67,6 @@ async fn serve(
 ) -> anyhow::Result<Queryable<()>> {
     let services = services.clone();
     let callback = move |query: Query| answer(&services, Request::new(query));
-    // Complete: an evaluator that wants the best answer only asks here, too.
+    // Complete: an evaluator that asks only for the best answer asks here, too.
     session.declare_queryable(key).complete(true).callback(callback).await.map_err(anyhow::Error::from_boxed)
 }

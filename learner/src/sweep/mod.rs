@@ -1,8 +1,8 @@
-//! Many runs: what a study file asks for, what it will cost, and the learners that do it.
+//! Many runs: reads a study file, estimates its cost, and starts its learners.
 //!
-//! Owns the format of study files and the folder of a study, `runs/STUDY`, in which each run has its own folder. It is called
-//! by the command `learner sweep` and runs on the main thread; each run is a process, `learner train`, that meets the shared
-//! evaluators at a router in this process. It uses `service` for evaluators, `report` and `run` for how far a run is, and
+//! Owns the format of study files and the folder of a study, `runs/STUDY`, in which each run has its own folder. The command
+//! `learner sweep` calls it on the main thread. Each run is a process `learner train`, which meets the shared evaluators at a
+//! router in this process. It uses `service` for evaluators, `report` and `run` for the state of a run, and
 //! [`train`](crate::train) to measure how long steps take.
 //!
 //! In reading order: `study` is the file, `axes` are its lists of values, `rules` say which combinations, `names` what runs are

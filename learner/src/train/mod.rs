@@ -1,12 +1,12 @@
-//! Gradient steps. This room owns the algorithm while it trains, and the batches.
+//! Gradient steps. This module owns the algorithm during training, and the batches.
 //!
-//! All of it runs on the thread `training` (with rayon's pool for the arithmetic), which never waits for a network or a
-//! metric, and for the disk only when far too much waits for it: what it makes goes into the [`Outbox`], from which the
-//! thread `snapshots` takes it. The room `service` starts it.
+//! All of it runs on the thread `training` (with rayon's pool for the arithmetic). That thread never waits for a network or a
+//! metric, and for the disk only if far too much output is unwritten: it puts its output into the [`Outbox`], from which the
+//! thread `snapshots` takes it. The module `service` starts it.
 //!
 //! In reading order: `training` (the thread's work), `steps` (the loop), `agent` (an algorithm at work, saved and loaded),
 //! `device` (where it computes), `pool` (rayon's threads kept awake), `results`, `outbox`, `metrics`. Beside them, `price`
-//! foretells what a run costs, on the thread of its caller.
+//! estimates what a run costs, on its caller's thread.
 
 pub mod agent;
 mod device;

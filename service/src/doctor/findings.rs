@@ -4,7 +4,7 @@ use std::fmt;
 
 use serde::Serialize;
 
-/// The results of all checks, in their order. Displayed as a line each, with hints below.
+/// The results of all checks, in their order. Display prints a line for each, with hints below.
 #[derive(Debug, Default, Serialize)]
 pub struct Findings(Vec<Finding>);
 
@@ -39,13 +39,13 @@ impl Findings {
     /// As an indented JSON array.
     ///
     /// # Errors
-    /// None that is known; serialising is allowed to fail.
+    /// Serialisation fails, which it does for no known value.
     pub fn json(&self) -> serde_json::Result<String> {
         serde_json::to_string_pretty(self)
     }
 
     /// # Errors
-    /// Some check failed.
+    /// At least one check failed.
     pub fn verdict(&self) -> anyhow::Result<()> {
         let failed = self.0.iter().filter(|finding| finding.verdict == "fail").count();
         anyhow::ensure!(failed == 0, "{failed} of {} checks failed", self.0.len());

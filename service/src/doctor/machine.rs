@@ -10,11 +10,11 @@ use rustix::fs::statvfs;
 
 use super::findings::Findings;
 
-/// Bounds the threads of the networks' arithmetic; rayon's.
+/// Limits the threads of the networks' arithmetic, which are rayon's.
 const THREADS: &str = "RAYON_NUM_THREADS";
-/// What is written as a trial, bytes: more than a file system keeps aside for small files.
+/// Size of the trial file, bytes: more than a file system keeps aside for small files.
 const TRIAL: usize = 1 << 20;
-/// A disk that takes longer than this for the trial holds up scores, each of which is on the disk before it counts.
+/// A disk that takes longer than this for the trial delays scores: the learner synchronises each score before it counts.
 const SLOW: Duration = Duration::from_millis(500);
 /// Less free space than this is not enough for a checkpoint and some snapshots of the paper's networks, bytes.
 const TOO_LITTLE: u64 = 100 << 20;
@@ -38,8 +38,8 @@ pub fn threads(findings: &mut Findings) {
     }
 }
 
-/// Checks a folder that a program will write to, or the one that it would be made in. `elsewhere` says how to choose
-/// another one. Nothing is left behind.
+/// Checks a folder that a program will write to, or the nearest existing folder in which the program would make it.
+/// `elsewhere` says how to choose another folder. Leaves no file behind.
 pub fn folder(findings: &mut Findings, check: &str, path: &Path, elsewhere: &str) {
     let path = &absolute(path).unwrap_or_else(|_| path.to_owned());
     let folder = path.ancestors().find(|folder| folder.is_dir()).unwrap_or(path);
@@ -64,7 +64,7 @@ pub fn folder(findings: &mut Findings, check: &str, path: &Path, elsewhere: &str
     }
 }
 
-/// Writes a file, down to the disk itself, and removes it. Gives the free bytes, and how long it took.
+/// Writes a file, synchronises it to the disk and removes it. Returns the free bytes, and how long the trial took.
 fn write_trial(folder: &Path) -> io::Result<(u64, Duration)> {
     let path = folder.join(format!(".doctor-{}", std::process::id()));
     let begin = Instant::now();

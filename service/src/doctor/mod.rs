@@ -1,6 +1,6 @@
 //! `learner doctor` and `evaluator doctor`: checks of a machine, before a run is started on it.
 //!
-//! Here is what both programs need; each adds its own checks in its `doctor.rs`.
+//! These checks are for both programs; each program adds its own in its `doctor.rs`.
 
 mod findings;
 mod machine;

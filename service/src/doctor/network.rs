@@ -15,12 +15,12 @@ use crate::certificates::{Certificates, Role};
 use crate::endpoints::{Endpoints, address_of};
 use crate::session::open_session;
 
-/// A connection across the world takes half a second.
+/// Time limit of a TCP connection: one across the world takes half a second.
 const CONNECT: Duration = Duration::from_secs(3);
-/// The same with Zenoh's own handshake, and perhaps TLS's.
+/// Time limit of a connection with Zenoh's own handshake, and perhaps TLS's.
 const SESSION: Duration = Duration::from_secs(5);
 
-/// Checks the certificates in `folder`, which are to be those of `role`. Gives them if a connection can be tried with them.
+/// Checks the certificates in `folder`, which must be for `role`. Returns them if a connection can be tried with them.
 pub fn certificates(findings: &mut Findings, folder: &Path, role: Role) -> Option<Certificates> {
     let found = Certificates::check(folder, role);
     match &found {
@@ -43,8 +43,8 @@ pub fn port(findings: &mut Findings, port: u16) {
     }
 }
 
-/// Connects to the first endpoint to connect to, by TCP alone and then with Zenoh, and does further checks over the session
-/// if there is one.
+/// Connects to the first endpoint, by TCP alone and then with Zenoh, and does the further checks over the session if there is
+/// one.
 ///
 /// # Errors
 /// No thread can be started, or the further checks cannot be done.

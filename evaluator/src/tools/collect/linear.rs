@@ -5,7 +5,7 @@
 pub struct LinearPolicy {
     /// M, action_dim × observation_dim.
     pub weights: Vec<f64>,
-    /// What observations are normalised with.
+    /// Normalises observations.
     pub normaliser: Normaliser,
 }
 
@@ -46,7 +46,7 @@ pub struct Moments {
 }
 
 impl Moments {
-    /// Of no observation.
+    /// Statistics of no observation.
     pub fn new(observation_dim: usize) -> Self {
         Self { count: 0.0, mean: vec![0.0; observation_dim], squares: vec![0.0; observation_dim] }
     }
@@ -58,7 +58,7 @@ impl Moments {
         self.squares.fill(0.0);
     }
 
-    /// Takes up one observation.
+    /// Adds one observation.
     pub fn push(&mut self, observation: &[f64]) {
         self.count += 1.0;
         for (i, value) in observation.iter().enumerate() {
@@ -68,7 +68,7 @@ impl Moments {
         }
     }
 
-    /// Takes up all that `other` has seen.
+    /// Adds all observations of `other`.
     pub fn merge(&mut self, other: &Self) {
         let count = self.count + other.count;
         if other.count == 0.0 {
@@ -82,7 +82,7 @@ impl Moments {
         self.count = count;
     }
 
-    /// What normalises what has been seen. A value that never changed is only centred.
+    /// The normalisation of these observations. A value that never changes is only centred.
     pub fn normaliser(&self) -> Normaliser {
         let inverse = |squares: &f64| {
             let deviation = (squares / (self.count - 1.0).max(1.0)).sqrt();

@@ -1,8 +1,9 @@
-//! Records a dataset of mediocre behaviour, so that a fresh machine needs no download.
+//! Records a dataset of mediocre behaviour, so that a new machine needs no download.
 //!
-//! As an environment's `recipe` says, `search` trains `linear` policies, and `record` mixes episodes of all of them, from the
-//! first to the last, into one file in D4RL's layout: something like D4RL's "medium-replay", the replay buffer of a policy that
-//! was learning. The file is a function of the number of transitions and the seed; the number of threads does not change it.
+//! Following an environment's `recipe`, `search` trains `linear` policies, and `record` mixes episodes of all of them, from
+//! the first to the last, into one file in D4RL's layout. The result resembles D4RL's "medium-replay", the replay buffer of a
+//! learning policy. The file is a function of the number of transitions and the seed; the number of threads does not change
+//! it.
 
 mod error;
 mod linear;
@@ -33,18 +34,18 @@ pub struct Summary {
     pub episodes: usize,
     /// Mean over the episodes of D4RL's normalised score.
     pub mean_score: f64,
-    /// The 50th, 90th and 99th percentile of the same, and its maximum.
+    /// The 50th, 90th and 99th percentile, and the maximum, of the normalised scores.
     pub score_percentiles: [f64; 4],
-    /// Policies that the episodes are of.
+    /// Policies that act in the episodes.
     pub policies: usize,
-    /// Wall-clock time of it all.
+    /// Wall-clock time of the command.
     pub seconds: f64,
 }
 
-/// The environment of that name, if it can be recorded in.
+/// The environment of that name, if this command can record in it.
 ///
 /// # Errors
-/// It cannot; the text says which can.
+/// It cannot; the text lists the possible environments.
 pub fn environment(name: &str) -> Result<&'static EnvironmentSpec, String> {
     let found = find(name).ok().filter(|spec| Recipe::of(spec).is_some());
     found.ok_or_else(|| format!("what can be recorded is {}", Recipe::environments()))

@@ -1,4 +1,4 @@
-//! What tells one environment's recording from another's: how much search it takes, and which episodes are kept.
+//! What differs between environments: how much search the recording needs, and which episodes it keeps.
 
 use quad_dataset::EnvironmentSpec;
 
@@ -6,36 +6,34 @@ use quad_dataset::EnvironmentSpec;
 #[derive(Debug)]
 pub struct Recipe {
     environment: &'static str,
-    /// Independent searches. Each comes by a gait of its own, so that the recorded actions in a state differ as those of
-    /// different people do, not only by noise.
+    /// Independent searches. Each finds its own gait, so that the recorded actions in a state differ by more than noise.
     pub searches: u64,
-    /// Steps that the searches may take for each transition that is to be recorded, up to [`MOST_TRANSITIONS`] of them.
+    /// Steps that the searches may take per recorded transition, for up to [`MOST_TRANSITIONS`] transitions.
     steps_per_transition: u64,
-    /// Episodes by their normalised score: where a band begins, and its share of the transitions.
+    /// Bands of normalised score: the lower bound of each, and its share of the transitions.
     ///
-    /// Left to itself, a search's history is mostly long, good episodes, and there is little to learn offline from what is
-    /// good already. The shares make the mixture that offline learning is for, whatever the seed: good actions are there
-    /// to be found, diluted by worse ones in the same states.
+    /// Without shares, a search's history is mostly long, good episodes, from which offline learning can gain little. The
+    /// shares make a mixture with any seed: good actions exist, among worse ones in the same states.
     pub mixture: &'static [(f64, f64)],
 }
 
-/// By so many transitions most searches move well, and a minute of two cores is over.
+/// With this many transitions most searches move well, after a minute on two cores.
 const MOST_TRANSITIONS: u64 = 100_000;
 
 /// The environments that linear policies learn to move in.
 static RECIPES: [Recipe; 3] = [
     Recipe {
         environment: "hopper",
-        // One in three or four takes long to find any gait.
+        // One search in three or four takes long to find any gait.
         searches: 8,
         steps_per_transition: 16,
-        // A third of the transitions, but nearly nine in ten episodes, fall over soon and pull the mean score down to about
-        // 8; most of the others hop a while with one gait or another; and one in ten shows how far it can be taken.
+        // A third of the transitions, but nearly nine in ten episodes, fall over soon and pull the mean score down to about 8;
+        // most other episodes hop for a while; and one in ten shows how far a gait can be taken.
         mixture: &[(f64::NEG_INFINITY, 0.22), (3.0, 0.15), (10.0, 0.2), (30.0, 0.2), (50.0, 0.13), (80.0, 0.1)],
     },
     Recipe {
         environment: "halfcheetah",
-        // All episodes have a thousand steps, so that an iteration takes sixteen thousand; but steps are quick.
+        // All episodes have a thousand steps, so an iteration takes sixteen thousand; but steps are fast.
         searches: 4,
         steps_per_transition: 48,
         mixture: &[(f64::NEG_INFINITY, 0.25), (5.0, 0.25), (12.0, 0.25), (20.0, 0.25)],
@@ -49,17 +47,17 @@ static RECIPES: [Recipe; 3] = [
 ];
 
 impl Recipe {
-    /// The recipe of an environment; none for a maze, which is beyond linear policies.
+    /// The recipe of an environment; none for a maze, which linear policies cannot solve.
     pub fn of(spec: &EnvironmentSpec) -> Option<&'static Self> {
         RECIPES.iter().find(|recipe| recipe.environment == spec.name)
     }
 
-    /// Environment steps that the searches may take together when `transitions` are to be recorded.
+    /// Environment steps that the searches may take together to record `transitions`.
     pub fn search_steps(&self, transitions: usize) -> u64 {
         self.steps_per_transition * (transitions as u64).min(MOST_TRANSITIONS)
     }
 
-    /// The environments that have one.
+    /// The environments that have a recipe.
     pub fn environments() -> String {
         RECIPES.each_ref().map(|recipe| recipe.environment).join(", ")
     }

@@ -1,4 +1,4 @@
-//! Episodes of a search's policies, from its first to its last, mixed into one dataset.
+//! Mixes episodes of a search's policies, from the first to the last, into one dataset.
 
 use quad_dataset::{D4rlWriter, EnvironmentSpec, Row};
 use quad_service::Progress;
@@ -12,22 +12,22 @@ use super::linear::LinearPolicy;
 use super::recipe::Recipe;
 use crate::sim::{self, EnvironmentError, Simulation, Step};
 
-/// Each episode adds Gaussian noise to its actions (which span ±1), of a standard deviation drawn uniformly from this
-/// range: enough to show what other actions in a state lead to, up to more than most gaits survive.
+/// Each episode adds Gaussian noise to its actions (which span ±1). Its standard deviation is drawn uniformly from this range:
+/// enough to show the effects of other actions in a state, up to more than most gaits survive.
 const NOISE: std::ops::Range<f64> = 0.1..0.5;
 
 /// Episodes run at a time, in parallel.
 const ROUND: usize = 32;
 
-/// Once this many times the wanted transitions were simulated, any episode is taken: a search that never got good has
+/// After simulating this many times the wanted transitions, the recorder takes any episode: a search that never got good has
 /// none for the upper bands.
 const PATIENCE: usize = 4;
 
-/// The stream that the noise of actions is drawn from, among those of an episode's seed.
+/// The stream of an episode's seed for the noise of actions.
 const NOISE_STREAM: u64 = 3;
 
-/// Records whole episodes, each of a policy drawn from `policies`, until there are `transitions` rows; answers with each
-/// episode's normalised score.
+/// Records whole episodes, each of a policy drawn from `policies`, until there are `transitions` rows. Returns each episode's
+/// normalised score.
 pub fn record(
     spec: &'static EnvironmentSpec,
     recipe: &Recipe,
@@ -44,7 +44,7 @@ pub fn record(
     let progress = Progress::of("transitions recorded");
     progress.start(0, transitions as u64);
     loop {
-        // Past the end of the highest band with room, an episode is of no use.
+        // An episode beyond the end of the highest unfilled band is useless.
         let patient = simulated <= PATIENCE * transitions;
         let highest = room.iter().rposition(|&room| room > 0.0).filter(|_| patient);
         let ceiling = highest.and_then(|band| mixture.get(band + 1)).map_or(f64::INFINITY, |&(from, _)| from);
@@ -72,11 +72,11 @@ pub fn record(
     }
 }
 
-/// An environment and the episode last run in it.
+/// An environment and its last episode.
 struct Recorder {
     spec: &'static EnvironmentSpec,
     environment: Box<dyn Simulation>,
-    /// (steps + 1) × observation_dim, as the next two: from the state before the first step to that after the last.
+    /// (steps + 1) × observation_dim, also the next two fields: from the state before the first step to that after the last.
     observations: Vec<f64>,
     qpos: Vec<f64>,
     qvel: Vec<f64>,

@@ -1,9 +1,9 @@
-//! Augmented random search: behaviour that learns in seconds, without a gradient.
+//! Augmented random search: learns behaviour in seconds, without a gradient.
 //!
 //! ARS V2-t of Mania, Guy and Recht, "Simple random search of static linear policies is competitive for reinforcement
-//! learning" (2018): perturb the weights of a linear policy in random directions, forwards and backwards, and move along
-//! the better directions by how much better they were; observations are normalised by all that were seen; the bonus for
-//! being alive is left out of what is maximised, or standing still is a local optimum.
+//! learning" (2018). It perturbs the weights of a linear policy in random directions, forwards and backwards, and moves along
+//! the better directions by how much better they are. It normalises observations by all that it has seen, and leaves the bonus
+//! for being alive out of the objective, in which standing still would be a local optimum.
 
 use quad_dataset::EnvironmentSpec;
 use quad_service::Progress;
@@ -18,17 +18,17 @@ use crate::sim::{self, EnvironmentError, Simulation};
 
 /// N: directions tried in one iteration, each forwards and backwards.
 const DIRECTIONS: usize = 8;
-/// b: the directions that count, by the better of their two returns.
+/// b: the directions used, ordered by the better of their two returns.
 const BEST: usize = 4;
 /// ν: how far the weights are perturbed.
 const PERTURBATION: f64 = 0.025;
 /// α: length of a step.
 const STEP_SIZE: f64 = 0.02;
-/// Taken off each step's reward.
+/// Subtracted from each step's reward.
 const ALIVE_BONUS: f64 = 1.0;
 
-/// Trains for as many steps as the recipe has for `transitions`; answers with the policies of all iterations, `random` being
-/// asked for a generator for each search.
+/// Trains for as many steps as the recipe has for `transitions`. Returns the policies of all iterations; `random` makes a
+/// generator for each search.
 pub fn train(
     spec: &EnvironmentSpec,
     recipe: &Recipe,
@@ -51,10 +51,10 @@ pub fn train(
     Ok(policies)
 }
 
-/// A search and the policies it has come by.
+/// A search and its policies so far.
 struct Search {
     policy: LinearPolicy,
-    /// Of all iterations; the first is the one that never moves.
+    /// The policies of all iterations; the first never moves.
     policies: Vec<LinearPolicy>,
     /// Mean return of each iteration's trials.
     returns: Vec<f64>,
@@ -64,7 +64,7 @@ struct Search {
     environment_steps: u64,
 }
 
-/// One perturbed policy and the environment it is tried in.
+/// One perturbed policy and its environment.
 struct Trial {
     environment: Box<dyn Simulation>,
     policy: LinearPolicy,
@@ -102,7 +102,8 @@ impl Search {
         })
     }
 
-    /// Iterates until `environment_steps` have been taken, to the end of the last iteration; `advance` is told how many have.
+    /// Iterates until it has taken `environment_steps`, to the end of the last iteration; calls `advance` with the number
+    /// taken.
     fn run(&mut self, environment_steps: u64, advance: impl Fn(u64)) {
         while self.environment_steps < environment_steps {
             self.iterate();
@@ -118,8 +119,8 @@ impl Search {
 
     /// One iteration.
     ///
-    /// Trials run in parallel, but everything random is drawn and everything learned is summed in their order, so the
-    /// result does not depend on the number of threads.
+    /// Trials run in parallel, but the search draws random numbers and sums results in the order of the trials, so the result
+    /// does not depend on the number of threads.
     fn iterate(&mut self) {
         let normal = StandardNormal;
         let directions: Vec<Vec<f64>> = (0..DIRECTIONS)

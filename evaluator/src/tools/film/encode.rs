@@ -14,12 +14,12 @@ use quad_service::Hint;
 use super::output::{Format, Output};
 use super::picture::Picture;
 
-/// Colours of an animation; the fewer, the smaller it is.
+/// Colours of an animation; fewer colours make a smaller file.
 const COLOURS: usize = 64;
-/// How much of the first picture its colours are chosen from: all of it is 1, a tenth 10.
+/// Sampling of the first picture to choose colours: 1 is all of it, 10 a tenth.
 const SAMPLE: i32 = 10;
 
-/// Writes pictures, each to be shown for so many seconds.
+/// Writes pictures, each shown for `seconds`.
 ///
 /// # Errors
 /// A picture cannot be drawn, or the file cannot be written.
@@ -49,7 +49,7 @@ fn strip(path: &Path, pictures: impl Iterator<Item = anyhow::Result<Picture>>) -
     Ok(writer.finish()?)
 }
 
-/// The colours are those of the first picture: with colours of its own for each, the floor would flicker.
+/// All pictures have the colours of the first: with a palette for each picture, the floor would flicker.
 fn animation(
     path: &Path,
     seconds: f64,
@@ -86,7 +86,7 @@ fn video(path: &Path, seconds: f64, mut pictures: impl Iterator<Item = anyhow::R
         .hint("apt-get install --no-install-recommends ffmpeg, or --out film.gif, which needs nothing")?;
     if let Some(mut pipe) = ffmpeg.stdin.take() {
         for picture in once(Ok(first)).chain(pictures) {
-            // If ffmpeg has ended, it says why.
+            // If ffmpeg has ended, its message says why.
             if pipe.write_all(&picture?.rgb).is_err() {
                 break;
             }

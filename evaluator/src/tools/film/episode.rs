@@ -1,4 +1,4 @@
-//! Plays an episode and keeps every pose of it, from which pictures are made afterwards.
+//! Plays an episode and keeps every pose of it, for pictures that are drawn afterwards.
 
 use std::sync::mpsc::{Sender, channel};
 
@@ -8,12 +8,12 @@ use quad_protocol::episode_seeds;
 use crate::sim::{self, Environment, EnvironmentError, Simulation, Step};
 use crate::tools::score::Subject;
 
-/// What a picture shows.
+/// What one picture shows.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Pose {
     /// Generalised positions, as many as the model has.
     pub qpos: Vec<f64>,
-    /// Where the goal is (x and y, metres), in a task that has one.
+    /// The position of the goal (x and y, metres), in a task that has one.
     pub goal: Option<[f64; 2]>,
     /// Undiscounted sum of the rewards so far.
     pub episode_return: f64,
@@ -23,17 +23,17 @@ pub struct Pose {
 pub struct Episode {
     /// Its seed.
     pub seed: u64,
-    /// The pose at its beginning, then one after each step.
+    /// The pose at the beginning, then one after each step.
     pub poses: Vec<Pose>,
     /// Gradient step of the policy.
     pub gradient_step: u64,
-    /// How the policy chooses, for people.
+    /// How the policy chooses, as text.
     pub choice: String,
 }
 
 impl Episode {
-    /// Plays the episode of a seed or, without one, the first that the subject's run evaluates it on. What is drawn once for all
-    /// episodes follows from `environment_seed`.
+    /// Plays the episode of a seed; without one, of the first seed on which the run evaluates the subject. `environment_seed`
+    /// is the seed of what the environment draws once for all episodes.
     ///
     /// # Errors
     /// The policy cannot act.
@@ -49,7 +49,7 @@ impl Episode {
         Ok(Self { seed, poses: poses.try_iter().collect(), gradient_step: subject.step, choice })
     }
 
-    /// Both columns of the caption after so many steps; after the end, those of the end.
+    /// Both columns of the caption after `steps` steps; later than the end, those of the end.
     pub fn caption(&self, steps: usize) -> [String; 2] {
         let Self { gradient_step, choice, .. } = self;
         let step = if steps < self.length() { steps.to_string() } else { format!("{}, end", self.length()) };
@@ -57,7 +57,7 @@ impl Episode {
         [format!("trained {gradient_step}\nstep {step}"), format!("return {episode_return:.1}\n{choice}")]
     }
 
-    /// The pose after so many steps; after the end, the last.
+    /// The pose after `steps` steps; later than the end, the last pose.
     pub fn pose(&self, steps: usize) -> &Pose {
         &self.poses[steps.min(self.length())]
     }
@@ -68,7 +68,7 @@ impl Episode {
     }
 }
 
-/// A simulation that tells each of its poses.
+/// A simulation that reports each of its poses.
 struct Watched {
     simulation: Box<dyn Simulation>,
     spec: &'static EnvironmentSpec,

@@ -1,19 +1,19 @@
-//! OpenGL without a screen: EGL on Mesa's platform that has no surfaces, which needs no GPU.
+//! OpenGL without a screen: EGL on Mesa's surfaceless platform, which needs no GPU.
 //!
-//! libEGL is looked for when a film is made, not when the program starts: evaluators run on machines without it.
+//! The program loads libEGL when it makes a film, not when it starts: evaluators run on machines without libEGL.
 
 use anyhow::Context;
 use khronos_egl::{self as egl, DynamicInstance, EGL1_5};
 use quad_service::Hint;
 
-/// What to do where there is no OpenGL.
+/// What to do without OpenGL.
 pub const INSTALL: &str = "apt-get install --no-install-recommends libegl1 libegl-mesa0 libgl1-mesa-dri";
 /// `EGL_PLATFORM_SURFACELESS_MESA`, of the extension `EGL_MESA_platform_surfaceless`.
 const SURFACELESS: egl::Enum = 0x31DD;
 
-/// An OpenGL context, current on the thread that made it for as long as that runs.
+/// An OpenGL context, current on the thread that made it.
 pub struct Gl {
-    /// The library: what it gave stays valid as long as it is loaded.
+    /// The library: what it returned is valid as long as it is loaded.
     _egl: DynamicInstance<EGL1_5>,
 }
 

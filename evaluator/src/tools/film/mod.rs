@@ -1,10 +1,9 @@
-//! `evaluator film`: shows what a saved policy does.
+//! `evaluator film`: films what a saved policy does.
 //!
-//! `args`: what is asked for; `run_folder`: which snapshot of a run; `episode`: plays it and keeps its poses; `stage`: draws
-//! them, in the OpenGL of `gl`; `output`: where the film goes and how its pictures are arranged; `encode`: writes it, of
-//! `picture`s.
+//! `args`: the arguments; `run_folder`: chooses a snapshot of a run; `episode`: plays it and keeps its poses; `stage`: draws
+//! them, with the OpenGL of `gl`; `output`: the file and the layout of its pictures; `encode`: writes `picture`s to the file.
 //!
-//! The pictures are drawn after the episode, by a second model with colours, so nothing of the simulation depends on them.
+//! A second model with colours draws the pictures after the episode, so the simulation does not depend on them.
 
 mod args;
 mod encode;
@@ -29,10 +28,11 @@ pub(crate) use gl::{Gl, INSTALL};
 use output::{Layout, steps, stride};
 use stage::Stage;
 
-/// Makes the film that the command line asks for; gives what is to be printed.
+/// Makes the film. Returns the text to print.
 ///
 /// # Errors
-/// A file that is no policy of an environment that is simulated here, no OpenGL, no ffmpeg, or a file that cannot be written.
+/// A file that is no policy of an environment that this program simulates, no OpenGL, no ffmpeg, or a file that cannot be
+/// written.
 pub(crate) fn film(args: &FilmArgs) -> anyhow::Result<String> {
     let first = subject(&args.subject, args.step)?;
     let mut subjects = vec![first];

@@ -1,18 +1,18 @@
-//! The file of a film: which kind it is, and how its pictures are arranged.
+//! The file of a film: its kind, and the layout of its pictures.
 
 use std::path::PathBuf;
 
 /// Pictures of a strip.
 pub const STRIP: usize = 8;
 
-/// What a film is written as.
+/// The kinds of files.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Format {
-    /// An animation, by this program.
+    /// An animation, which this program encodes.
     Gif,
-    /// A video, by ffmpeg.
+    /// A video, which ffmpeg encodes.
     Mp4,
-    /// A few pictures side by side as one, by this program.
+    /// A few pictures side by side, as one picture.
     Png,
 }
 
@@ -21,11 +21,11 @@ pub enum Format {
 pub struct Output {
     /// The file.
     pub path: PathBuf,
-    /// What its name says.
+    /// The kind that its name says.
     pub format: Format,
 }
 
-/// Reads the name of a file.
+/// Parses the name of a file.
 pub fn output(name: &str) -> Result<Output, String> {
     let path = PathBuf::from(name);
     let format = match path.extension().and_then(|extension| extension.to_str()) {
@@ -37,19 +37,19 @@ pub fn output(name: &str) -> Result<Output, String> {
     Ok(Output { path, format })
 }
 
-/// How a picture of several episodes is divided among them.
+/// How a picture is divided among several episodes.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Layout {
     /// Width of one episode's part, pixels.
     width: usize,
     /// Height of one episode's part, pixels.
     height: usize,
-    /// One below the other, rather than side by side.
+    /// One below the other, not side by side.
     stacked: bool,
 }
 
 impl Layout {
-    /// The one for a kind of file.
+    /// The layout for a kind of file.
     pub fn of(format: Format) -> Self {
         let (width, height) = match format {
             Format::Gif => (320, 240),
@@ -64,12 +64,12 @@ impl Layout {
         self.width as f64 / self.height as f64
     }
 
-    /// Width and height of the picture of so many episodes, pixels.
+    /// Width and height of the picture of several episodes, pixels.
     pub fn size(self, episodes: usize) -> (usize, usize) {
         if self.stacked { (self.width, self.height * episodes) } else { (self.width * episodes, self.height) }
     }
 
-    /// The part of the episode in a place: left, bottom, width and height, pixels.
+    /// The part of the episode with this index: left, bottom, width and height, pixels.
     pub fn view(self, place: usize, episodes: usize) -> [usize; 4] {
         let (left, bottom) =
             if self.stacked { (0, (episodes - 1 - place) * self.height) } else { (place * self.width, 0) };
@@ -77,7 +77,7 @@ impl Layout {
     }
 }
 
-/// The steps after which a picture is taken, of an episode of `last` steps: about 25 a second, with the last one.
+/// The steps after which a picture of an episode of `last` steps is taken: about 25 a second, and the last one.
 pub fn steps(format: Format, last: usize, control_period: f64) -> Vec<usize> {
     match format {
         Format::Png => (0..STRIP).map(|picture| picture * last / (STRIP - 1)).collect(),

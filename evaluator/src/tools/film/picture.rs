@@ -15,7 +15,7 @@ impl Picture {
         self.rgb.len() / (3 * self.width)
     }
 
-    /// Pictures of one height in a row, from the left.
+    /// Joins pictures of one height in a row, from the left.
     pub fn strip(pictures: &[Self]) -> Self {
         let rows = pictures.iter().map(Self::height).max().unwrap_or(0);
         let row = |row: usize| pictures.iter().flat_map(move |picture| picture.row(row)).copied();
@@ -27,7 +27,7 @@ impl Picture {
         &self.rgb[3 * self.width * row..3 * self.width * (row + 1)]
     }
 
-    /// The same from the bottom up: OpenGL's order.
+    /// The same picture from the bottom up: OpenGL's order.
     pub fn flipped(self) -> Self {
         let rgb = (0..self.height()).rev().flat_map(|row| self.row(row)).copied().collect();
         Self { rgb, ..self }

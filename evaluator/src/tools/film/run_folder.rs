@@ -1,4 +1,4 @@
-//! Which snapshot of a run is filmed.
+//! Chooses the snapshot of a run for a film.
 
 use std::collections::BTreeMap;
 use std::fs;
@@ -11,14 +11,14 @@ use serde::Deserialize;
 const RUN: &str =
     "name a file like RUN/snapshots/step_000020000.safetensors, or the folder RUN that `learner train` made";
 
-/// What counts here of a line of `scores.jsonl`.
+/// The fields of a line of `scores.jsonl` that this module needs.
 #[derive(Deserialize)]
 struct ScoreLine {
     step: u64,
     score: f64,
 }
 
-/// The snapshot that `path` names: itself or, in the folder of a run, the one of `step`; without a step the best one.
+/// The snapshot that `path` names: the file itself or, in a run's folder, the snapshot of `step`; without a step the best one.
 ///
 /// # Errors
 /// There is no such snapshot.
@@ -58,10 +58,10 @@ fn snapshots(run: &Path) -> anyhow::Result<BTreeMap<u64, PathBuf>> {
     Ok(paths.filter_map(|path| Some((step(&path)?, path))).collect())
 }
 
-/// The step with the highest mean score among those that are `there` and have as many episodes as any; of equal ones the last.
+/// The step with the highest mean score among the steps in `there` that have the most episodes; of equal ones the last.
 fn best(scores: &str, there: impl Fn(u64) -> bool) -> Option<u64> {
     let mut evaluations: BTreeMap<u64, Vec<f64>> = BTreeMap::new();
-    // A learner at work may not have written the last line to its end.
+    // A learner at work may not have finished the last line.
     for ScoreLine { step, score } in scores.lines().filter_map(|line| serde_json::from_str(line).ok()) {
         evaluations.entry(step).or_default().push(score);
     }

@@ -12,7 +12,7 @@ use super::output::Layout;
 use super::picture::Picture;
 use crate::sim::{self, EnvironmentError};
 
-/// What only a camera sees, which the simulation's model leaves out. The light follows the robot.
+/// Parts that only a camera sees, which the simulation's model leaves out. The light follows the robot.
 const LOOKS: &str = r#"
   <statistic extent="4"/>
   <visual>
@@ -28,7 +28,7 @@ const LOOKS: &str = r#"
   </asset>
   <worldbody>
     <light directional="true" mode="trackcom" pos="0 -1 4" dir="0.2 0.3 -1" diffuse="0.5 0.5 0.5" specular="0 0 0"/>"#;
-/// A robot's first body has the first colour, its last the second, so that legs that cross can be told apart.
+/// A robot's first body has the first colour, its last the second, so that crossing legs differ.
 const ROBOT: [[f32; 3]; 2] = [[0.93, 0.49, 0.15], [0.16, 0.38, 0.66]];
 const WALL: [f32; 4] = [0.8, 0.7, 0.55, 1.0];
 const GOAL: [f32; 4] = [0.85, 0.15, 0.2, 0.6];
@@ -36,16 +36,16 @@ const GOAL: [f32; 4] = [0.85, 0.15, 0.2, 0.6];
 const GOAL_RADIUS: f64 = 0.5;
 /// Side of a wall, metres.
 const CELL: f64 = 4.0;
-/// Geometries that a scene has room for, beyond the model's: the goal, and what MuJoCo adds.
+/// Space in a scene for geometries beyond the model's: the goal, and what MuJoCo adds.
 const MORE: usize = 100;
-/// The widest angle of a free camera, from top to bottom, is 45°: at this many times a thing's height it is seen whole.
+/// The largest vertical angle of a free camera is 45°: at this many times its height, an object is fully visible.
 const WHOLE: f64 = 1.25;
 /// The share of a view's height that the caption takes.
 const CAPTION: f64 = 0.2;
 
-/// The place where films of one environment are made.
+/// Draws the films of one environment.
 pub struct Stage {
-    // Dropped in this order: MuJoCo frees what it has in OpenGL while that is still there.
+    // Dropped in this order: MuJoCo must free its OpenGL objects before the context ends.
     context: MjrContext,
     scene: MjvScene,
     data: MjData<Box<MjModel>>,
@@ -55,7 +55,7 @@ pub struct Stage {
 }
 
 impl Stage {
-    /// Builds the stage of an environment, for pictures that show so many episodes.
+    /// Builds the stage of an environment, for pictures of several episodes.
     ///
     /// # Errors
     /// There is no OpenGL, or MuJoCo fails.
@@ -63,17 +63,17 @@ impl Stage {
         let gl = Gl::new()?;
         let model = Box::new(model(spec, layout.size(episodes))?);
         let camera = camera(&model, layout.aspect());
-        // SAFETY: the context of `gl` is current on this thread, and lives as long as what is made here.
+        // SAFETY: the context of `gl` is current on this thread, and outlives what is made here.
         let mut context = unsafe { MjrContext::new(&model) };
         context.offscreen();
         let mut scene = MjvScene::new(&model, model.geom_size().len() + MORE);
-        // MuJoCo draws the shadows around one robot; those of a whole maze would be in pieces.
+        // MuJoCo draws shadows only around one robot; shadows of a whole maze would be in pieces.
         scene.flags_mut()[MjtRndFlag::mjRND_SHADOW as usize] = u8::from(camera.trackbodyid >= 0);
         let data = MjData::try_new(model).map_err(|error| EnvironmentError::Allocation(error.to_string()))?;
         Ok(Self { context, scene, data, camera, layout, _gl: gl })
     }
 
-    /// The picture of all episodes after so many steps.
+    /// The picture of all episodes after `steps` steps.
     ///
     /// # Errors
     /// The pixels cannot be read.
@@ -99,13 +99,13 @@ impl Stage {
         self.scene.update(&mut self.data, &MjvOption::default(), &MjvPerturb::default(), &mut self.camera);
         if let Some([x, y]) = pose.goal {
             let (size, at) = ([GOAL_RADIUS; 3], [x, y, GOAL_RADIUS]);
-            // SAFETY: it has no material, texture or object, and there is room for it.
+            // SAFETY: it has no material, texture or object, and there is space for it.
             unsafe { self.scene.create_geom(MjtGeom::mjGEOM_SPHERE, Some(size), Some(at), None, Some(GOAL)) };
         }
     }
 }
 
-/// The model of an environment with what only a camera sees, for pictures of a size (width, height).
+/// The model of an environment with the parts that only a camera sees, for pictures of a size (width, height).
 fn model(spec: &EnvironmentSpec, (width, height): (usize, usize)) -> anyhow::Result<MjModel> {
     let looks = LOOKS.replace("{width}", &width.to_string()).replace("{height}", &height.to_string());
     let mjcf = sim::mjcf(spec)?.replacen("<worldbody>", &looks, 1);
@@ -115,7 +115,7 @@ fn model(spec: &EnvironmentSpec, (width, height): (usize, usize)) -> anyhow::Res
     Ok(model)
 }
 
-/// Colours robot and walls, and draws the floor without end: the simulation's has none either.
+/// Colours robot and walls, and draws the floor without end, as it is in the simulation.
 fn paint(model: &mut MjModel) {
     let bodies = model.geom_bodyid().to_vec();
     let last = bodies.iter().copied().max().unwrap_or(1);
@@ -130,7 +130,7 @@ fn paint(model: &mut MjModel) {
     }
 }
 
-/// Beside the robot, going along with it; in a maze, above all walls. `aspect` is a view's width over its height.
+/// Beside the robot, moving with it; in a maze, above all walls. `aspect` is a view's width over its height.
 fn camera(model: &MjModel, aspect: f64) -> MjvCamera {
     let walls: Vec<[f64; 3]> = (0..model.geom_size().len())
         .filter(|&geom| model.geom_bodyid()[geom] == 0 && model.geom_type()[geom] == MjtGeomBase::mjGEOM_BOX)

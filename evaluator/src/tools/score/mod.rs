@@ -1,6 +1,6 @@
 //! `evaluator score`: scores saved policies, on this machine alone.
 //!
-//! `args`: what is asked for; `subject`: a policy, and which episodes are its own; `results`: what they came to, as a table.
+//! `args`: the arguments; `subject`: a policy, and its episodes; `results`: the results as a table.
 
 mod args;
 mod results;
@@ -16,13 +16,13 @@ pub(crate) use args::ScoreArgs;
 use results::{Episode, Scored, Spread, table};
 pub(crate) use subject::Subject;
 
-/// Episodes in a batch. It bounds memory; a larger batch is hardly faster.
+/// Episodes in a batch. The limit bounds memory; a larger batch is hardly faster.
 const BATCH: usize = 16;
 
-/// Scores what the command line names; gives what is to be printed.
+/// Scores the policies of the command line. Returns the text to print.
 ///
 /// # Errors
-/// A file that is no policy of an environment that can be simulated here; nothing is scored then. Or a policy that cannot
+/// A file that is no policy of an environment that this program simulates (then nothing is scored), or a policy that cannot
 /// act.
 pub(crate) fn score(args: &ScoreArgs) -> anyhow::Result<String> {
     if !args.precision.is_available() {
@@ -35,7 +35,7 @@ pub(crate) fn score(args: &ScoreArgs) -> anyhow::Result<String> {
     Ok(if args.json { serde_json::to_string(&scored)? } else { table(&scored) })
 }
 
-/// Runs a policy's episodes. What one comes to depends on neither the batch it is in nor the number of threads.
+/// Runs a policy's episodes. An episode's result depends on neither its batch nor the number of threads.
 fn measure(subject: &Subject) -> anyhow::Result<Scored> {
     let Subject { path, weights, spec, seed, step, episodes, policy } = subject;
     let batch = |seeds: &[u64]| subject.roll_out(|| Simulations.make(&spec.name, *seed), seeds);

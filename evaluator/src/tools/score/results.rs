@@ -1,4 +1,4 @@
-//! What policies came to, and that as a table.
+//! The scores of policies, and their table.
 
 use std::collections::BTreeSet;
 use std::fmt;
@@ -9,20 +9,20 @@ use serde::Serialize;
 
 use crate::sim::EpisodeOutcome;
 
-/// What one policy came to with one way to choose.
+/// The results of one policy with one way to choose.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct Scored {
     /// The file.
     pub snapshot: PathBuf,
     /// BLAKE3 of the file.
     pub weights: String,
-    /// Environment that it acted in.
+    /// Environment of the episodes.
     pub environment: String,
-    /// Gradient step that it was saved after.
+    /// Gradient step of the snapshot.
     pub step: u64,
-    /// Seed that the episodes follow from, with the step.
+    /// Seed from which, with the step, the episodes' seeds follow.
     pub seed: u64,
-    /// How it chose among its candidates; absent if it draws none.
+    /// How the policy chose among its candidates; absent if it draws none.
     pub choice: Option<Choice>,
     /// Arithmetic of its actions, as in `scores.jsonl`.
     pub precision: String,
@@ -30,7 +30,7 @@ pub struct Scored {
     pub episodes: Vec<Episode>,
 }
 
-/// What one episode came to.
+/// The result of one episode.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize)]
 pub struct Episode {
     /// Seed of its initial state and of the policy's noise.
@@ -45,7 +45,7 @@ pub struct Episode {
 }
 
 impl Scored {
-    /// How it chose, for people.
+    /// How the policy chose, as text.
     pub fn title(&self) -> String {
         self.choice.map_or_else(|| "no candidates".to_owned(), |choice| choice.to_string())
     }
@@ -63,17 +63,17 @@ impl From<&EpisodeOutcome> for Episode {
     }
 }
 
-/// Mean and sample standard deviation (n - 1) of some values.
+/// Mean and sample standard deviation (n - 1).
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Spread {
-    /// The mean; NaN without any value.
+    /// The mean; NaN for no value.
     pub mean: f64,
     /// The standard deviation; absent for a single value.
     pub std: Option<f64>,
 }
 
 impl Spread {
-    /// Of these values.
+    /// The summary of these values.
     pub fn of(values: &[f64]) -> Self {
         let count = values.len() as f64;
         let mean = values.iter().sum::<f64>() / count;
@@ -91,7 +91,7 @@ impl fmt::Display for Spread {
     }
 }
 
-/// A row for each snapshot, a column for each way to choose; below, their means if they can be averaged.
+/// A row for each snapshot, a column for each way to choose; below, their means if averaging makes sense.
 pub fn table(scored: &[Scored]) -> String {
     let mut titles: Vec<String> = Vec::new();
     for title in scored.iter().map(Scored::title) {
@@ -120,7 +120,7 @@ pub fn table(scored: &[Scored]) -> String {
         let mean = |title: &String| {
             let with_these = scored.iter().filter(|scored| scored.title() == *title);
             let means: Vec<f64> = with_these.map(|scored| Spread::of(&scored.scores()).mean).collect();
-            // Of fewer it would be something else than the row says.
+            // A mean over fewer snapshots would not be what the row says.
             if means.len() == snapshots.len() { Spread::of(&means).to_string() } else { String::new() }
         };
         rows.push(head.into_iter().chain(titles.iter().map(mean)).collect());
@@ -129,7 +129,7 @@ pub fn table(scored: &[Scored]) -> String {
     aligned(&rows) + &note
 }
 
-/// Columns as wide as they must be: text to the left, in all but the first, numbers to the right.
+/// Makes columns as wide as needed: text to the left, numbers (in all columns but the first) to the right.
 fn aligned(rows: &[Vec<String>]) -> String {
     let width = |column: usize| rows.iter().map(|row| row[column].chars().count()).max().unwrap_or(0);
     let widths: Vec<usize> = (0..rows.first().map_or(0, Vec::len)).map(width).collect();

@@ -1,4 +1,4 @@
-//! A saved policy, and the episodes that it is to be scored on.
+//! A saved policy, and the episodes to score it on.
 
 use std::fs;
 use std::path::{Path, PathBuf};
@@ -19,7 +19,7 @@ const OTHER_ENVIRONMENT: &str = "in an environment of your own it acts from Pyth
 const OTHER_CHOICE: &str = "score it without --candidates, --rule and --value";
 const RANGE: &str = "--episodes takes the place of what the file says";
 
-/// A saved policy, ready to act, and how it is to be scored.
+/// A saved policy, ready to act, with its episodes.
 pub struct Subject {
     /// The file.
     pub path: PathBuf,
@@ -27,23 +27,23 @@ pub struct Subject {
     pub weights: Hash,
     /// The policy.
     pub policy: Box<dyn Policy>,
-    /// Where it acts.
+    /// Its environment.
     pub spec: &'static EnvironmentSpec,
-    /// What its episodes follow from, with `step`.
+    /// Seed from which, with `step`, the episodes' seeds follow.
     pub seed: u64,
-    /// Gradient step that it was saved after.
+    /// Gradient step of the snapshot.
     pub step: u64,
-    /// How many episodes.
+    /// Number of episodes.
     pub episodes: u32,
 }
 
 impl Subject {
-    /// Reads a file, and takes from it what the command line does not say. Gives its policy once for each way to choose that is
-    /// asked for.
+    /// Reads a file, and takes from it what the command line does not say. Returns its policy once for each way to choose that
+    /// the command line asks for.
     ///
     /// # Errors
     ///
-    /// The file is no policy, or one that cannot act in the environment, or cannot choose so.
+    /// The file is no policy, or the policy cannot act in the environment or cannot choose in this way.
     pub fn read(path: &Path, args: &ScoreArgs) -> anyhow::Result<Vec<Self>> {
         let name = path.display();
         let file = fs::read(path).with_context(|| format!("cannot read {name}")).hint(ONE)?;
@@ -115,7 +115,7 @@ impl Subject {
     }
 }
 
-/// The ways to choose that the command line asks for; what it does not say is the policy's `own`. None if it says nothing.
+/// The ways to choose that the command line asks for, completed from the policy's `own`. None if it asks for none.
 fn choices(args: &ScoreArgs, own: Option<Choice>) -> Vec<Choice> {
     let own = own.unwrap_or(Choice::best_of(1));
     let of =
