@@ -9,7 +9,7 @@ use criterion::{BenchmarkGroup, BenchmarkId, Criterion, Throughput, criterion_gr
 use quad_kernels::Buffer;
 use quad_kernels::activation::Activation::Mish;
 use quad_kernels::activation::{activate, activate_with_slope};
-use quad_kernels::product::{Matrix, Rounded, by_gemm, outer, product, product_transposed};
+use quad_kernels::product::{Matrix, Packed, by_gemm, outer, product, product_transposed};
 use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 use std::time::Duration;
@@ -91,9 +91,16 @@ fn products(criterion: &mut Criterion) {
         let orders = (TRANSPOSED, AS_IT_IS, IN_TURN);
         compare(criterion, (&name, [k, m, n]), orders, &|_, x, g, out| outer(x, g, out, k, n));
     }
+    // As a policy acts: for ten episodes on one thread, for ten candidates.
+    for [m, k, n] in [[100, 256, 256], [10, 256, 256]] {
+        let pack = |seed| Packed::new(numbers(k * n, seed).first(k * n), k, n);
+        let Some(packed) = (1..=IN_TURN).map(pack).collect::<Option<Vec<_>>>() else { return };
+        let (name, orders) = (format!("packed product, {m} × {k} × {n}"), (AS_IT_IS, AS_IT_IS, 1));
+        compare(criterion, (&name, [m, k, n]), orders, &|i, x, _, out| packed[i].product(x, out));
+    }
     // The library has no product of rounded operands and multiplies in f32; nor has a CPU that gains nothing by it.
     for [m, k, n] in [[32, 256, 256], [32, 128, 128]] {
-        let round = |seed| Rounded::new(numbers(k * n, seed).first(k * n), k, n);
+        let round = |seed| Packed::rounded(numbers(k * n, seed).first(k * n), k, n);
         let Some(rounded) = (1..=IN_TURN).map(round).collect::<Option<Vec<_>>>() else { return };
         let (name, orders) = (format!("bf16 product, {m} × {k} × {n}"), (AS_IT_IS, AS_IT_IS, 1));
         compare(criterion, (&name, [m, k, n]), orders, &|i, x, _, out| rounded[i].product(x, out));

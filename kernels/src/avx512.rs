@@ -14,7 +14,7 @@ use std::cell::RefCell;
 use crate::level::Level;
 
 /// Lanes of a register.
-const LANES: usize = 16;
+pub(crate) const LANES: usize = 16;
 /// Columns of the result that are worked on together: two registers.
 pub(crate) const COLUMNS: usize = 2 * LANES;
 /// Rows of the result that are worked on together: their sums fill most of the 32 registers.
@@ -28,7 +28,7 @@ pub(crate) fn serves(columns: usize) -> bool {
 /// What a register holds, where one cache line holds it: other addresses take two for each register.
 #[derive(Clone, Copy)]
 #[repr(align(64))]
-struct Line<T>([T; LANES]);
+pub(crate) struct Line<T>(pub [T; LANES]);
 
 /// A matrix by its first element and the distances between rows and between columns.
 #[derive(Clone, Copy)]
@@ -158,6 +158,22 @@ pub(crate) unsafe fn multiply(m: usize, n: usize, k: usize, a: Strided<f32>, b: 
         }
     }
     BLOCK.set(block_of_b);
+}
+
+/// `c[m × n] = a[m × k] · b`, where `b` has `n / 32` blocks of `k × 32`, one behind the other.
+///
+/// # Safety
+/// [`serves`] must hold for `n`, and the three matrices must span that many elements.
+#[target_feature(enable = "avx512f")]
+pub(crate) unsafe fn multiply_packed(m: usize, n: usize, k: usize, a: *const f32, b: *const f32, c: *mut f32) {
+    let a = Strided { first: a, row: k, column: 1 };
+    for j in (0..n).step_by(COLUMNS) {
+        // SAFETY: block j and its columns of the result are inside.
+        unsafe {
+            let block = b.add(j * k);
+            panel(m, k, a, block, Ahead { first: block.wrapping_add(k * COLUMNS), row: COLUMNS }, c.add(j), n);
+        }
+    }
 }
 
 /// `to = fromᵀ` for 16 × 16 numbers.

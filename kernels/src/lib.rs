@@ -3,7 +3,8 @@
 //! # Layout
 //!
 //! - [`product`]: dense products on one thread, in f32 and with operands rounded to bfloat16.
-//! - `avx512`: the products that the libraries at hand do more slowly (docs/results.md says by how much).
+//! - `packed`: a product's right-hand side, laid out once for many products.
+//! - `avx512`, `avx2`: the products that the libraries at hand do more slowly (docs/performance.md says by how much).
 //! - [`activation`]: Mish and its derivative; [`narrow`]: the first and last layer of a network, fused with it.
 //! - [`optimiser`]: Adam and EMA over whole parameter vectors.
 //! - [`scaling`]: between a user's units and those of networks.
@@ -16,11 +17,15 @@
 
 pub mod activation;
 #[cfg(target_arch = "x86_64")]
+mod avx2;
+#[cfg(target_arch = "x86_64")]
 mod avx512;
 mod buffer;
 mod level;
 pub mod narrow;
 pub mod optimiser;
+#[cfg(target_arch = "x86_64")]
+mod packed;
 pub mod product;
 pub mod scaling;
 mod vectorised;

@@ -11,9 +11,9 @@ use gemm_common::{
 
 #[cfg(target_arch = "x86_64")]
 use crate::avx512;
-#[cfg(target_arch = "x86_64")]
-pub use crate::avx512::bf16::Rounded;
 use crate::level::Level;
+#[cfg(target_arch = "x86_64")]
+pub use crate::packed::Packed;
 
 /// The left or right side of a product.
 #[derive(Clone, Copy)]
@@ -116,7 +116,7 @@ fn multiply([m, k, n]: [usize; 3], a: Matrix, b: &[f32], out: &mut [f32]) {
     by_gemm([m, k, n], a, Matrix::RowMajor(b), out);
 }
 
-/// Whether this CPU multiplies rounded operands ([`Rounded`]), and faster than in f32.
+/// Whether this CPU multiplies rounded operands ([`Packed::rounded`]), and faster than in f32.
 pub fn rounding_is_faster() -> bool {
     #[cfg(target_arch = "x86_64")]
     let available = avx512::bf16::available();
@@ -142,12 +142,20 @@ pub fn product(x: &[f32], w: &[f32], out: &mut [f32], k: usize, n: usize) {
 
 /// There are none where no such CPU is.
 #[cfg(not(target_arch = "x86_64"))]
-pub enum Rounded {}
+pub enum Packed {}
 
 #[cfg(not(target_arch = "x86_64"))]
-impl Rounded {
+impl Packed {
     pub fn new(_: &[f32], _: usize, _: usize) -> Option<Self> {
         None
+    }
+
+    pub fn rounded(_: &[f32], _: usize, _: usize) -> Option<Self> {
+        None
+    }
+
+    pub fn is_rounded(&self) -> bool {
+        match *self {}
     }
 
     pub fn product(&self, _: &[f32], _: &mut [f32]) {
@@ -200,8 +208,13 @@ mod tests {
             product(&x, &w, &mut out, k, n);
             let exact = |i: usize| sum(k, &|p| (x[i / n * k + p], w[p * n + i % n]));
             assert_close(&out, exact, &format!("{m} × {k} × {n}"));
+            if let Some(packed) = Packed::new(&w, k, n) {
+                out.fill(f32::NAN);
+                packed.product(&x, &mut out);
+                assert_close(&out, exact, &format!("{m} × {k} × {n}, packed"));
+            }
             let mut out = vec![f32::NAN; m * n];
-            match Rounded::new(&w, k, n) {
+            match Packed::rounded(&w, k, n) {
                 Some(rounded) => rounded.product(&x, &mut out),
                 None => product(&x, &w, &mut out, k, n),
             }

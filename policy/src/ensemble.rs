@@ -3,9 +3,9 @@
 use crate::action_gradients::ActionGradients;
 use crate::mlp::Mlp;
 use crate::operation::OnCpu;
+use crate::packed::Packing;
 use crate::plain;
 use crate::precision::Precision;
-use crate::rounded::Rounding;
 use crate::shape::EnsembleShape;
 use crate::weights::Weights;
 use candle_core::{Result, Tensor, Var, bail};
@@ -15,14 +15,20 @@ pub struct Ensemble {
     shape: EnsembleShape,
     networks: Mlp,
     weights: Weights,
-    rounding: Rounding,
+    packing: Packing,
 }
 
 impl Ensemble {
     /// `weights` are of the shape's layout; `precision` is for what no gradient is taken of.
     pub fn new(shape: EnsembleShape, weights: Weights, precision: Precision) -> Self {
         let networks = Mlp::new(shape.layers(), "");
-        Self { shape, networks, weights, rounding: Rounding::new(precision) }
+        Self { shape, networks, weights, packing: Packing::new(precision) }
+    }
+
+    /// The same for a policy that acts: its weights do not change, so that kernels are laid out for its products once.
+    pub fn fixed(mut self) -> Self {
+        self.packing.fixed = true;
+        self
     }
 
     /// Its weights.
@@ -37,13 +43,13 @@ impl Ensemble {
 
     /// The same networks with a copy of the weights as constants: a target network at its beginning.
     pub fn copy(&self) -> Result<Self> {
-        Ok(Self::new(self.shape.clone(), self.weights.copy()?, self.rounding.precision))
+        Ok(Self::new(self.shape.clone(), self.weights.copy()?, self.packing.precision))
     }
 
     /// The same networks with their weights as constants, which share their memory with these.
     pub fn detach(&self) -> Self {
         let (shape, networks) = (self.shape.clone(), self.networks.clone());
-        Self { shape, networks, weights: self.weights.detach(), rounding: Rounding::new(Precision::F32) }
+        Self { shape, networks, weights: self.weights.detach(), packing: Packing::new(Precision::F32) }
     }
 
     /// What comes out, `[K, rows, outputs]`, a row for each action.
@@ -54,11 +60,11 @@ impl Ensemble {
         self.check(observations, actions)?;
         let constant = !(self.weights.values().track_op() || observations.track_op() || actions.track_op());
         let fast = constant && self.networks.is_fast(&self.weights);
-        let rounded = if fast { self.rounding.kernels(&self.networks, &self.weights)? } else { None };
+        let packed = if fast { self.packing.kernels(&self.networks, &self.weights)? } else { None };
         let observations = plain::repeat_rows(observations, actions.dim(0)? / observations.dim(0)?)?;
         let inputs = [&observations, actions];
         let inputs = if self.shape.action_dim == 0 { &inputs[..1] } else { &inputs };
-        self.networks.forward_by(rounded, &self.weights, inputs)
+        self.networks.forward_by(packed, &self.weights, inputs)
     }
 
     /// Q_k(s, a), `[K, rows]`, of networks with one output; the arguments are those of [`Self::outputs`].

@@ -16,7 +16,7 @@
 //! - [`Precision`] (`precision`): how exactly networks are evaluated that no gradient is taken of.
 //! - Below: `layers` (where each layer lies in the vector), `network` (one network on one tile of rows, over the crate
 //!   `kernels`), `saved` and `kept_gradient` (what forward and backward passes leave), `operation` (candle's custom
-//!   operations), `rounded` (kernels rounded once), `slices` (candle's tensors as slices), `statistics` (mean and variance
+//!   operations), `packed` (kernels packed once), `slices` (candle's tensors as slices), `statistics` (mean and variance
 //!   over an ensemble).
 //!
 //! Everything that draws random numbers takes them as an argument or from a seeded generator.
@@ -46,10 +46,10 @@ mod network;
 mod noise_predictor;
 mod operation;
 mod optimiser;
+mod packed;
 mod plain;
 mod policy;
 mod precision;
-mod rounded;
 mod sampler;
 mod saved;
 mod scaled;

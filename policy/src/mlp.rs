@@ -11,12 +11,17 @@ use crate::saved::{Lent, Pool, SavedActivations};
 use crate::slices::{has_fast_implementation, on_cpu, slice};
 use crate::weights::Weights;
 use candle_core::{CpuStorage, CustomOp2, Layout, Result, Shape, Tensor, bail};
-use quad_kernels::product::Rounded;
+use quad_kernels::product::Packed;
 use rayon::prelude::*;
 use std::sync::Arc;
 
-/// For each network the kernels between its hidden layers, rounded; none where it is as fast without.
-pub(crate) type Kernels = Vec<Vec<Rounded>>;
+/// For each network the kernels between its hidden layers, packed; none where products are as fast without.
+pub(crate) type Kernels = Vec<Vec<Packed>>;
+
+/// Those of one member, if any were packed.
+pub(crate) fn of_member(packed: Option<&Kernels>, member: usize) -> Option<&[Packed]> {
+    packed.and_then(|packed| packed.get(member)).map(Vec::as_slice)
+}
 
 /// Networks over some part of a vector of weights.
 #[derive(Clone)]
@@ -37,8 +42,8 @@ impl Mlp {
         self.forward_by(None, weights, inputs)
     }
 
-    /// The same; where no gradient is taken, by these kernels of the members, rounded.
-    pub fn forward_by(&self, rounded: Option<Arc<Kernels>>, weights: &Weights, inputs: &[&Tensor]) -> Result<Tensor> {
+    /// The same; where no gradient is taken, by these kernels of the members, packed.
+    pub fn forward_by(&self, packed: Option<Arc<Kernels>>, weights: &Weights, inputs: &[&Tensor]) -> Result<Tensor> {
         let x = if let [x] = inputs { (*x).clone() } else { Tensor::cat(inputs, 1)? };
         let (values, layers) = (weights.values(), &self.layers);
         if !matches!(*x.dims(), [rows, width] if rows > 0 && width == layers.inputs()) {
@@ -51,7 +56,7 @@ impl Mlp {
         let saved = (values.track_op() || x.track_op()).then(|| self.saved.lend());
         let constant =
             inputs.iter().take_while(|input| !input.track_op()).map(|input| input.dim(1)).sum::<Result<_>>()?;
-        values.apply_op2(&x.contiguous()?, Operation { mlp: self.clone(), kept, saved, rounded, constant })
+        values.apply_op2(&x.contiguous()?, Operation { mlp: self.clone(), kept, saved, packed, constant })
     }
 
     /// Whether the fast implementation serves them.
@@ -67,16 +72,15 @@ impl Mlp {
     }
 
     pub fn network<'a>(&'a self, weights: &'a [f32], member: usize) -> Network<'a> {
-        Network { weights, layers: &self.layers, member, rounded: None }
+        Network { weights, layers: &self.layers, member, packed: None }
     }
 
     /// Forward of plain rows, nothing kept: `K × rows × out`.
-    pub fn run(&self, weights: &[f32], rounded: Option<&[Vec<Rounded>]>, x: &[f32], out: &mut [f32]) {
+    pub fn run(&self, weights: &[f32], packed: Option<&Kernels>, x: &[f32], out: &mut [f32]) {
         let (inputs, outputs) = (self.layers.inputs(), self.layers.outputs());
         let rows = out.len() / (self.layers.members * outputs);
         out.par_chunks_mut(rows * outputs).enumerate().for_each(|(member, out)| {
-            let rounded = rounded.and_then(|rounded| rounded.get(member)).map(Vec::as_slice);
-            let network = Network { rounded, ..self.network(weights, member) };
+            let network = Network { packed: of_member(packed, member), ..self.network(weights, member) };
             out.par_chunks_mut(TILE * outputs).enumerate().for_each(|(i, out)| {
                 let x = rows_of(x, i * TILE, TILE, inputs);
                 with_workspace(|work| {
@@ -99,7 +103,7 @@ struct Operation {
     /// What the forward pass keeps for the backward pass, if there is to be one.
     saved: Option<Lent>,
     /// What the products between hidden layers use, if nothing is kept.
-    rounded: Option<Arc<Kernels>>,
+    packed: Option<Arc<Kernels>>,
     /// How many of the inputs, the first ones, get no gradient.
     constant: usize,
 }
@@ -173,7 +177,7 @@ impl CustomOp2 for Operation {
         let mut out = vec![0.0; members * rows * outputs];
         match &self.saved {
             Some(saved) => self.forward_saving(weights, x, saved, &mut out),
-            None => self.mlp.run(weights, self.rounded.as_ref().map(|rounded| &***rounded), x, &mut out),
+            None => self.mlp.run(weights, self.packed.as_deref(), x, &mut out),
         }
         Ok((CpuStorage::F32(out), (members, rows, outputs).into()))
     }

@@ -4,10 +4,11 @@
 //! number of actions is tried in it, and the action's few columns are fused with the activation.
 
 use crate::layers::{Layers, TILE};
+use crate::precision::Precision;
 use quad_kernels::Buffer;
 use quad_kernels::activation::{activate, activate_with_slope, multiply};
 use quad_kernels::narrow::{FirstLayer, dots, first_layer, scale_by_combination};
-use quad_kernels::product::{Rounded, product, product_transposed};
+use quad_kernels::product::{Packed, product, product_transposed};
 use std::cell::RefCell;
 
 /// Rows of a tile that are worked on together in a task whose products are rounded: these are so fast that activations must be in the nearest cache.
@@ -21,8 +22,8 @@ pub(crate) struct Network<'a> {
     pub weights: &'a [f32],
     pub layers: &'a Layers,
     pub member: usize,
-    /// The kernels between hidden layers with their numbers rounded, if forward passes are to use these.
-    pub rounded: Option<&'a [Rounded]>,
+    /// The kernels between hidden layers as their products read them, if they were packed.
+    pub packed: Option<&'a [Packed]>,
 }
 
 /// What a tile of rows is fed: `repeat` consecutive rows share a row of `base`.
@@ -150,13 +151,17 @@ impl<'a> Network<'a> {
         rows
     }
 
-    /// The kernels between hidden layers, rounded; `None` where [`Self::forward`] is as fast without.
-    pub fn round(&self) -> Option<Vec<Rounded>> {
-        let round = |layer| {
-            let (inputs, outputs) = self.layers.shape(layer);
-            Rounded::new(self.kernel(layer), inputs, outputs)
+    /// The kernels between hidden layers, packed; `None` where products are as fast without.
+    pub fn pack(&self, precision: Precision) -> Option<Vec<Packed>> {
+        let pack = |layer| {
+            let (kernel, (inputs, outputs)) = (self.kernel(layer), self.layers.shape(layer));
+            let rounded = match precision {
+                Precision::F32 => None,
+                Precision::Bf16 => Packed::rounded(kernel, inputs, outputs),
+            };
+            rounded.or_else(|| Packed::new(kernel, inputs, outputs))
         };
-        (1..self.last()).map(round).collect()
+        (1..self.last()).map(pack).collect()
     }
 
     /// `out[rows × outputs]` of a tile.
@@ -165,7 +170,8 @@ impl<'a> Network<'a> {
         let action_dim = input.kernel.len() / width;
         let [x, y] = &mut work.pair;
         let output = self.output_rows(&mut work.output);
-        let block = if self.rounded.is_some() { BLOCK } else { TILE };
+        let rounded = self.packed.is_some_and(|kernels| kernels.iter().any(Packed::is_rounded));
+        let block = if rounded { BLOCK } else { TILE };
         let states = (block / input.repeat).max(1);
         let rows = states * input.repeat;
         for (i, (base, out)) in input.base.chunks(states * width).zip(out.chunks_mut(rows * outputs)).enumerate() {
@@ -181,7 +187,7 @@ impl<'a> Network<'a> {
                 let (inputs, width) = self.layers.shape(layer);
                 let (x, y) = if layer % 2 == 1 { (&mut *x, &mut *y) } else { (&mut *y, &mut *x) };
                 let (x, y) = (x.sized(count * inputs), y.sized(count * width));
-                match self.rounded {
+                match self.packed {
                     Some(kernels) => kernels[layer - 1].product(x, y),
                     None => product(x, self.kernel(layer), y, inputs, width),
                 }

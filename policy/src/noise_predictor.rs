@@ -2,9 +2,9 @@
 
 use crate::mlp::Mlp;
 use crate::operation::OnCpu;
+use crate::packed::Packing;
 use crate::plain;
 use crate::precision::Precision;
-use crate::rounded::Rounding;
 use crate::sampler::{Parts, Sample};
 use crate::schedule::Schedule;
 use crate::shape::{NoiseShape, TIME_FEATURES};
@@ -16,7 +16,7 @@ use std::sync::Arc;
 pub struct NoisePredictor {
     parts: Arc<Parts>,
     weights: Weights,
-    rounding: Rounding,
+    packing: Packing,
 }
 
 /// cos(t·f_k), then sin(t·f_k), with f_k = exp(-k·ln(10000)/7) for k = 0..7, of t = 1..T.
@@ -37,7 +37,13 @@ impl NoisePredictor {
             features: time_features(shape.diffusion_steps),
             shape,
         };
-        Self { parts: Arc::new(parts), weights, rounding: Rounding::new(precision) }
+        Self { parts: Arc::new(parts), weights, packing: Packing::new(precision) }
+    }
+
+    /// The same for a policy that acts: its weights do not change, so that kernels are laid out for its products once.
+    pub fn fixed(mut self) -> Self {
+        self.packing.fixed = true;
+        self
     }
 
     /// Its weights.
@@ -73,7 +79,7 @@ impl NoisePredictor {
     /// The same network with its weights as constants, which share their memory with these.
     pub fn detach(&self) -> Self {
         let (parts, weights) = (self.parts.clone(), self.weights.detach());
-        Self { parts, weights, rounding: Rounding::new(Precision::F32) }
+        Self { parts, weights, packing: Packing::new(Precision::F32) }
     }
 
     /// Draws actions by the whole reverse process (DDPM).
@@ -86,8 +92,8 @@ impl NoisePredictor {
             return self.detach().sample_with_gradient(observations, noise);
         }
         self.check_noise(observations, noise)?;
-        let rounded = self.rounding.kernels(&self.parts.trunk, &self.weights)?;
-        let operation = OnCpu(Sample { parts: self.parts.clone(), rounded });
+        let packed = self.packing.kernels(&self.parts.trunk, &self.weights)?;
+        let operation = OnCpu(Sample { parts: self.parts.clone(), packed });
         let weights = self.weights.values().detach();
         weights.apply_op3_no_bwd(&observations.contiguous()?, &noise.contiguous()?, &operation)
     }

@@ -2,7 +2,7 @@
 //! one tile of rows after the other, so that activations stay in a core's cache; tiles run in parallel.
 
 use crate::layers::TILE;
-use crate::mlp::{Kernels, Mlp};
+use crate::mlp::{Kernels, Mlp, of_member};
 use crate::network::{Input, Network, rows_of, with_workspace};
 use crate::operation::{Arguments, Operation};
 
@@ -28,7 +28,7 @@ pub(crate) struct Parts {
 /// The custom operation of (weights, observations, noise) that draws actions.
 pub(crate) struct Sample {
     pub parts: Arc<Parts>,
-    pub rounded: Option<Arc<Kernels>>,
+    pub packed: Option<Arc<Kernels>>,
 }
 
 impl Parts {
@@ -82,8 +82,8 @@ impl Operation for Sample {
     fn forward(&self, given: Arguments<'_>) -> Result<(Vec<f32>, Shape)> {
         let action_dim = self.parts.shape.action_dim;
         let mut actions = vec![0.0; given.rows * action_dim];
-        let rounded = self.rounded.as_ref().and_then(|rounded| rounded.first()).map(Vec::as_slice);
-        let network = Network { rounded, ..self.parts.trunk.network(given.weights, 0) };
+        let packed = of_member(self.packed.as_deref(), 0);
+        let network = Network { packed, ..self.parts.trunk.network(given.weights, 0) };
         self.parts.sample(network, given, &mut actions);
         Ok((actions, (given.rows, action_dim).into()))
     }

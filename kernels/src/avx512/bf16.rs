@@ -55,7 +55,7 @@ thread_local! {
 }
 
 /// The right-hand side of products, `k × n`, rounded to bfloat16: block after block of columns, and in each the pairs of `k` as rows.
-pub struct Rounded {
+pub(crate) struct Rounded {
     blocks: Vec<Line<Pair>>,
     k: usize,
     n: usize,

@@ -1,4 +1,4 @@
-//! Kernels rounded once, and used until the weights change.
+//! Kernels packed once, and used until the weights change.
 
 use crate::mlp::{Kernels, Mlp};
 use crate::precision::Precision;
@@ -8,21 +8,24 @@ use candle_core::Result;
 use rayon::prelude::*;
 use std::sync::{Arc, Mutex, PoisonError};
 
-/// How the products of some networks are rounded.
-pub(crate) struct Rounding {
+/// How the kernels of some networks are packed.
+pub(crate) struct Packing {
     pub precision: Precision,
+    /// Whether the weights stay. In f32, packing kernels for one gradient step costs as much as it gains.
+    pub fixed: bool,
     /// What was made of the weights, and of which state of them.
     made: Mutex<Option<(u64, Arc<Kernels>)>>,
 }
 
-impl Rounding {
+impl Packing {
+    /// For weights that change.
     pub fn new(precision: Precision) -> Self {
-        Self { precision, made: Mutex::default() }
+        Self { precision, fixed: false, made: Mutex::default() }
     }
 
-    /// The kernels of these networks, made now or before; `None` if they are not to be rounded.
+    /// The kernels of these networks, packed now or before; `None` if they are not to be packed.
     pub fn kernels(&self, mlp: &Mlp, weights: &Weights) -> Result<Option<Arc<Kernels>>> {
-        if self.precision == Precision::F32 {
+        if self.precision == Precision::F32 && !self.fixed {
             return Ok(None);
         }
         let mut made = self.made.lock().unwrap_or_else(PoisonError::into_inner);
@@ -31,11 +34,11 @@ impl Rounding {
         {
             return Ok(Some(kernels.clone()));
         }
-        let round = |weights: &[f32]| {
+        let pack = |weights: &[f32]| {
             let members = (0..mlp.layers.members).into_par_iter();
-            members.filter_map(|member| mlp.network(weights, member).round()).collect::<Kernels>()
+            members.filter_map(|member| mlp.network(weights, member).pack(self.precision)).collect::<Kernels>()
         };
-        let kernels = Arc::new(read(weights.values(), round)?);
+        let kernels = Arc::new(read(weights.values(), pack)?);
         *made = Some((weights.changes(), kernels.clone()));
         Ok(Some(kernels))
     }

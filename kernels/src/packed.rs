@@ -1,0 +1,72 @@
+//! The right-hand side of products, laid out once as all of them read it.
+
+use crate::avx2;
+use crate::avx512::bf16::Rounded;
+use crate::avx512::{self, LANES, Line};
+use crate::level::Level;
+
+/// A matrix `k × n` that many others are multiplied with: block after block of columns, so that a product copies nothing.
+pub struct Packed {
+    blocks: Blocks,
+    k: usize,
+    n: usize,
+}
+
+enum Blocks {
+    F32(Vec<Line<f32>>),
+    Bf16(Rounded),
+}
+
+impl Packed {
+    /// Packs a row-major matrix; `None` where this CPU gains nothing by it, or the matrix is not made of whole blocks.
+    pub fn new(matrix: &[f32], k: usize, n: usize) -> Option<Self> {
+        assert_eq!(matrix.len(), k * n, "the matrix's shape");
+        let columns = match Level::in_use() {
+            Level::Avx512 => avx512::COLUMNS,
+            Level::Avx2 => avx2::COLUMNS,
+            Level::Plain => return None,
+        };
+        if !n.is_multiple_of(columns) {
+            return None;
+        }
+        let mut lines = Vec::with_capacity(k * n / LANES);
+        for j in (0..n).step_by(columns) {
+            for row in matrix.chunks_exact(n) {
+                for numbers in row[j..j + columns].chunks_exact(LANES) {
+                    let mut line = Line([0.0; LANES]);
+                    line.0.copy_from_slice(numbers);
+                    lines.push(line);
+                }
+            }
+        }
+        Some(Self { blocks: Blocks::F32(lines), k, n })
+    }
+
+    /// The same with its numbers rounded to bfloat16, as those of the left side will be; sums are in f32.
+    pub fn rounded(matrix: &[f32], k: usize, n: usize) -> Option<Self> {
+        Some(Self { blocks: Blocks::Bf16(Rounded::new(matrix, k, n)?), k, n })
+    }
+
+    /// Whether its numbers are rounded.
+    pub fn is_rounded(&self) -> bool {
+        matches!(self.blocks, Blocks::Bf16(_))
+    }
+
+    /// `c[m × n] = a[m × k] · self`, row-major.
+    pub fn product(&self, a: &[f32], c: &mut [f32]) {
+        let Self { k, n, .. } = *self;
+        let m = a.len() / k;
+        assert!(a.len() == m * k && c.len() == m * n, "the product's shape");
+        match &self.blocks {
+            Blocks::Bf16(rounded) => rounded.product(a, c),
+            // SAFETY: they were packed for the instructions in use, which the CPU has, and the shapes are those.
+            Blocks::F32(lines) => unsafe {
+                let (a, b, c) = (a.as_ptr(), lines.as_ptr().cast(), c.as_mut_ptr());
+                match Level::in_use() {
+                    Level::Avx512 => avx512::multiply_packed(m, n, k, a, b, c),
+                    _ => avx2::multiply_packed(m, n, k, a, b, c),
+                }
+            },
+        }
+    }
+}
