@@ -16,12 +16,14 @@ RUN=runs/hopper-demo
 EVALUATORS=2
 BIN=target/release
 
+say "1 of 4: packages and libmujoco; next: build, data, training"
 deploy/setup.sh
+say "2 of 4: building learner and evaluator, 420 crates: 5 to 10 minutes the first time; next: data (one minute), training (three)"
 cargo build --release --locked --package quad-learner --package quad-evaluator
 
 mkdir -p data
 if [ ! -e "$DATASET" ]; then
-  say "recording $DATASET"
+  say "3 of 4: recording $DATASET"
   $BIN/evaluator collect --env hopper --out "$DATASET"
 fi
 
@@ -33,6 +35,7 @@ if [ -e "$RUN/complete" ] && [ $# -eq 0 ]; then
   exit
 fi
 
+say "4 of 4: training, then the table, a film and a report"
 status=0
 $BIN/learner train --task $TASK --dataset $DATASET --run-dir $RUN --evaluators $EVALUATORS "$@" || status=$?
 if [ "$status" -ne 0 ]; then
