@@ -4,7 +4,7 @@
 #
 #   deploy/bench.sh [ROUNDS]     five rounds if not said otherwise, of two or three minutes each; on an idle machine
 #
-# QUAD_INSTRUCTIONS=avx2 keeps all of them, JAX too, to what a CPU without AVX-512 has.
+# QUAD_INSTRUCTIONS=avx2 keeps all of them but JAX's products to what a CPU without AVX-512 has.
 # Criterion's own reports are in target/criterion afterwards, every figure in target/bench.json.
 set -euo pipefail
 cd "$(dirname "$0")/.."

@@ -32,9 +32,9 @@ PEAK_CALLS, PEAK_ROWS, PEAK_WIDTH = 1000, 128, 256
 KERNELS, OURS = "/20 in turn$|/mish", ("ours", "mish")
 LIBRARIES = {"gemm": "gemm", "gemm in f32": "gemm, f32", "mish by std's exp": "std's exp"}
 PYTHON = ".deps/venv/bin/python"
-# Asked for fewer instructions than the CPU has, JAX's compiler and its library of products keep to them, too.
+# Asked for fewer instructions than the CPU has, JAX's compiler keeps to them, too. Its library of products takes what it finds.
 ONLY_AVX2 = os.environ.get("QUAD_INSTRUCTIONS") == "avx2"
-PEER_ENVIRONMENT = {"XLA_FLAGS": "--xla_cpu_max_isa=AVX2", "ONEDNN_MAX_CPU_ISA": "AVX2"} if ONLY_AVX2 else {}
+PEER_ENVIRONMENT = {"XLA_FLAGS": "--xla_cpu_max_isa=AVX2"} if ONLY_AVX2 else {}
 
 
 class Work:
@@ -236,7 +236,7 @@ def rollouts(rounds):
     head = "ten Hopper episodes | environment steps/s | over JAX | step of all ten | its policy"
     rows = [head.split(" | ") + ["network and physics at their best", "over that"]]
     rows.append(["JAX, one at a time", f"{median(rounds, lambda x: 1 / jax(x)):.0f}", "", "", "", "", ""])
-    for name in (name for name in ("f32", "bf16") if f"select/{name}" in rounds[0]["seconds"]):
+    for name in ("f32", "bf16") if has_bf16(rounds) else ("f32",):
         step = lambda x: x["seconds"][f"rollout/{ROLLOUT_STEPS} steps, {name}"] / ROLLOUT_STEPS
         bound = lambda x: work.bound(x["peak"]) + physics(x)
         row = [f"evaluator, {name}", f"{median(rounds, lambda x: EPISODES / step(x)):.0f}"]

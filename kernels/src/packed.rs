@@ -6,14 +6,10 @@ use crate::avx512::{self, LANES, Line};
 use crate::level::Level;
 
 /// A matrix `k × n` that many others are multiplied with: block after block of columns, so that a product copies nothing.
-pub struct Packed {
-    blocks: Blocks,
-    k: usize,
-    n: usize,
-}
+pub struct Packed(Blocks);
 
 enum Blocks {
-    F32(Vec<Line<f32>>),
+    F32 { lines: Vec<Line<f32>>, k: usize, n: usize },
     Bf16(Rounded),
 }
 
@@ -39,34 +35,35 @@ impl Packed {
                 }
             }
         }
-        Some(Self { blocks: Blocks::F32(lines), k, n })
+        Some(Self(Blocks::F32 { lines, k, n }))
     }
 
     /// The same with its numbers rounded to bfloat16, as those of the left side will be; sums are in f32.
     pub fn rounded(matrix: &[f32], k: usize, n: usize) -> Option<Self> {
-        Some(Self { blocks: Blocks::Bf16(Rounded::new(matrix, k, n)?), k, n })
+        Some(Self(Blocks::Bf16(Rounded::new(matrix, k, n)?)))
     }
 
     /// Whether its numbers are rounded.
     pub fn is_rounded(&self) -> bool {
-        matches!(self.blocks, Blocks::Bf16(_))
+        matches!(self.0, Blocks::Bf16(_))
     }
 
     /// `c[m × n] = a[m × k] · self`, row-major.
     pub fn product(&self, a: &[f32], c: &mut [f32]) {
-        let Self { k, n, .. } = *self;
-        let m = a.len() / k;
-        assert!(a.len() == m * k && c.len() == m * n, "the product's shape");
-        match &self.blocks {
+        match &self.0 {
             Blocks::Bf16(rounded) => rounded.product(a, c),
-            // SAFETY: they were packed for the instructions in use, which the CPU has, and the shapes are those.
-            Blocks::F32(lines) => unsafe {
+            Blocks::F32 { lines, k, n } => {
+                let m = a.len() / k;
+                assert!(a.len() == m * k && c.len() == m * n, "the product's shape");
                 let (a, b, c) = (a.as_ptr(), lines.as_ptr().cast(), c.as_mut_ptr());
-                match Level::in_use() {
-                    Level::Avx512 => avx512::multiply_packed(m, n, k, a, b, c),
-                    _ => avx2::multiply_packed(m, n, k, a, b, c),
+                // SAFETY: they were packed for the instructions in use, which the CPU has, and the shapes are those.
+                unsafe {
+                    match Level::in_use() {
+                        Level::Avx512 => avx512::multiply_packed(m, *n, *k, a, b, c),
+                        _ => avx2::multiply_packed(m, *n, *k, a, b, c),
+                    }
                 }
-            },
+            }
         }
     }
 }
