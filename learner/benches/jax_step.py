@@ -7,7 +7,7 @@ The step is QUAD's, as tests/golden/quad.py has it, but in float32 and compiled 
 is called from Python, and run by `lax.scan`. Tuned means: Mish with a single exponential instead of softplus and tanh,
 and an allocator that keeps its memory. Prints a line of JSON for each configuration: {way: seconds per step}, medians.
 With --serve it waits for names of configurations on standard input, a line each, so that others can be timed in
-between. --check compares one step, with either Mish, with golden folders (docs/golden.md).
+between. --check compares one step, with either Mish, with golden folders (tests/golden/README.md).
 """
 
 import argparse
@@ -243,7 +243,7 @@ def ways(name):
 
 
 def check():
-    """One step against golden folders, by the measure and the bound of docs/golden.md."""
+    """One step against golden folders, by the measure and the bound of tests/golden/README.md."""
     worst = 0.0
     # In the first, both gradients are clipped and the target actor moves; in the second it does not.
     for name, mish in ("quad", networks.mish), ("ten-critics", networks.mish), ("quad", tuned_mish):

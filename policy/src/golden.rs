@@ -1,5 +1,5 @@
 //! Tests: the sampler and acting by the best of several candidates, against an independent implementation
-//! (docs/golden.md).
+//! (tests/golden/README.md).
 
 #[path = "../../tests/golden/golden.rs"]
 mod reader;

@@ -1,4 +1,4 @@
-"""One update of AlignIQL (He et al. 2024), without its multipliers: docs/golden.md."""
+"""One update of AlignIQL (He et al. 2024), without its multipliers."""
 
 import math
 

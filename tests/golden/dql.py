@@ -1,4 +1,4 @@
-"""One update of Diffusion-QL (Wang, Hunt and Zhou 2022): docs/golden.md."""
+"""One update of Diffusion-QL (Wang, Hunt and Zhou 2022)."""
 
 import math
 

@@ -1,4 +1,4 @@
-//! Reads golden folders (docs/golden.md); shared by the tests of several crates.
+//! Reads golden folders (tests/golden/README.md); shared by the tests of several crates.
 
 use candle_core::{DType, Device, Tensor};
 use std::collections::BTreeMap;
@@ -69,7 +69,7 @@ pub fn goldens(algorithm: &str) -> Vec<Golden> {
     if let Some(folder) = std::env::var_os("GOLDEN_DIR") {
         let golden = Golden::open(folder.into());
         let (found, place) = (&golden.config["algorithm"], golden.folder.display());
-        assert_eq!(found, algorithm, "{place} is of another algorithm; name this one's tests, as docs/golden.md shows");
+        assert_eq!(found, algorithm, "{place} is of another algorithm; see tests/golden/README.md");
         return vec![golden];
     }
     let of_algorithm = |golden: &Golden| golden.config["algorithm"] == algorithm;

@@ -1,4 +1,4 @@
-"""One update of IQL (Kostrikov et al. 2021), equation numbers are its paper's: docs/golden.md."""
+"""One update of IQL (Kostrikov et al. 2021), equation numbers are its paper's."""
 
 import jax
 import jax.numpy as jnp

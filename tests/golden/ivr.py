@@ -1,4 +1,4 @@
-"""One update of IVR (Xu et al. 2023): SQL with the divergence `sparse`, EQL with `exponential`; docs/golden.md."""
+"""One update of IVR (Xu et al. 2023): SQL with the divergence `sparse`, EQL with `exponential`."""
 
 import jax
 import jax.numpy as jnp

@@ -4,8 +4,8 @@
     make.py --all      rewrites the committed folders, which stand beside this file
     make.py --check    checks that the committed folders are what it makes now
 
-Writes folders as docs/golden.md describes them. Nothing here is taken from the Rust side: it is written from the
-papers and that page.
+Writes folders as README.md beside this file describes them. Nothing here is taken from the Rust side: it is written from
+the papers and that page.
 """
 
 import argparse

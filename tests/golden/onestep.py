@@ -1,4 +1,4 @@
-"""One update of one-step RL (Brandfonbrener et al. 2021) in each of its three phases: docs/golden.md."""
+"""One update of one-step RL (Brandfonbrener et al. 2021) in each of its three phases."""
 
 import jax
 import jax.numpy as jnp

@@ -1,4 +1,4 @@
-"""One update of QUAD. Equation numbers are its paper's; where that is silent, the rules are DAC's (docs/golden.md)."""
+"""One update of QUAD. Equation numbers are its paper's; where that is silent, the rules are DAC's (docs/deviations.md)."""
 
 from typing import NamedTuple
 

@@ -1,4 +1,4 @@
-"""One update of XQL (Garg et al. 2023), with its extras in the variant `xql-extras`: docs/golden.md."""
+"""One update of XQL (Garg et al. 2023), with its extras in the variant `xql-extras`."""
 
 import jax
 import jax.numpy as jnp

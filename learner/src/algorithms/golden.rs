@@ -1,4 +1,4 @@
-//! What the golden tests of all algorithms share (docs/golden.md).
+//! What the golden tests of all algorithms share (tests/golden/README.md).
 
 #[path = "../../../tests/golden/golden.rs"]
 mod reader;

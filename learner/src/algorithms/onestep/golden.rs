@@ -1,4 +1,5 @@
-//! Tests: an update of each phase against an independent implementation (docs/golden.md), and what it learns from.
+//! Tests: an update of each phase against an independent implementation (tests/golden/README.md), and what it learns
+//! from.
 
 use super::*;
 use crate::algorithms::golden::{

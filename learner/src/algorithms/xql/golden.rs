@@ -1,4 +1,4 @@
-//! Tests: the update against an independent implementation (docs/golden.md).
+//! Tests: the update against an independent implementation (tests/golden/README.md).
 
 use super::*;
 use crate::algorithms::algorithm::Algorithm;
