@@ -15,6 +15,6 @@ cargo bench --locked --workspace --no-run
 cargo build --release --locked --workspace
 [ -e data/hopper-demo.hdf5 ] || target/release/evaluator collect --env hopper --out data/hopper-demo.hdf5
 # The peer must compute what the learner does.
-"$DEPS/venv/bin/python" -W ignore learner/benches/jax_step.py --check >&2
+"$DEPS/venv/bin/python" -W ignore algorithms/benches/jax_step.py --check >&2
 python3 deploy/bench/bench.py "${1:-5}"
 python3 deploy/bench/service.py

@@ -3,7 +3,7 @@
 #
 #   deploy/cuda.sh                 cargo build --release --locked -p quad-learner --features cuda
 #   deploy/cuda.sh COMMAND ...     another cargo command in the same environment, e.g.
-#                                  deploy/cuda.sh test --release -p quad-learner --features cuda golden
+#                                  deploy/cuda.sh test --release -p quad-algorithms --features cuda golden
 #
 # Takes the CUDA toolkit whose nvcc is on PATH; where there is none, fetches one into .deps/cuda, for x86_64. Building
 # needs no GPU, but the kernels are for one kind of them: CUDA_COMPUTE_CAP, by default 90, Hopper (H100, H200).

@@ -16,7 +16,7 @@ import subprocess
 import sys
 from pathlib import Path
 
-# Shapes, as in learner/benches/update.rs and evaluator/benches/rollout.rs.
+# Shapes, as in algorithms/benches/update.rs and evaluator/benches/rollout.rs.
 OBSERVATION, ACTION, TIME, STEPS, BATCH = 11, 3, 32, 5, 256
 CONFIGURATIONS = {
     "paper, 10 samples": {"hidden": 256, "critics": 10, "samples": 10, "predictions": 1},
@@ -139,7 +139,7 @@ def moment(jax, *benches):
 
 def measure(count):
     """{configuration: its rounds}, those of the evaluation as `rollout` and of the kernels as `kernels`."""
-    plain, tuned = Peer("learner/benches/jax_step.py"), Peer("learner/benches/jax_step.py", "--tuned")
+    plain, tuned = Peer("algorithms/benches/jax_step.py"), Peer("algorithms/benches/jax_step.py", "--tuned")
     rollout = Peer("evaluator/benches/jax_rollout.py")
     rounds = {name: [] for name in [*CONFIGURATIONS, *ALONE, "rollout", "kernels"]}
     for i in range(count):

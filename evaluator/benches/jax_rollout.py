@@ -15,7 +15,7 @@ import sys
 import time
 from pathlib import Path
 
-for folder in "tests/golden", "learner/benches":
+for folder in "tests/golden", "algorithms/benches":
     sys.path.insert(0, str(Path(__file__).parents[2] / folder))
 
 import gymnasium

@@ -8,7 +8,7 @@ use clap::{Args, CommandFactory, Parser, Subcommand};
 use clap_complete::Shell;
 use quad_dataset::EnvironmentSpec;
 use quad_dataset::environment;
-use quad_service::{Hint, print};
+use quad_runtime::{Hint, print};
 
 use crate::doctor::{self, DoctorArgs};
 use crate::serve::{self, ServeArgs};

@@ -6,8 +6,8 @@ use std::time::Duration;
 use clap::Args;
 use quad_policy::Precision;
 use quad_protocol::{JobReply, JobRequest, Name, PROTOCOL_VERSION, decode_from, encode, keys};
-use quad_service::doctor::{self, Findings};
-use quad_service::{Endpoints, Role, default_endpoint, parse_endpoint};
+use quad_runtime::doctor::{self, Findings};
+use quad_runtime::{Endpoints, Role, default_endpoint, parse_endpoint};
 use zenoh::Session;
 
 use crate::serve::DEFAULT_PORT;

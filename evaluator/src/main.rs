@@ -7,5 +7,5 @@ use quad_evaluator::cli::Cli;
 
 fn main() -> ExitCode {
     let cli = Cli::parse();
-    quad_service::run_main(quad_service::init_logging(), || cli.run())
+    quad_runtime::run_main(quad_runtime::init_logging(), || cli.run())
 }

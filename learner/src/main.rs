@@ -6,7 +6,7 @@ use clap::Parser;
 use quad_learner::cli::Cli;
 
 fn main() -> ExitCode {
-    quad_service::choose_threads();
+    quad_runtime::choose_threads();
     let cli = Cli::parse();
-    quad_service::run_main(quad_service::init_logging(), || quad_learner::command::run(&cli))
+    quad_runtime::run_main(quad_runtime::init_logging(), || quad_learner::command::run(&cli))
 }

@@ -10,7 +10,7 @@ use pyo3::exceptions::{PyRuntimeError, PyValueError};
 use pyo3::prelude::*;
 use quad_evaluator::serve::{ServeArgs, serve};
 use quad_evaluator::sim::{Environment, EnvironmentError, Environments, Simulations, Step};
-use quad_service::init_logging;
+use quad_runtime::init_logging;
 
 /// What Python's object can make environments of.
 struct PythonEnvironments {

@@ -6,7 +6,7 @@ use std::time::Duration;
 
 use anyhow::Context;
 use quad_protocol::{Name, keys};
-use quad_service::{Certificates, Endpoints, open_session};
+use quad_runtime::{Certificates, Endpoints, open_session};
 use tokio::sync::watch;
 use tokio::task::JoinSet;
 use tracing::{info, warn};

@@ -5,7 +5,7 @@ use std::time::Duration;
 
 use quad_policy::{Policy, Precision};
 use quad_protocol::{EpisodeScore, Hash, Job, Name, ScoreReport};
-use quad_service::Beat;
+use quad_runtime::Beat;
 use tracing::info;
 
 use super::client::RunClient;
@@ -117,7 +117,7 @@ mod tests {
     use std::sync::atomic::{AtomicU32, Ordering::Relaxed};
 
     use quad_policy::{EpisodeState, PolicyError};
-    use quad_service::Health;
+    use quad_runtime::Health;
 
     use super::super::fixtures::job;
     use super::*;

@@ -37,7 +37,7 @@ use anyhow::Context;
 use clap::Args;
 use quad_policy::Precision;
 use quad_protocol::Name;
-use quad_service::{
+use quad_runtime::{
     BindError, Certificates, CertificatesError, Endpoints, Health, Hint, Role, SessionError, default_endpoint,
     parse_endpoint,
 };
@@ -110,7 +110,7 @@ pub fn serve(args: ServeArgs, environments: Arc<dyn Environments>) -> anyhow::Re
 }
 
 async fn serve_until_stopped(args: ServeArgs, environments: Arc<dyn Environments>) -> anyhow::Result<()> {
-    let stop = quad_service::shutdown_signal();
+    let stop = quad_runtime::shutdown_signal();
     let metrics = Metrics::new().context("cannot register the metrics")?;
     let name = args.name.map_or_else(unique_name, Ok)?;
     let endpoints = endpoints(args.connect, args.certificates.as_deref())?;
@@ -123,7 +123,7 @@ async fn serve_until_stopped(args: ServeArgs, environments: Arc<dyn Environments
     let _server = match args.metrics {
         Some(address) => {
             let server =
-                quad_service::serve_metrics(address, metrics.registry.clone(), health.clone(), Default::default())
+                quad_runtime::serve_metrics(address, metrics.registry.clone(), health.clone(), Default::default())
                     .await
                     .hint_of(BindError::hint)?;
             info!("metrics at http://{}/metrics", server.address);

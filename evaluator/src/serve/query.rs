@@ -121,7 +121,7 @@ mod tests {
     use std::time::Instant;
 
     use quad_protocol::JobReply;
-    use quad_service::{Endpoints, open_session, reachable_at};
+    use quad_runtime::{Endpoints, open_session, reachable_at};
 
     use super::*;
 

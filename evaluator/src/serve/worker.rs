@@ -145,7 +145,7 @@ mod tests {
 
     use quad_policy::Precision;
     use quad_protocol::Name;
-    use quad_service::Health;
+    use quad_runtime::Health;
 
     use super::*;
     use crate::sim::Simulations;

@@ -12,7 +12,7 @@ use quad_policy::{
 use quad_protocol::{
     Hash, Job, JobReply, JobRequest, Message, Name, Origin, ScoreReply, ScoreReport, Snapshot, decode, encode, keys,
 };
-use quad_service::{Endpoints, open_session, reachable_at};
+use quad_runtime::{Endpoints, open_session, reachable_at};
 use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;
 use zenoh::liveliness::LivelinessToken;

@@ -9,10 +9,9 @@ use std::path::PathBuf;
 use clap::{Args, Parser, Subcommand};
 use clap_complete::Shell;
 use quad_dataset::{EnvironmentSpec, environment};
-use quad_service::parse_endpoint;
-
-use crate::config::{hyperparameters, presets, tasks};
-use crate::report::Select;
+use quad_runs::config::{hyperparameters, presets, tasks};
+use quad_runs::results::Select;
+use quad_runtime::parse_endpoint;
 
 pub use sweep::{Shard, SweepArgs};
 pub use train::TrainArgs;
@@ -204,5 +203,4 @@ fn parse_algorithm(text: &str) -> Result<String, String> {
 }
 
 #[cfg(test)]
-#[path = "../../tests/unit/cli.rs"]
 mod tests;

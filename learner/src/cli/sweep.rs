@@ -3,7 +3,7 @@
 use std::path::PathBuf;
 
 use clap::{Args, value_parser};
-use quad_service::parse_endpoint;
+use quad_runtime::parse_endpoint;
 
 pub(super) const EXAMPLES: &str = "\
 Examples:
@@ -77,5 +77,4 @@ fn parse_shard(text: &str) -> Result<Shard, String> {
 }
 
 #[cfg(test)]
-#[path = "../../tests/unit/cli/sweep.rs"]
 mod tests;

@@ -6,12 +6,12 @@ use std::path::PathBuf;
 
 use clap::{Args, value_parser};
 use quad_policy::Precision;
-use quad_service::parse_endpoint;
+use quad_runs::config::Device;
+use quad_runs::config::tables::{self, parse_assignment};
+use quad_runtime::parse_endpoint;
 use toml::{Table, Value};
 
 use super::{parse_algorithm, parse_preset, parse_task};
-use crate::config::Device;
-use crate::config::tables::{self, parse_assignment};
 
 pub(super) const EXAMPLES: &str = "\
 Examples:
@@ -158,5 +158,4 @@ impl TrainArgs {
 }
 
 #[cfg(test)]
-#[path = "../../tests/unit/cli/train.rs"]
 mod tests;

@@ -1,8 +1,8 @@
 //! `learner doctor`: checks a machine before a run is started on it.
 
 use quad_policy::Precision;
-use quad_service::doctor::{self, Findings};
-use quad_service::{Endpoints, Role};
+use quad_runtime::doctor::{self, Findings};
+use quad_runtime::{Endpoints, Role};
 
 use crate::cli::DoctorArgs;
 use crate::data;

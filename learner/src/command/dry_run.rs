@@ -5,9 +5,9 @@ use std::path::Path;
 
 use indicatif::HumanBytes;
 use quad_dataset::Transitions;
-use quad_service::print;
+use quad_runs::config::RunConfig;
+use quad_runtime::print;
 
-use crate::config::RunConfig;
 use crate::train::Price;
 
 /// Measures the cost and prints the file.

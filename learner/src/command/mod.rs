@@ -11,19 +11,21 @@ use std::fmt::Alignment::{Left, Right};
 
 use clap::CommandFactory;
 use clap_complete::Shell;
+use quad_algorithms::{ALGORITHMS, Values};
 use quad_dataset::{DatasetError, environment};
-use quad_service::{Hint, hinted, print};
+use quad_runs::config::hyperparameters;
+use quad_runs::config::{Preset, tasks};
+use quad_runs::run::{RunDirError, runs_in, verify};
+use quad_runs::status::list;
+use quad_runs::table::{Style, Table};
+use quad_runtime::{Hint, hinted, print};
 use tracing::{info, warn};
 
-use crate::algorithms::ALGORITHMS;
 use crate::cli::{
     Cli, Command, DatasetsCommand, DoctorArgs, InspectArgs, ListArgs, PresetsArgs, ReportArgs, VerifyArgs,
 };
-use crate::config::hyperparameters::{self, Values};
-use crate::config::{Preset, tasks};
 use crate::data::{Source, cache};
-use crate::report::{Report, Style, Table, draw_all, export_all, list, runs_in, write_html};
-use crate::run::{RunDirError, verify};
+use crate::report::{Report, draw_all, export_all, write_html};
 
 /// Runs the command.
 ///

@@ -2,11 +2,11 @@
 
 use std::thread::available_parallelism;
 
-use quad_service::{Certificates, CertificatesError, Endpoints, Hint, Role, SessionError, default_endpoint};
+use quad_runtime::{Certificates, CertificatesError, Endpoints, Hint, Role, SessionError, default_endpoint};
 use tracing::{info, warn};
 
 use crate::cli::TrainArgs;
-use crate::service::{LocalEvaluators, Opening, open_network};
+use crate::live::{LocalEvaluators, Opening, open_network};
 
 /// The port at which evaluators look by default.
 const DEFAULT_PORT: u16 = 7447;

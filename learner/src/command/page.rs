@@ -1,7 +1,7 @@
 //! `learner page`: serves the page of all runs until it is told to stop.
 
 use anyhow::anyhow;
-use quad_service::{Health, Hint, hinted, serve_metrics, shutdown_signal};
+use quad_runtime::{Health, Hint, hinted, serve_metrics, shutdown_signal};
 use tracing::info;
 
 use crate::cli::PageArgs;

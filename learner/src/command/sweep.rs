@@ -8,13 +8,14 @@ use std::path::{Path, PathBuf};
 use std::thread::available_parallelism;
 
 use anyhow::{Context, anyhow};
-use quad_service::{Hint, SessionError, hinted, open_router, print, stay_in_background, unfinished};
+use quad_runs::status::State;
+use quad_runs::table::{Style, Table};
+use quad_runtime::{Hint, SessionError, hinted, open_router, print, stay_in_background, unfinished};
 use tracing::info;
 
 use super::train::record_hint;
 use crate::cli::SweepArgs;
-use crate::report::{State, Style, Table};
-use crate::service::LocalEvaluators;
+use crate::live::LocalEvaluators;
 use crate::sweep::{Cost, Ended, PlannedRun, Study, Sweep};
 
 /// Runs and their states.

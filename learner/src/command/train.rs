@@ -9,19 +9,21 @@ use anyhow::{Context, anyhow};
 use quad_dataset::{Transitions, environment};
 use quad_policy::Precision;
 use quad_protocol::Name;
-use quad_service::{BindError, Health, Hint, hinted, print, stay_in_background, unfinished};
+use quad_runs::config::{DatasetInfo, Experiment, Preset, RunConfig, RunInfo, hyperparameters};
+use quad_runs::results::RunReport;
+use quad_runs::run::{self, Begun, Log, Past, RunDir};
+use quad_runtime::{BindError, Health, Hint, hinted, print, stay_in_background, unfinished};
 use tokio::sync::mpsc;
 use tracing::{debug, info, warn};
 
 use super::dry_run;
 use super::outside::Outside;
 use crate::cli::TrainArgs;
-use crate::config::{DatasetInfo, Experiment, Preset, RunConfig, RunInfo, hyperparameters};
 use crate::data::{LocalDataset, Source, load};
+use crate::live::{Display, Ending, Life, Live, MainLoop, Metrics, Run, STUCK, Threads};
 use crate::page;
-use crate::report::{RunReport, of_run};
-use crate::run::{self, Begun, Log, Past, RunDir};
-use crate::service::{Display, Ending, Life, Live, MainLoop, Metrics, Run, STUCK, Threads};
+use crate::report::of_run;
+use crate::train::device;
 
 /// Default limit of training threads: a gradient step of the paper is cut into tiles (twenty with one next action per state),
 /// and threads that wait for a tile keep their cores busy.
@@ -44,7 +46,7 @@ pub fn train(args: &TrainArgs) -> anyhow::Result<()> {
     let begun = run::open(&path, args.fresh)?;
     let outside = Outside::new(args, experiment.eval_interval)?;
 
-    args.device.check(experiment.precision)?;
+    device::check(args.device, experiment.precision)?;
     let dataset = source.obtain().hint(record_hint(&experiment))?;
 
     start_pool(args.threads)?;
@@ -118,7 +120,7 @@ async fn run_to_its_end(
     let live = Live::new(name.clone(), steps, metrics.clone(), health.clone());
     let telling = live.clone();
     let page = page::routes(path.to_owned(), Some(Arc::new(move || telling.tell())))?;
-    let server = quad_service::serve_metrics(args.metrics, registry, health.clone(), page).await;
+    let server = quad_runtime::serve_metrics(args.metrics, registry, health.clone(), page).await;
     let server = server.hint_of(BindError::hint)?;
     info!("page: http://{}/", server.address);
     let opening = outside.open().await?;

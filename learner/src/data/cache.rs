@@ -5,7 +5,7 @@ use std::path::{Path, PathBuf};
 use anyhow::anyhow;
 use indicatif::HumanBytes;
 use quad_dataset::{NamedDataset, catalogue};
-use quad_service::Hint;
+use quad_runtime::Hint;
 
 use super::partial::left_of;
 

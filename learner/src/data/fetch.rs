@@ -7,7 +7,7 @@ use std::time::Duration;
 
 use anyhow::{Error, anyhow};
 use quad_dataset::NamedDataset;
-use quad_service::{Hint, Progress, hinted};
+use quad_runtime::{Hint, Progress, hinted};
 use ureq::Agent;
 
 use super::partial::Partial;
@@ -15,7 +15,6 @@ use super::transfer::{Failure, client, transfer};
 use super::verify::verify;
 
 #[cfg(test)]
-#[path = "../../tests/unit/data/fetch.rs"]
 mod tests;
 
 /// Attempts at one address, if none of them brings the file forward.

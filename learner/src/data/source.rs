@@ -4,12 +4,12 @@ use std::path::{Path, PathBuf};
 
 use anyhow::{Context, anyhow};
 use quad_dataset::{DatasetError, NamedDataset, catalogue, environment};
-use quad_service::Hint;
+use quad_runs::config::did_you_mean;
+use quad_runtime::Hint;
 
 use super::cache;
 use super::fetch::{Fetcher, LocalDataset};
 use super::verify::sha256;
-use crate::config::did_you_mean;
 
 /// A lab's own mirror: the address of a folder that is tried before the catalogue's.
 const MIRROR: &str = "QUAD_DATASETS_URL";
@@ -102,5 +102,4 @@ fn local(path: PathBuf) -> anyhow::Result<LocalDataset> {
 }
 
 #[cfg(test)]
-#[path = "../../tests/unit/data/source.rs"]
 mod tests;

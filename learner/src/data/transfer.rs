@@ -3,7 +3,7 @@
 use std::io::{self, Read};
 use std::time::Duration;
 
-use quad_service::Progress;
+use quad_runtime::Progress;
 use ureq::http::{Response, StatusCode};
 use ureq::{Agent, Body, Error};
 

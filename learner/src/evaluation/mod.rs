@@ -6,7 +6,7 @@
 //! another evaluator, unless that has happened too often. For each (step, seed) only the first delivered score counts,
 //! whichever evaluator delivers it.
 //!
-//! It has no thread: the module `service` calls it behind a lock, for microseconds. The current time is an argument, so tests
+//! It has no thread: the module `live` calls it behind a lock, for microseconds. The current time is an argument, so tests
 //! have a clock of their own.
 //!
 //! In reading order: `scoreboard`, `outcomes` (its arguments and results), `episodes` (one evaluation), `jobs` (which
@@ -18,11 +18,10 @@ mod outcomes;
 mod refusal;
 mod scoreboard;
 #[cfg(test)]
-#[path = "../../tests/unit/evaluation/mod.rs"]
 pub(crate) mod tests;
 mod validate;
 
-pub(crate) use outcomes::{Claim, Claimed, Earlier, HandedBack, Lost, OtherWeights};
+pub(crate) use outcomes::{Claim, Claimed, HandedBack, Lost, OtherWeights};
 pub(crate) use refusal::Refusal;
 pub(crate) use scoreboard::{Rules, Scoreboard};
 pub(crate) use validate::Validated;

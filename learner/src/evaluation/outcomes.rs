@@ -4,15 +4,6 @@ use std::time::Duration;
 
 use quad_protocol::{EpisodeScore, Hash, Job, Name};
 
-/// The scores of one step that an earlier life of the learner wrote down.
-#[derive(Clone, Debug, PartialEq)]
-pub(crate) struct Earlier {
-    /// Hash of the snapshot that was scored, as text.
-    pub weights: String,
-    /// Each seed once.
-    pub episodes: Vec<EpisodeScore>,
-}
-
 /// Training has come by a step again, and its weights are not those that were scored.
 #[derive(Clone, Debug, PartialEq, thiserror::Error)]
 #[error("the weights of step {step} are {found}, but {scored} were scored before")]

@@ -5,10 +5,11 @@ use std::time::{Duration, Instant};
 
 use quad_dataset::Task;
 use quad_protocol::{EpisodeScore, Hash, Job, Name, Progress, ScoreReport};
+use quad_runs::run::Earlier;
 
 use super::episodes::Evaluation;
 use super::jobs::{OpenJob, OpenJobs};
-use super::outcomes::{Claim, Claimed, Earlier, HandedBack, Lost, OtherWeights, Recorded};
+use super::outcomes::{Claim, Claimed, HandedBack, Lost, OtherWeights, Recorded};
 use super::refusal::{Refusal, require};
 
 /// After this time an evaluator asks again when there was no job for it, or after this time for each evaluator that there is

@@ -4,9 +4,8 @@ use std::collections::BTreeMap;
 use std::io;
 use std::path::PathBuf;
 
+use quad_runs::run::new_lines;
 use serde::{Serialize, Serializer};
-
-use crate::run::new_lines;
 
 /// Most rows that are kept: more than a chart has pixels for. Even, so that pairs of rows can become one.
 const MOST_ROWS: usize = 500;
@@ -118,5 +117,4 @@ fn rounded(value: f64) -> Option<f64> {
 }
 
 #[cfg(test)]
-#[path = "../../tests/unit/page/history.rs"]
 mod tests;

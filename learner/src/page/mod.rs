@@ -92,5 +92,4 @@ impl Site {
 }
 
 #[cfg(test)]
-#[path = "../../tests/unit/page/mod.rs"]
 mod tests;

@@ -6,14 +6,15 @@ use std::sync::mpsc::Receiver;
 use std::time::{Duration, Instant};
 
 use axum::body::Bytes;
-use quad_service::stay_in_background;
+use quad_algorithms::Metric;
+use quad_runs::results::RunReport;
+use quad_runs::run::RunDir;
+use quad_runs::status::list;
+use quad_runtime::stay_in_background;
 use serde_json::{Value, json};
 use tokio::sync::oneshot;
 
 use super::history::History;
-use crate::algorithms::Metric;
-use crate::report::{RunReport, list};
-use crate::run::RunDir;
 
 /// However often browsers ask, a run is read no more often than this.
 const RUN_EVERY: Duration = Duration::from_secs(1);

@@ -4,15 +4,15 @@ use std::collections::BTreeMap;
 use std::path::Path;
 
 use anyhow::Context;
-use quad_service::Hint;
+use quad_runs::config::settings::{self, Settings};
+use quad_runs::results::RunReport;
+use quad_runs::results::statistics::{self, Estimate, Runs};
+use quad_runtime::Hint;
 
 use super::plot::{Line, Picture};
-use super::run::RunReport;
 use super::seeds::GroupReport;
-use super::statistics::{self, Estimate, Runs};
 use super::study::MethodReport;
 use super::summary::Report;
-use crate::config::settings::{self, Settings};
 
 const FOLDER: &str = "--figures names a folder that you may write in";
 const TAU: &str = "agent.tau";

@@ -7,16 +7,16 @@ use anyhow::Context;
 use base64::prelude::{BASE64_STANDARD, Engine};
 use minijinja::Environment;
 use minijinja::value::Serde;
+use quad_runs::results::RunReport;
+use quad_runs::results::lambda::LambdaReport;
+use quad_runs::table::Part;
 use serde::Serialize;
 
 use super::figures;
-use super::lambda::LambdaReport;
 use super::plot;
 use super::remake;
-use super::run::RunReport;
 use super::seeds::GroupReport;
 use super::summary::Report;
-use super::table::Part;
 
 /// Pictures of an episode that a run's folder may hold, with their media types: `evaluator film RUN --out RUN/film.gif`.
 const FILMS: [(&str, &str); 2] = [("film.png", "image/png"), ("film.gif", "image/gif")];

@@ -2,11 +2,11 @@
 
 use std::fmt::Alignment::{Left, Right};
 
-use super::published::{Published, Remark};
+use quad_runs::results::published::{Published, Remark};
+use quad_runs::results::{Select, Spread};
+use quad_runs::table::{Part, Table};
+
 use super::seeds::GroupReport;
-use super::selection::Select;
-use super::spread::Spread;
-use super::table::{Part, Table};
 
 /// What the paper prints for a task.
 type Figure<'a> = (&'a str, &'a Published);

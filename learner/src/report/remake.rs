@@ -1,10 +1,9 @@
 //! The command that makes a run again.
 
-use crate::config::settings::{self, differences};
-use crate::config::tables::parse_assignment;
-
-use super::departures::as_given;
-use super::run::RunReport;
+use quad_runs::config::settings::{self, differences};
+use quad_runs::config::tables::parse_assignment;
+use quad_runs::results::RunReport;
+use quad_runs::results::departures::as_given;
 
 /// `learner train` with all that decides the outcome of the run. Nothing if what the run began from is no task of this
 /// learner's, but a file of its user's, or lacks a value that its task has.
@@ -50,5 +49,4 @@ pub fn quoted(word: &str) -> String {
 }
 
 #[cfg(test)]
-#[path = "../../tests/unit/report/remake.rs"]
 mod tests;

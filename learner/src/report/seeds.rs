@@ -4,15 +4,13 @@ use std::collections::BTreeSet;
 use std::path::PathBuf;
 
 use quad_dataset::{Goal, environment};
+use quad_runs::config::Device;
+use quad_runs::config::settings::{self, Settings, differences};
+use quad_runs::results::departures::{as_given, departures};
+use quad_runs::results::published::{self, Published};
+use quad_runs::results::run::{RunReport, joined};
+use quad_runs::results::{Select, Spread};
 use serde::Serialize;
-
-use super::departures::{as_given, departures};
-use super::published::{self, Published};
-use super::run::{RunReport, joined};
-use super::selection::Select;
-use super::spread::Spread;
-use crate::config::Device;
-use crate::config::settings::{self, Settings, differences};
 
 /// Runs that differ in their seed alone: in task, data, device and every hyper-parameter they agree, and in how far they have
 /// come. The precision in which evaluators scored them may differ; it is named.

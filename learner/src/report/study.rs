@@ -3,11 +3,11 @@
 use std::collections::BTreeSet;
 use std::fmt::Alignment::{Left, Right};
 
+use quad_runs::results::statistics::{self, Estimate, RESAMPLES, Runs};
+use quad_runs::table::{Part, Table};
 use serde::Serialize;
 
 use super::seeds::GroupReport;
-use super::statistics::{self, Estimate, RESAMPLES, Runs};
-use super::table::{Part, Table};
 
 /// A method over all its tasks with D4RL-normalised scores, or over one task without references.
 #[derive(Clone, Debug, PartialEq, Serialize)]

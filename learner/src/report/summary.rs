@@ -2,19 +2,16 @@
 
 use std::collections::BTreeSet;
 use std::fmt::Alignment::{Left, Right};
-use std::io;
-use std::path::{Path, PathBuf};
+use std::path::PathBuf;
 
+use quad_runs::results::{RunReport, Select, Spread};
+use quad_runs::run::runs_in;
+use quad_runs::table::{Part, Style, Table};
 use serde::Serialize;
 
 use super::paper;
-use super::run::RunReport;
 use super::seeds::{self, GroupReport};
-use super::selection::Select;
-use super::spread::Spread;
 use super::study::{self, Comparison, MethodReport};
-use super::table::{Part, Style, Table};
-use crate::run::RunDir;
 
 /// What `learner report` says.
 #[derive(Clone, Debug, PartialEq, Serialize)]
@@ -127,22 +124,4 @@ impl Report {
         parts.extend((!marked.is_empty()).then(|| Part::Words(marked.concat())));
         parts
     }
-}
-
-/// A folder that holds a run, or those of such folders at any depth below it, in alphabetical order.
-pub fn runs_in(path: &Path) -> Vec<PathBuf> {
-    walk(path, &mut |_, _| {})
-}
-
-/// The same; folders that cannot be read are handed to `unreadable`.
-pub fn walk(path: &Path, unreadable: &mut impl FnMut(&Path, io::Error)) -> Vec<PathBuf> {
-    if RunDir::is_occupied(path) {
-        return vec![path.to_owned()];
-    }
-    let entries = std::fs::read_dir(path).map_err(|error| unreadable(path, error));
-    // Links are not followed: they may lead back.
-    let entries = entries.into_iter().flatten().flatten();
-    let folders = entries.filter(|entry| entry.file_type().is_ok_and(|kind| kind.is_dir())).map(|entry| entry.path());
-    let folders: BTreeSet<PathBuf> = folders.collect();
-    folders.iter().flat_map(|folder| walk(folder, unreadable)).collect()
 }

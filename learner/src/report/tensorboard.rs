@@ -7,10 +7,9 @@ use std::path::{Path, PathBuf};
 use std::time::{Duration, SystemTime, UNIX_EPOCH};
 
 use anyhow::{Context, anyhow};
-use quad_service::hinted;
-
-use super::run::{EvaluationReport, RunReport};
-use crate::run::new_lines;
+use quad_runs::results::run::{EvaluationReport, RunReport};
+use quad_runs::run::new_lines;
+use quad_runtime::hinted;
 
 /// What the name of an event file begins with, by which TensorBoard finds it.
 const PREFIX: &str = "events.out.tfevents.";
@@ -206,5 +205,4 @@ fn checksum(bytes: &[u8]) -> [u8; 4] {
 }
 
 #[cfg(test)]
-#[path = "../../tests/unit/report/tensorboard.rs"]
 mod tests;

@@ -1,8 +1,7 @@
 //! The axes of a study: lists of values, which are combined.
 
+use quad_runs::config::tables;
 use toml::{Table, Value};
-
-use crate::config::tables;
 
 /// One axis.
 #[derive(Clone, Debug, PartialEq)]

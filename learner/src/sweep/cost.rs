@@ -6,11 +6,11 @@ use std::time::Duration;
 
 use anyhow::Context;
 use indicatif::{HumanBytes, HumanDuration};
+use quad_runs::config::{Device, settings};
+use quad_runs::status::State;
 
 use super::study::PlannedRun;
-use crate::config::{Device, settings};
 use crate::data::load;
-use crate::report::State;
 use crate::train::Price;
 
 /// Most configurations that are; further ones are taken to cost as much as these on average.

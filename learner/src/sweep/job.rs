@@ -5,13 +5,13 @@ use std::path::{Path, PathBuf};
 use std::process::{Child, Command};
 
 use anyhow::Context;
+use quad_runs::config::tables;
+use quad_runs::run::RunDir;
+use quad_runs::status::State;
 use rustix::process::{Pid, Signal, kill_process};
 
 use super::study::PlannedRun;
-use crate::config::tables;
-use crate::report::State;
-use crate::run::RunDir;
-use crate::service::{not_encrypted, spawn_logged};
+use crate::live::{not_encrypted, spawn_logged};
 
 /// What a learner says by its exit code: the run is not complete, and the same command goes on.
 const UNFINISHED: i32 = 75;

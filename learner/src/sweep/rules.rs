@@ -1,10 +1,10 @@
 //! Which combinations of a study's axes are runs.
 
+use quad_algorithms::fits;
+use quad_runs::config::tables;
 use toml::{Table, Value};
 
 use super::axes::Combination;
-use crate::config::hyperparameters::fits;
-use crate::config::tables;
 
 /// What a study says of combinations. A rule has a value, or a list of values, for some axes; `*` stands for any letters.
 pub(super) struct Rules<'a> {

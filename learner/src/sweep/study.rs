@@ -5,17 +5,18 @@ use std::path::Path;
 
 use anyhow::{Context, anyhow, ensure};
 use quad_protocol::Name;
-use quad_service::{Hint, hinted, hints};
+use quad_runs::config::{Experiment, Preset, did_you_mean, settings, tables};
+use quad_runs::results::RunReport;
+use quad_runs::run::RunDir;
+use quad_runs::status::State;
+use quad_runtime::{Hint, hinted, hints};
 use serde::Deserialize;
 use toml::{Table, Value};
 
 use super::axes::{Combination, axes, combinations};
 use super::names;
 use super::rules::Rules;
-use crate::config::{Experiment, Preset, did_you_mean, settings, tables};
 use crate::data::Source;
-use crate::report::{RunReport, State};
-use crate::run::RunDir;
 
 /// Keys that are no keys of an experiment: the first two say what a run begins from, the third names a table of changes.
 const BEGIN: [&str; 2] = ["task", "preset"];
@@ -225,5 +226,4 @@ fn some_of(names: &[String]) -> String {
 }
 
 #[cfg(test)]
-#[path = "../../tests/unit/sweep/study.rs"]
 mod tests;

@@ -6,13 +6,13 @@ use std::pin::pin;
 use std::time::{Duration, Instant};
 
 use indicatif::HumanDuration;
+use quad_runs::status::{Progress, State};
 use tokio::time::interval;
 
 use super::display::Display;
 use super::job::{End, Job};
 use super::study::PlannedRun;
-use crate::report::{Progress, State};
-use crate::service::LocalEvaluators;
+use crate::live::LocalEvaluators;
 
 /// How often it looks whether a learner has ended.
 const GLANCE: Duration = Duration::from_millis(100);
@@ -59,7 +59,7 @@ struct Floor {
 impl Sweep {
     /// Runs all, or, at SIGINT or SIGTERM, lets those at work save what they have.
     pub async fn run(mut self) -> Ended {
-        let mut shutdown = pin!(quad_service::shutdown_signal());
+        let mut shutdown = pin!(quad_runtime::shutdown_signal());
         let mut ticker = interval(GLANCE);
         let mut floor = Floor {
             at_work: Vec::new(),

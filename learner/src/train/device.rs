@@ -2,32 +2,29 @@
 
 use anyhow::{Context, anyhow};
 use quad_policy::Precision;
-use quad_service::Hint;
+use quad_runs::config::Device;
+use quad_runtime::Hint;
 
-use crate::config::Device;
-
-impl Device {
-    /// That the device is there and can compute with this precision.
-    ///
-    /// # Errors
-    /// It is not, or it cannot.
-    pub fn check(self, precision: Precision) -> anyhow::Result<()> {
-        match (self, precision) {
-            (Self::Cpu, _) => Ok(()),
-            (Self::Cuda, Precision::F32) => gpu().map(drop),
-            (Self::Cuda, _) => Err(anyhow!("on a GPU the update computes in f32 only")).hint("use --precision f32"),
-        }
+/// That the device is there and can compute with this precision.
+///
+/// # Errors
+/// It is not, or it cannot.
+pub(crate) fn check(device: Device, precision: Precision) -> anyhow::Result<()> {
+    match (device, precision) {
+        (Device::Cpu, _) => Ok(()),
+        (Device::Cuda, Precision::F32) => gpu().map(drop),
+        (Device::Cuda, _) => Err(anyhow!("on a GPU the update computes in f32 only")).hint("use --precision f32"),
     }
+}
 
-    /// The device, as candle knows it.
-    ///
-    /// # Errors
-    /// There is no such device here.
-    pub fn open(self) -> anyhow::Result<candle_core::Device> {
-        match self {
-            Self::Cpu => Ok(candle_core::Device::Cpu),
-            Self::Cuda => gpu(),
-        }
+/// The device, as candle knows it.
+///
+/// # Errors
+/// There is no such device here.
+pub(crate) fn open(device: Device) -> anyhow::Result<candle_core::Device> {
+    match device {
+        Device::Cpu => Ok(candle_core::Device::Cpu),
+        Device::Cuda => gpu(),
     }
 }
 
@@ -40,5 +37,4 @@ fn gpu() -> anyhow::Result<candle_core::Device> {
 }
 
 #[cfg(test)]
-#[path = "../../tests/unit/train/device.rs"]
 mod tests;

@@ -7,8 +7,7 @@ use prometheus::{
     Counter, Gauge, GaugeVec, Histogram, HistogramOpts, IntCounter, IntCounterVec, IntGauge, IntGaugeVec, Opts,
     Registry, exponential_buckets,
 };
-
-use crate::algorithms::Metric;
+use quad_algorithms::Metric;
 
 /// Shortest gradient step that the histogram tells apart, and how many doublings follow it: 1 ms to 2 s.
 const SHORTEST_STEP: f64 = 1e-3;

@@ -2,22 +2,19 @@
 //!
 //! All of it runs on the thread `training` (with rayon's pool for the arithmetic). That thread never waits for a network or a
 //! metric, and for the disk only if far too much output is unwritten: it puts its output into the [`Outbox`], from which the
-//! thread `snapshots` takes it. The module `service` starts it.
+//! thread `snapshots` takes it. The module `live` starts it.
 //!
 //! In reading order: `training` (the thread's work), `steps` (the loop), `agent` (an algorithm at work, saved and loaded),
 //! `device` (where it computes), `pool` (rayon's threads kept awake), `results`, `outbox`, `metrics`. Beside them, `price`
 //! estimates what a run costs, on its caller's thread.
 
-pub mod agent;
-mod device;
+pub(crate) mod device;
 mod metrics;
 mod outbox;
-mod pool;
 mod price;
 mod results;
 mod steps;
 #[cfg(test)]
-#[path = "../../tests/unit/train.rs"]
 mod tests;
 mod training;
 

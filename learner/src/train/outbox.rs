@@ -10,10 +10,10 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError};
 use std::time::Duration;
 
-use quad_service::Beat;
+use quad_runs::run::Checkpoint;
+use quad_runtime::Beat;
 
 use super::results::{Outcome, Row, TrainedPolicy};
-use crate::run::Checkpoint;
 
 /// Most bytes of snapshots that wait for the disk: forty of the paper's size.
 const MOST_BYTES: usize = 256 << 20;

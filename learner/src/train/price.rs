@@ -3,13 +3,13 @@
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
+use quad_algorithms::{Agent, Context};
 use quad_dataset::{BatchSampler, Transitions};
 use quad_protocol::Origin;
+use quad_runs::config::{Device, Experiment};
+use quad_runs::run::Checkpoint;
 
-use super::agent::Agent;
-use crate::algorithms::Context;
-use crate::config::{Device, Experiment};
-use crate::run::Checkpoint;
+use super::device;
 
 /// How long steps are measured.
 const MEASURED: Duration = Duration::from_secs(1);
@@ -38,7 +38,7 @@ impl Price {
             total_steps: experiment.steps,
             seed: experiment.seed,
             precision: experiment.precision,
-            device: device.open()?,
+            device: device::open(device)?,
         };
         let mut agent = Agent::new(experiment.definition()?, &experiment.agent, context)?;
         let mut sampler = BatchSampler::new(agent.items(), batch_size, experiment.seed, 0);

@@ -1,9 +1,8 @@
 //! What training gives.
 
+use quad_algorithms::Metric;
 use serde::ser::SerializeMap;
 use serde::{Serialize, Serializer};
-
-use crate::algorithms::Metric;
 
 /// The policy after a gradient step.
 #[derive(Debug)]

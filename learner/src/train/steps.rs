@@ -3,19 +3,18 @@
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant};
 
+use quad_algorithms::{Agent, AlgorithmError, Metric};
 use quad_dataset::BatchSampler;
 use quad_policy::PolicyError;
 use quad_protocol::Origin;
-use quad_service::Beat;
+use quad_runs::config::Schedule;
+use quad_runs::run::Checkpoint;
+use quad_runtime::Beat;
 use tracing::debug;
 
-use super::agent::Agent;
 use super::metrics::TrainingMetrics;
 use super::outbox::Outbox;
 use super::results::{Outcome, Row, TrainedPolicy};
-use crate::algorithms::{AlgorithmError, Metric};
-use crate::config::Schedule;
-use crate::run::Checkpoint;
 
 /// Gradient steps that a line of `metrics.jsonl` averages over.
 const STEPS_PER_ROW: u64 = 100;
@@ -123,7 +122,8 @@ fn hand_over_policy(agent: &mut Agent, schedule: Schedule, outlets: &Outlets<'_>
     let evaluate = schedule.is_evaluated(step);
     if evaluate || step == schedule.steps {
         debug!(step, "snapshot");
-        let file = agent.policy(outlets.origin).map_err(|source| TrainError::at(step, source))?;
+        let file =
+            agent.policy(Origin { step, ..outlets.origin.clone() }).map_err(|source| TrainError::at(step, source))?;
         outlets.metrics.saving_seconds.inc_by(begin.elapsed().as_secs_f64());
         outlets.outbox.snapshot(TrainedPolicy { step, file, evaluate }, outlets.stop, outlets.beat);
     }

@@ -5,17 +5,17 @@ use std::sync::atomic::AtomicBool;
 use std::time::Duration;
 
 use anyhow::{Context, anyhow};
+use quad_algorithms::{Agent, Context as Learning};
 use quad_dataset::{BatchSampler, Transitions};
 use quad_protocol::{Origin, Snapshot};
-use quad_service::{Beat, hinted};
+use quad_runs::config::{Device, Experiment};
+use quad_runs::run::Checkpoint;
+use quad_runtime::{Beat, hinted};
 
-use super::agent::Agent;
+use super::device;
 use super::metrics::TrainingMetrics;
 use super::outbox::Outbox;
 use super::steps::{Outlets, Plan, TrainError, train};
-use crate::algorithms::Context as Learning;
-use crate::config::{Device, Experiment};
-use crate::run::Checkpoint;
 
 const DIVERGED: &str = "the same configuration would diverge again: try a smaller agent.critic_learning_rate or \
                         agent.actor_learning_rate, a smaller agent.gradient_clip, or look for outliers with \
@@ -81,7 +81,7 @@ impl Training {
             total_steps: experiment.steps,
             seed: experiment.seed,
             precision: experiment.precision,
-            device: self.device.open()?,
+            device: device::open(self.device)?,
         };
         let mut agent = Agent::new(experiment.definition()?, &experiment.agent, context)?;
         if let Some(Checkpoint { step, state }) = &self.checkpoint {

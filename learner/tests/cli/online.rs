@@ -4,7 +4,7 @@ use std::net::TcpListener;
 use std::process::Command;
 
 use quad_protocol::{Name, keys};
-use quad_service::{Endpoints, open_session};
+use quad_runtime::{Endpoints, open_session};
 
 use crate::write_dataset;
 

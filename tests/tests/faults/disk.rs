@@ -5,7 +5,7 @@ use std::path::PathBuf;
 use std::sync::{Arc, Mutex};
 
 use quad_protocol::{Snapshot, decode, keys};
-use quad_service::{Endpoints, open_session};
+use quad_runtime::{Endpoints, open_session};
 use quad_tests::learner::Learner;
 use quad_tests::made_up::name;
 use quad_tests::setting::Setting;

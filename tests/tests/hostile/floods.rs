@@ -6,7 +6,7 @@ use std::sync::atomic::{AtomicBool, Ordering::Relaxed};
 use std::time::Duration;
 
 use quad_protocol::{Name, encode, keys};
-use quad_service::{Endpoints, open_session};
+use quad_runtime::{Endpoints, open_session};
 use quad_tests::made_up::{self, name};
 use quad_tests::setting::{ENDLESS, Setting};
 use quad_tests::system::Scratch;

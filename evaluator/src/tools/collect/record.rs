@@ -1,7 +1,7 @@
 //! Mixes episodes of a search's policies, from the first to the last, into one dataset.
 
 use quad_dataset::{D4rlWriter, EnvironmentSpec, Row};
-use quad_service::Progress;
+use quad_runtime::Progress;
 use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 use rand_distr::{Distribution, StandardNormal};

@@ -6,7 +6,7 @@
 //! for being alive out of the objective, in which standing still would be a local optimum.
 
 use quad_dataset::EnvironmentSpec;
-use quad_service::Progress;
+use quad_runtime::Progress;
 use rand::Rng;
 use rand_chacha::ChaCha8Rng;
 use rand_distr::{Distribution, StandardNormal};

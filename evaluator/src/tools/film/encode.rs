@@ -9,7 +9,7 @@ use std::process::{Command, Stdio};
 use anyhow::{Context, bail};
 use color_quant::NeuQuant;
 use gif::{Encoder, Frame, Repeat};
-use quad_service::Hint;
+use quad_runtime::Hint;
 
 use super::output::{Format, Output};
 use super::picture::Picture;

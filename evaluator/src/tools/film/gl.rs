@@ -4,7 +4,7 @@
 
 use anyhow::Context;
 use khronos_egl::{self as egl, DynamicInstance, EGL1_5};
-use quad_service::Hint;
+use quad_runtime::Hint;
 
 /// What to do without OpenGL.
 pub const INSTALL: &str = "apt-get install --no-install-recommends libegl1 libegl-mesa0 libgl1-mesa-dri";

@@ -17,7 +17,7 @@ mod stage;
 use std::path::Path;
 
 use anyhow::anyhow;
-use quad_service::Hint;
+use quad_runtime::Hint;
 use tracing::info;
 
 use crate::sim;

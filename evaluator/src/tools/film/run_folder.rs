@@ -5,7 +5,7 @@ use std::fs;
 use std::path::{Path, PathBuf};
 
 use anyhow::{Context, anyhow};
-use quad_service::Hint;
+use quad_runtime::Hint;
 use serde::Deserialize;
 
 const RUN: &str =

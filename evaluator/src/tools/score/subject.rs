@@ -8,7 +8,7 @@ use quad_dataset::EnvironmentSpec;
 use quad_dataset::environment;
 use quad_policy::{Choice, Header, Policy, load_policy};
 use quad_protocol::{Hash, Origin};
-use quad_service::Hint;
+use quad_runtime::Hint;
 
 use super::args::{MOST_EPISODES, ScoreArgs};
 use crate::sim::{self, Environment, EnvironmentError, EpisodeOutcome, Rollout};

@@ -1,0 +1,210 @@
+//! Gradient steps at Hopper's shapes, whole and in parts, and the machine's peaks at these shapes, which bound them.
+//! `deploy/bench.sh` makes a table of the results.
+
+#![allow(clippy::expect_used)] // what cannot be had ends the run
+
+use candle_core::{Device, Result, Tensor};
+use criterion::measurement::WallTime;
+use criterion::{BenchmarkGroup, Criterion, criterion_group, criterion_main};
+use quad_algorithms::{ALGORITHMS, Agent, Context, Definition, Values};
+use quad_dataset::{Arrays, Transitions};
+use quad_kernels::activation::{Activation, activate, activate_with_slope};
+use quad_kernels::product::{Matrix::RowMajor, by_gemm};
+use quad_policy::{Adam, AdamStep, DiffusionShape, Ensemble, Gradients, Layout, NoisePredictor, Precision, Weights};
+use rand::{Rng, SeedableRng};
+use rand_chacha::ChaCha8Rng;
+use rayon::prelude::*;
+use std::sync::Arc;
+use std::time::Duration;
+use toml::Table;
+
+/// Hopper's observation and action.
+const DIMS: (usize, usize) = (11, 3);
+
+/// The configurations that are measured: task, algorithm, and next actions sampled per state. deploy/bench/bench.py knows
+/// their shapes.
+const CONFIGURATIONS: [(&str, [&str; 2], Option<u32>); 4] = [
+    ("paper, 10 samples", ["hopper-medium-replay-v2", "quad"], Some(10)),
+    ("paper, 1 sample", ["hopper-medium-replay-v2", "quad"], Some(1)),
+    ("demo", ["hopper-demo", "quad"], Some(1)),
+    ("demo, IQL", ["hopper-demo", "iql"], None),
+];
+
+/// What is measured: an algorithm with its values for a task.
+struct Experiment {
+    definition: Definition,
+    agent: Table,
+    batch_size: usize,
+}
+
+fn experiment([task, algorithm]: [&str; 2], samples: Option<u32>) -> Experiment {
+    let definition = ALGORITHMS.into_iter().find(|known| known.name == algorithm).expect("an algorithm");
+    let mut values = Values::of(&definition).expect("its values").for_task(Some(task));
+    let Some(toml::Value::Table(mut agent)) = values.remove("agent") else { panic!("no values for {task}") };
+    agent.extend(samples.map(|samples| ("samples".to_owned(), samples.into())));
+    let batch_size = values["batch_size"].as_integer().expect("a whole number") as usize;
+    Experiment { definition, agent, batch_size }
+}
+
+fn context(experiment: &Experiment, precision: Precision, device: &Device) -> Context {
+    Context {
+        transitions: Arc::new(transitions(experiment.batch_size)),
+        batch_size: experiment.batch_size,
+        total_steps: 1_000_000,
+        seed: 0,
+        precision,
+        device: device.clone(),
+    }
+}
+
+fn numbers(len: usize) -> Vec<f32> {
+    let mut generator = ChaCha8Rng::seed_from_u64(len as u64);
+    (0..len).map(|_| generator.random_range(-1.0..1.0)).collect()
+}
+
+fn tensor(shape: &[usize]) -> Tensor {
+    let numbers = numbers(shape.iter().product());
+    Tensor::from_vec(numbers, shape, &Device::Cpu).expect("a tensor")
+}
+
+fn transitions(count: usize) -> Transitions {
+    let arrays = Arrays {
+        observation_dim: DIMS.0,
+        action_dim: DIMS.1,
+        observations: numbers(count * DIMS.0),
+        actions: numbers(count * DIMS.1),
+        rewards: numbers(count),
+        next_observations: numbers(count * DIMS.0),
+        terminals: vec![false; count],
+        timeouts: vec![true; count],
+    };
+    Transitions::of(arrays).expect("numbers that can be learnt from")
+}
+
+fn updates(criterion: &mut Criterion) {
+    let mut groups = vec![("update", Device::Cpu, Precision::F32)];
+    if Precision::Bf16.is_available() {
+        groups.push(("update, bf16", Device::Cpu, Precision::Bf16));
+    }
+    // An update ends with its numbers on the host, so that nothing of it is left for the GPU to do.
+    if cfg!(feature = "cuda") {
+        groups.push(("update on cuda", Device::new_cuda(0).expect("a GPU"), Precision::F32));
+    }
+    for (group, device, precision) in groups {
+        let mut group = criterion.benchmark_group(group);
+        group.sample_size(20);
+        for (name, which, samples) in CONFIGURATIONS {
+            let experiment = experiment(which, samples);
+            let context = context(&experiment, precision, &device);
+            let items: Vec<u32> = (0..experiment.batch_size as u32).collect();
+            let mut agent = Agent::new(experiment.definition, &experiment.agent, context).expect("usable values");
+            group.bench_function(name, |bencher| bencher.iter(|| agent.update(&items).expect("a step")));
+        }
+        group.finish();
+    }
+}
+
+/// Products and activations per second, on all threads: 1000 tiles of 128 × 256 on each.
+fn peaks(criterion: &mut Criterion) {
+    const REPEAT: usize = 1000;
+    let (rows, width, threads) = (128, 256, 0..rayon::current_num_threads());
+    let mut group = criterion.benchmark_group("peak");
+    group.sample_size(10);
+    let mut tiles: Vec<_> =
+        threads.clone().map(|_| (numbers(rows * width), numbers(width * width), vec![0.0_f32; rows * width])).collect();
+    let product = |(x, w, out): &mut (Vec<f32>, Vec<f32>, Vec<f32>)| {
+        for _ in 0..REPEAT {
+            by_gemm([rows, width, width], RowMajor(x), RowMajor(w), out);
+        }
+    };
+    group.bench_function("product", |bencher| bencher.iter(|| tiles.par_iter_mut().for_each(product)));
+    let zero = vec![0.0; width];
+    let mish = |(x, _, out): &mut (Vec<f32>, Vec<f32>, Vec<f32>)| {
+        for _ in 0..REPEAT {
+            out.copy_from_slice(x);
+            activate(Activation::Mish, out, &zero);
+        }
+    };
+    group.bench_function("mish", |bencher| bencher.iter(|| tiles.par_iter_mut().for_each(mish)));
+    let slope = |(x, w, out): &mut (Vec<f32>, Vec<f32>, Vec<f32>)| {
+        for _ in 0..REPEAT {
+            out.copy_from_slice(x);
+            activate_with_slope(Activation::Mish, out, &zero, &mut w[..rows * width]);
+        }
+    };
+    group.bench_function("mish and slope", |bencher| bencher.iter(|| tiles.par_iter_mut().for_each(slope)));
+    group.finish();
+}
+
+/// What QUAD's update consists of, in its order, each by itself.
+fn parts(criterion: &mut Criterion) {
+    for (name, which, samples) in CONFIGURATIONS {
+        let Some(samples) = samples else { continue };
+        let mut group = criterion.benchmark_group(name);
+        group.sample_size(20).measurement_time(Duration::from_secs(2)).warm_up_time(Duration::from_millis(500));
+        parts_of(&mut group, &experiment(which, Some(samples)), samples as usize).expect("candle works");
+        group.finish();
+    }
+}
+
+/// Benchmarks `work` on a thread of the pool, as an update runs.
+fn bench<R: Send>(group: &mut BenchmarkGroup<'_, WallTime>, name: &str, mut work: impl FnMut() -> Result<R> + Send) {
+    group.bench_function(name, |bencher| bencher.iter(|| rayon::scope(|_| work()).expect("candle works")));
+}
+
+fn parts_of(group: &mut BenchmarkGroup<'_, WallTime>, experiment: &Experiment, samples: usize) -> Result<()> {
+    let count = |name: &str| experiment.agent[name].as_integer().expect("a whole number") as usize;
+    let (b, k, steps) = (experiment.batch_size, count("critics"), count("diffusion_steps"));
+    let (observation_dim, action_dim) = DIMS;
+    let layers = experiment.agent["critic"].clone().try_into().expect("hidden layers");
+    let shape = DiffusionShape::quad(DIMS, &layers, k, steps);
+    let weights = |layout: Layout| {
+        let values = Weights::initial(&layout, &mut ChaCha8Rng::seed_from_u64(0), &Device::Cpu)?;
+        Weights::trainable(layout, &values)
+    };
+    let (actor, critics) = (weights(shape.actor().layout())?, weights(shape.critics().layout())?);
+    let (mut actor_adam, mut critic_adam) = (Adam::new(&actor, 0.0)?, Adam::new(&critics, 0.0)?);
+    let mut target_actor = NoisePredictor::new(shape.actor(), actor.copy()?, Precision::F32);
+    let mut target_critics = Ensemble::new(shape.critics(), critics.copy()?, Precision::F32);
+    let mut actor = NoisePredictor::new(shape.actor(), actor, Precision::F32);
+    let mut critics = Ensemble::new(shape.critics(), critics, Precision::F32);
+    let (observations, actions) = (tensor(&[b, observation_dim]), tensor(&[b, action_dim]));
+    let (noise, targets) = (tensor(&[steps, b * samples, action_dim]), tensor(&[b]));
+
+    bench(group, "sampled next actions", || target_actor.sample(&observations, &noise));
+    let next = target_actor.sample(&observations, &noise)?;
+    bench(group, "target critics", || target_critics.values(&observations, &next));
+    let regress = |critics: &Ensemble| {
+        Gradients::of(&critics.squared_error(&observations, &actions, &targets)?)?.with_respect_to(critics.weights())
+    };
+    bench(group, "critic step", || regress(&critics));
+    let step = AdamStep { rate: 1e-9, clip: Some(1.0), count: 1 };
+    let gradient = regress(&critics)?.copy()?;
+    bench(group, "critic optimiser", || critic_adam.descend(critics.weights_mut(), &gradient, step));
+    bench(group, "critic EMA", || target_critics.weights_mut().ema_update(critics.weights(), 0.005));
+    bench(group, "Q-gradients' scale", || target_critics.values(&observations, &actions));
+    bench(group, "Q-gradients", || target_critics.action_gradients(&observations, &actions));
+    let t = Tensor::from_iter((0..b).map(|i| (i % steps + 1) as u32), observations.device())?;
+    let clone = |actor: &NoisePredictor| {
+        let loss = actor.predict(&observations, &actions, &t)?.sqr()?.mean_all()?;
+        Gradients::of(&loss)?.with_respect_to(actor.weights())
+    };
+    let threshold = experiment.agent["eta"].get("threshold").is_some();
+    bench(group, "actor step", || {
+        let gradient = clone(&actor)?;
+        // Again for η, with the new weights.
+        if threshold {
+            actor.detach().predict(&observations, &actions, &t)?;
+        }
+        Ok(gradient)
+    });
+    let gradient = clone(&actor)?.copy()?;
+    bench(group, "actor optimiser and EMA", || {
+        actor_adam.descend(actor.weights_mut(), &gradient, step)?;
+        target_actor.weights_mut().ema_update(actor.weights(), 0.005)
+    });
+    Ok(())
+}
+
+criterion_group!(benches, peaks, updates, parts);
+criterion_main!(benches);

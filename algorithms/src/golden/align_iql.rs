@@ -1,0 +1,59 @@
+//! Tests: the update against an independent implementation (tests/golden/README.md).
+
+use super::*;
+use crate::golden::{
+    Golden, batch, check_candidates, check_update, context, denoising, devices, fresh, goldens, load, table,
+};
+use candle_core::Device;
+
+fn check(golden: &Golden, device: &Device) {
+    let mut align_iql = AlignIql::new(read(&table(golden)).unwrap(), context(golden, device)).unwrap();
+    load(golden, align_iql.parts());
+    check_choice(golden, &align_iql);
+    let (batch, noise) = (batch(golden, &align_iql.context), denoising(golden, device));
+    let noisy = noise.noisy(align_iql.actor.network.schedule(), &batch.actions).unwrap();
+    golden.close("noisy_actions", &noisy.actions);
+    let values = align_iql.step(golden.count("/step") as u64, &batch, &noise).unwrap();
+    check_update(golden, METRICS, &values, align_iql.parts().save().unwrap());
+}
+
+/// What the published networks say of the candidates, and that the one whose Q is nearest to V is to be taken.
+fn check_choice(golden: &Golden, align_iql: &AlignIql) {
+    let drawn = check_candidates(golden, align_iql);
+    let candidates = golden.count("/agent/candidates") as u32;
+    assert_eq!(drawn.choice, Choice { candidates, value: Reduce::Min, rule: Rule::Nearest });
+    let v = drawn.v.unwrap();
+    golden.close("select.v", &v);
+    let index = drawn.q.broadcast_sub(&v.unsqueeze(1).unwrap()).unwrap().abs().unwrap().argmin(1).unwrap();
+    golden.close("select.index", &index);
+    let first = (0..v.elem_count()).map(|state| state as u32 * candidates);
+    let rows: Vec<u32> = first.zip(index.to_vec1::<u32>().unwrap()).map(|(first, chosen)| first + chosen).collect();
+    let rows = candle_core::Tensor::new(rows, &Device::Cpu).unwrap();
+    golden.close("select.actions", &drawn.candidates.index_select(&rows, 0).unwrap());
+}
+
+#[test]
+fn golden_update() {
+    for golden in goldens("align-iql") {
+        devices().iter().for_each(|device| check(&golden, device));
+    }
+}
+
+#[test]
+fn golden_update_of_a_fresh_seed() {
+    let Some(golden) = fresh("align-iql") else { return };
+    devices().iter().for_each(|device| check(&golden, device));
+}
+
+#[test]
+fn the_noise_of_a_step_is_repeatable_and_no_other_steps() {
+    let golden = goldens("align-iql").remove(0);
+    let align_iql = AlignIql::new(read(&table(&golden)).unwrap(), context(&golden, &Device::Cpu)).unwrap();
+    let numbers = |step: u64| {
+        let Denoising { t, epsilon } = align_iql.noise(step).unwrap();
+        (t, epsilon.flatten_all().unwrap().to_vec1::<f32>().unwrap())
+    };
+    assert_eq!(numbers(0), numbers(0));
+    let (first, other) = (numbers(0), numbers(1));
+    assert!(first.0 != other.0 && first.1 != other.1);
+}

@@ -1,0 +1,132 @@
+//! Tests: an update of each phase against an independent implementation (tests/golden/README.md), and what it learns
+//! from.
+
+use super::*;
+use crate::golden::{Golden, batch, check_actions, check_update, context, devices, fresh, goldens, load, table};
+use candle_core::Device;
+use quad_dataset::{Arrays, Transitions};
+use std::sync::Arc;
+
+fn start(golden: &Golden, device: &Device) -> Onestep {
+    let mut onestep = Onestep::new(read(&table(golden)).unwrap(), context(golden, device)).unwrap();
+    load(golden, onestep.parts());
+    onestep
+}
+
+fn check_golden(golden: &Golden, device: &Device) {
+    let (mut onestep, step) = (start(golden, device), golden.count("/step") as u64);
+    check_actions(golden, &onestep);
+    let batch = batch(golden, &onestep.context);
+    let values = match onestep.phase(step) {
+        Phase::Behavior(steps) => onestep.clone_behavior(&batch, steps),
+        Phase::Critic(steps) => onestep.evaluate_behavior(&batch, &golden.input("next_actions", device), steps),
+        Phase::Policy(steps) => {
+            let noise = golden.input("behavior_noise", device).transpose(0, 1).unwrap().contiguous().unwrap();
+            onestep.improve(&batch, &noise, steps)
+        }
+    };
+    check_update(golden, METRICS, &values.unwrap(), onestep.parts().save().unwrap());
+}
+
+#[test]
+fn golden_update() {
+    for golden in goldens("onestep") {
+        devices().iter().for_each(|device| check_golden(&golden, device));
+    }
+}
+
+#[test]
+fn golden_update_of_a_fresh_seed() {
+    for golden in ["onestep-behavior", "onestep-critic", "onestep-policy"].into_iter().filter_map(fresh) {
+        devices().iter().for_each(|device| check_golden(&golden, device));
+    }
+}
+
+/// Three episodes of two steps: the first terminates, the second is cut off, the third, of one step more, goes on to the end.
+fn small_context(golden: &Golden) -> Context {
+    let transitions = Transitions::of(Arrays {
+        observation_dim: 1,
+        action_dim: 1,
+        observations: vec![0.0, 1.0, 2.0, 3.0, 4.0, 5.0],
+        actions: vec![0.0, 0.1, 0.2, 0.3, 0.4, 0.5],
+        rewards: vec![0.0; 6],
+        next_observations: vec![1.0, 2.0, 3.0, 4.0, 5.0, 6.0],
+        terminals: vec![false, true, false, false, false, false],
+        timeouts: vec![false, false, false, true, false, true],
+    });
+    Context { transitions: Arc::new(transitions.unwrap()), batch_size: 2, ..context(golden, &Device::Cpu) }
+}
+
+#[test]
+fn it_learns_from_transitions_with_a_next_action_and_from_terminals() {
+    let golden = goldens("onestep").remove(0);
+    let onestep = Onestep::new(read(&table(&golden)).unwrap(), small_context(&golden)).unwrap();
+    assert_eq!((onestep.items(), &onestep.items[..]), (4, &[0, 1, 2, 4][..]));
+    let next: Vec<Vec<f32>> = onestep.next_actions(&onestep.items).unwrap().to_vec2().unwrap();
+    assert_eq!(next, [[0.1], [0.0], [0.3], [0.5]]);
+}
+
+/// Two steps for β, one for Q, and what remains of five for π.
+fn short(golden: &Golden) -> Onestep {
+    let mut config: Config = read(&table(golden)).unwrap();
+    (config.behavior_steps, config.critic_steps) = (Steps(2), Steps(1));
+    Onestep::new(config, Context { total_steps: 5, ..small_context(golden) }).unwrap()
+}
+
+/// A copy of its state, because weights are saved as views.
+fn state(onestep: &mut Onestep) -> Tensors {
+    let tensors = onestep.parts().save().unwrap().into_iter();
+    tensors.map(|(name, tensor)| (name, tensor.copy().unwrap())).collect()
+}
+
+fn numbers(x: &Tensor) -> Vec<f32> {
+    x.flatten_all().unwrap().to_vec1().unwrap()
+}
+
+#[test]
+fn a_run_that_is_cut_in_any_phase_ends_as_one_that_is_not() {
+    let golden = goldens("onestep").remove(0);
+    let train = |onestep: &mut Onestep, steps: std::ops::Range<u64>| {
+        steps.for_each(|step| drop(onestep.update(step, &[0, 1]).unwrap()));
+    };
+    let mut straight = short(&golden);
+    train(&mut straight, 0..5);
+    let expected = state(&mut straight);
+    for cut in 0..5 {
+        let (mut first, mut second) = (short(&golden), short(&golden));
+        train(&mut first, 0..cut);
+        second.parts().load(&mut state(&mut first)).unwrap();
+        train(&mut second, cut..5);
+        for (name, tensor) in state(&mut second) {
+            assert_eq!(numbers(&tensor), numbers(&expected[&name]), "cut at {cut}: {name}");
+        }
+    }
+}
+
+#[test]
+fn each_phase_has_its_steps_and_the_policy_is_left_some() {
+    let golden = goldens("onestep").remove(0);
+    let context = Context { total_steps: 1500, ..small_context(&golden) };
+    let refused = Onestep::new(read(&table(&golden)).unwrap(), context).err().unwrap().to_string();
+    assert!(refused.contains("behavior_steps is 500") && refused.contains("critic_steps"), "{refused}");
+
+    let mut onestep = short(&golden);
+    let mut before = state(&mut onestep);
+    for (step, moved) in ["behavior", "behavior", "critic", "actor", "actor"].into_iter().enumerate() {
+        onestep.update(step as u64, &[0, 1]).unwrap();
+        let after = state(&mut onestep);
+        for (name, tensor) in &after {
+            // The moments tell which network was trained: π moves with β.
+            if let Some(of) = name.strip_prefix("adam_v.") {
+                let changed = numbers(tensor) != numbers(&before[name]);
+                assert!(!changed || of.starts_with(moved), "step {step}: {name}");
+            }
+        }
+        let last = format!("{moved}.2.bias");
+        assert!(numbers(&after[&last]) != numbers(&before[&last]), "step {step}: {moved} stays");
+        let [actor, behavior] = ["actor.2.bias", "behavior.2.bias"].map(|name| numbers(&after[name]));
+        let is_copy = actor.iter().zip(&behavior).all(|(x, y)| (x - y).abs() < 1e-6);
+        assert_eq!(is_copy, step < 3, "step {step}");
+        before = after;
+    }
+}

@@ -1,0 +1,50 @@
+//! Learning algorithms, one file each, to be read beside its paper.
+//!
+//! `algorithm` is all that the learner sees of an algorithm, `agent` an algorithm at work, saved and loaded, and `values` its
+//! values for each task. A new algorithm is a file here, a line in [`ALGORITHMS`] and its values in `presets/`.
+
+#![deny(unsafe_code)]
+
+mod agent;
+mod algorithm;
+mod align_iql;
+mod context;
+mod diffusion;
+mod dql;
+mod gaussian;
+mod hyperparameters;
+mod in_sample;
+mod iql;
+mod ivr;
+mod onestep;
+mod parts;
+mod pool;
+mod quad;
+mod random;
+mod trained;
+mod values;
+mod xql;
+
+pub use agent::{Agent, StateError};
+pub use algorithm::{AgentError, Algorithm, AlgorithmError, Definition, Metric};
+pub use context::{Context, Minibatch};
+pub use parts::Parts;
+pub use values::{Values, fits, merge};
+
+/// All algorithms, the one that learns unless another is asked for first.
+pub const ALGORITHMS: [Definition; 7] = [
+    quad::DEFINITION,
+    iql::DEFINITION,
+    align_iql::DEFINITION,
+    dql::DEFINITION,
+    ivr::DEFINITION,
+    onestep::DEFINITION,
+    xql::DEFINITION,
+];
+
+#[cfg(test)]
+#[allow(clippy::unwrap_used)]
+mod golden;
+#[cfg(test)]
+#[allow(clippy::unwrap_used)]
+mod tests;

@@ -1,0 +1,282 @@
+//! Onestep-RL (Brandfonbrener, Whitney, Ranganath and Bruna 2021, "Offline RL Without Off-Policy Evaluation"), with
+//! exponential weights, in three phases: the data's policy β is cloned, its value Q^β is learnt from the data's own next
+//! actions, and β is improved once. No value of the improved policy is ever asked for.
+
+#[cfg(test)]
+#[allow(clippy::unwrap_used)]
+#[path = "golden/onestep.rs"]
+mod golden;
+
+use super::algorithm::{Algorithm, AlgorithmError, Definition, Metric, check, numbers, read};
+use super::context::{Context, Minibatch};
+use super::gaussian::log_density;
+use super::hyperparameters::{Count, Positive, Rate, Share, Steps};
+use super::parts::Parts;
+use super::random::{Purpose, stream};
+use super::trained::{Trained, ensemble};
+use candle_core::{DType, Result, Tensor};
+use quad_dataset::Batch;
+use quad_policy::{
+    AdamStep, Ensemble, EnsembleShape, GaussianPolicy, GaussianShape, Gradients, MlpConfig, PolicyConfig, Tensors,
+};
+use rand_distr::{Distribution, StandardNormal};
+use serde::Deserialize;
+
+/// What the learner has to know of it.
+pub(super) const DEFINITION: Definition = Definition {
+    name: "onestep",
+    settings: include_str!("../../presets/onestep.toml"),
+    variant: None,
+    metrics: METRICS,
+    check: |table| read::<Config>(table).map(drop),
+    start: |table, context| Ok(Box::new(Onestep::new(read(table)?, context)?)),
+};
+
+/// Largest weight of an action of the data.
+const MOST_WEIGHT: f64 = 100.0;
+/// Bounds of log σ.
+const LOG_STD: (f64, f64) = (-5.0, 0.0);
+
+/// In the order of the values that an update gives; those of other phases than the update's are 0.
+const METRICS: &[Metric] = &[
+    Metric {
+        name: "behavior_loss",
+        label: "behaviour loss",
+        help: "First phase: mean over the batch of −log β(a|s). 0 in the others.",
+    },
+    Metric {
+        name: "critic_loss",
+        label: "critic loss",
+        help: "Second phase: mean over the batch of (Q(s, a) − y)². 0 in the others.",
+    },
+    Metric {
+        name: "q_mean",
+        label: "",
+        help: "Second phase: mean over the batch of the critic's target y = r + γ·mask·Q̂(s', a') with the data's next action a'. 0 in the others.",
+    },
+    Metric {
+        name: "actor_loss",
+        label: "actor loss",
+        help: "Third phase: mean over the batch of −weight·log π(a|s) with weight = exp(temperature·A), at most 100. 0 in the others.",
+    },
+    Metric {
+        name: "advantage_mean",
+        label: "",
+        help: "Third phase: mean over the batch of the advantage A = Q(s, a) − mean of Q(s, ·) over actions that β draws. 0 in the others.",
+    },
+    Metric {
+        name: "weight_mean",
+        label: "",
+        help: "Third phase: mean over the batch of the weights in the actor's loss. 0 in the others.",
+    },
+    Metric {
+        name: "clipped_share",
+        label: "",
+        help: "Third phase: share of the batch, 0 to 1, whose weight is clipped at 100. 0 in the others.",
+    },
+];
+
+/// Onestep-RL's hyper-parameters: the `[agent]` table of a preset.
+#[derive(Deserialize)]
+#[serde(deny_unknown_fields)]
+struct Config {
+    /// β's hidden layers, and π's.
+    behavior: MlpConfig,
+    critic: MlpConfig,
+    /// Discount γ.
+    gamma: Share,
+    /// Inverse temperature of the advantages.
+    temperature: Positive,
+    /// Actions of β, over which the mean of Q is the state's value.
+    samples: Count,
+    learning_rate: Positive,
+    /// EMA rate of the target critic, which follows after every so many steps.
+    ema_rate: Rate,
+    ema_every: Steps,
+    /// Lengths of the first two phases; what remains of the run is the third.
+    behavior_steps: Steps,
+    critic_steps: Steps,
+}
+
+/// What an update does, and how many of its kind came before it.
+enum Phase {
+    Behavior(u64),
+    Critic(u64),
+    Policy(u64),
+}
+
+/// Onestep-RL in the middle of a run.
+struct Onestep {
+    config: Config,
+    context: Context,
+    /// The transitions to learn from.
+    items: Vec<u32>,
+    /// β.
+    behavior: Trained<Ensemble>,
+    /// Q, and its EMA Q̂.
+    critic: Trained<Ensemble>,
+    target_critic: Ensemble,
+    /// π. Until its phase it is β, and its optimiser is new.
+    actor: Trained<Ensemble>,
+}
+
+impl Onestep {
+    fn new(config: Config, context: Context) -> std::result::Result<Self, AlgorithmError> {
+        let before = config.behavior_steps.saturating_add(*config.critic_steps);
+        let value = format!(
+            "{} (and critic_steps {}, of {} steps)",
+            *config.behavior_steps, *config.critic_steps, context.total_steps
+        );
+        let range = "so small that steps are left for the policy: give more --steps, or make both smaller";
+        check("behavior_steps", value, before < context.total_steps, range)?;
+        let items = items(&context);
+        if items.is_empty() {
+            let what = "no transition of the dataset has a next action, which Onestep-RL learns from";
+            return Err(candle_core::Error::msg(what).into());
+        }
+        let (observation_dim, action_dim) = (context.observation_dim(), context.action_dim());
+        let shape = |action_dim, layers: &MlpConfig, outputs| EnsembleShape {
+            members: 1,
+            observation_dim,
+            action_dim,
+            layers: layers.clone(),
+            outputs,
+        };
+        // The same initial weights twice.
+        let policy = || ensemble(shape(0, &config.behavior, 2 * action_dim), &context, 0);
+        let (behavior, actor) = (policy()?, policy()?);
+        let critic = ensemble(shape(action_dim, &config.critic, 1), &context, 1)?;
+        Ok(Self { target_critic: critic.network.copy()?, behavior, critic, actor, items, config, context })
+    }
+
+    fn phase(&self, step: u64) -> Phase {
+        let (behavior, critic) = (*self.config.behavior_steps, *self.config.critic_steps);
+        match step {
+            step if step < behavior => Phase::Behavior(step),
+            step if step < behavior + critic => Phase::Critic(step - behavior),
+            step => Phase::Policy(step - behavior - critic),
+        }
+    }
+
+    /// Adam's step after so many others of its phase.
+    fn adam(&self, steps: u64) -> AdamStep {
+        AdamStep { rate: *self.config.learning_rate, clip: None, count: steps + 1 }
+    }
+
+    /// First phase: β towards the data's actions, and π with it.
+    fn clone_behavior(&mut self, batch: &Minibatch, steps: u64) -> Result<Vec<f32>> {
+        let (mean, log_std) = distribution(&self.behavior.network, &batch.observations)?;
+        let loss = log_density(&batch.actions, &mean, &log_std)?.mean_all()?.neg()?;
+        self.behavior.descend(&Gradients::of(&loss)?, self.adam(steps))?;
+        self.actor.network.weights_mut().ema_update(self.behavior.network.weights(), 1.0)?; // all the way
+        let zero = loss.zeros_like()?;
+        numbers(&[&loss, &zero, &zero, &zero, &zero, &zero, &zero])
+    }
+
+    /// Second phase: Q(s, a) towards r + γ·Q̂(s', a'), with the action a' that the data takes next, `[B, a]`.
+    fn evaluate_behavior(&mut self, batch: &Minibatch, next_actions: &Tensor, steps: u64) -> Result<Vec<f32>> {
+        let next = self.target_critic.values(&batch.next_observations, next_actions)?.squeeze(0)?;
+        let targets = batch.target(*self.config.gamma, &next)?;
+        let loss = self.critic.network.squared_error(&batch.observations, &batch.actions, &targets)?;
+        self.critic.descend(&Gradients::of(&loss)?, self.adam(steps))?;
+        if (steps + 1).is_multiple_of(*self.config.ema_every) {
+            self.target_critic.weights_mut().ema_update(self.critic.network.weights(), *self.config.ema_rate)?;
+        }
+        let zero = loss.zeros_like()?;
+        numbers(&[&zero, &loss, &targets.mean_all()?, &zero, &zero, &zero, &zero])
+    }
+
+    /// Third phase: π towards actions of the data, the more so the better they are than β's.
+    fn improve(&mut self, batch: &Minibatch, noise: &Tensor, steps: u64) -> Result<Vec<f32>> {
+        let q = self.critic.network.detach().values(&batch.observations, &batch.actions)?.squeeze(0)?;
+        let advantage = (q - self.value(&batch.observations, noise)?)?;
+        let weight = (&advantage * f64::from(*self.config.temperature))?.exp()?;
+        let clipped = weight.gt(MOST_WEIGHT)?.to_dtype(DType::F32)?;
+        let weight = weight.minimum(MOST_WEIGHT)?;
+        let (mean, log_std) = distribution(&self.actor.network, &batch.observations)?;
+        let loss = (&weight * log_density(&batch.actions, &mean, &log_std)?)?.mean_all()?.neg()?;
+        self.actor.descend(&Gradients::of(&loss)?, self.adam(steps))?;
+        let zero = loss.zeros_like()?;
+        let (advantage, weight, clipped) = (advantage.mean_all()?, weight.mean_all()?, clipped.mean_all()?);
+        numbers(&[&zero, &zero, &zero, &loss, &advantage, &weight, &clipped])
+    }
+
+    /// The mean of Q(s, ·) over actions that β draws with this noise, `[B, S, a]`; `[B]`.
+    fn value(&self, observations: &Tensor, noise: &Tensor) -> Result<Tensor> {
+        let (b, samples, a) = noise.dims3()?;
+        let (mean, log_std) = distribution(&self.behavior.network.detach(), observations)?;
+        let spread = noise.broadcast_mul(&log_std.exp()?.unsqueeze(1)?)?;
+        let actions = spread.broadcast_add(&mean.unsqueeze(1)?)?.clamp(-1.0, 1.0)?.reshape((b * samples, a))?;
+        self.critic.network.detach().values(observations, &actions)?.reshape((b, samples))?.mean(1)
+    }
+
+    /// Standard normal numbers for β's actions in an update, `[B, S, a]`.
+    fn noise(&self, step: u64) -> Result<Tensor> {
+        let mut generator = stream(self.context.seed, Purpose::Noise, step);
+        let shape = (self.context.batch_size, *self.config.samples, self.context.action_dim());
+        let numbers = (0..shape.0 * shape.1 * shape.2).map(|_| StandardNormal.sample(&mut generator));
+        Tensor::from_vec(numbers.collect::<Vec<f32>>(), shape, &self.context.device)
+    }
+
+    /// The actions that the data takes after these transitions, `[B, a]`; 0 at the end of an episode, where none counts.
+    fn next_actions(&self, rows: &[u32]) -> Result<Tensor> {
+        let a = self.context.action_dim();
+        let none = vec![0.0; a];
+        let next = |row: &u32| self.context.transitions.next_action(*row).unwrap_or(&none).to_vec();
+        let actions: Vec<f32> = rows.iter().flat_map(next).collect();
+        Tensor::from_vec(actions, (rows.len(), a), &self.context.device)
+    }
+}
+
+/// The transitions that have a next action, or need none because the episode terminates.
+fn items(context: &Context) -> Vec<u32> {
+    let (transitions, mut one) = (&context.transitions, Batch::default());
+    let usable = |row: &u32| {
+        transitions.gather(&[*row], &mut one);
+        transitions.next_action(*row).is_some() || one.masks == [0.0]
+    };
+    (0..transitions.len() as u32).filter(usable).collect()
+}
+
+/// Mean and log σ of a policy's actions, `[n, a]` each: its network gives both, log σ through a tanh that keeps it in bounds.
+fn distribution(network: &Ensemble, observations: &Tensor) -> Result<(Tensor, Tensor)> {
+    let out = network.state_outputs(observations)?.squeeze(0)?.tanh()?;
+    let (a, half) = (out.dim(1)? / 2, (LOG_STD.1 - LOG_STD.0) / 2.0);
+    Ok((out.narrow(1, 0, a)?, out.narrow(1, a, a)?.affine(half, LOG_STD.0 + half)?))
+}
+
+impl Algorithm for Onestep {
+    fn items(&self) -> usize {
+        self.items.len()
+    }
+
+    fn update(&mut self, step: u64, items: &[u32]) -> Result<Vec<f32>> {
+        let rows: Vec<u32> = items.iter().map(|item| self.items[*item as usize]).collect();
+        let batch = self.context.batch(&rows)?;
+        match self.phase(step) {
+            Phase::Behavior(steps) => self.clone_behavior(&batch, steps),
+            Phase::Critic(steps) => self.evaluate_behavior(&batch, &self.next_actions(&rows)?, steps),
+            Phase::Policy(steps) => self.improve(&batch, &self.noise(step)?, steps),
+        }
+    }
+
+    /// Acts by the mean: of the last layer the half that it comes from.
+    fn policy(&self) -> Result<(PolicyConfig, Tensors)> {
+        let (observation_dim, action_dim) = (self.context.observation_dim(), self.context.action_dim());
+        let shape = GaussianShape { observation_dim, action_dim, actor: self.config.behavior.clone() };
+        let mut tensors = GaussianPolicy::tensors(&self.actor.network)?;
+        let last = format!(".{}.", self.config.behavior.hidden.len());
+        for (_, tensor) in tensors.iter_mut().filter(|(name, _)| name.contains(&last)) {
+            *tensor = tensor.narrow(tensor.rank() - 1, 0, action_dim)?.contiguous()?;
+        }
+        Ok((PolicyConfig::Gaussian { shape }, tensors))
+    }
+
+    fn parts(&mut self) -> Parts<'_> {
+        Parts::default()
+            .trained("behavior", &mut self.behavior)
+            .trained("critic", &mut self.critic)
+            .weights("target_critic", self.target_critic.weights_mut())
+            .trained("actor", &mut self.actor)
+    }
+}

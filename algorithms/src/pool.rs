@@ -1,0 +1,41 @@
+//! The thread pool, kept awake.
+
+use rayon::Yield;
+use std::hint::spin_loop;
+use std::sync::atomic::{AtomicBool, Ordering};
+
+/// Between two looks for work; long enough not to disturb the thread that hands it out.
+const PAUSES: usize = 50;
+
+/// Runs `work` as a whole on a thread of the pool, and keeps the others looking for work meanwhile.
+///
+/// A gradient step has some fifteen parallel parts with microseconds of other work between them. Handing each of them to
+/// the pool from outside, or letting idle threads fall asleep in between, costs as much as that other work itself.
+pub(crate) fn run_awake<R: Send>(work: impl FnOnce() -> R + Send) -> R {
+    let done = AtomicBool::new(false);
+    rayon::scope(|scope| {
+        // Set however `work` ends, so that no thread looks for ever.
+        let _ending = SetWhenDropped(&done);
+        for _ in 1..rayon::current_num_threads() {
+            scope.spawn(|_| {
+                while !done.load(Ordering::Relaxed) {
+                    if rayon::yield_now() != Some(Yield::Executed) {
+                        (0..PAUSES).for_each(|_| spin_loop());
+                    }
+                }
+            });
+        }
+        work()
+    })
+}
+
+struct SetWhenDropped<'a>(&'a AtomicBool);
+
+impl Drop for SetWhenDropped<'_> {
+    fn drop(&mut self) {
+        self.0.store(true, Ordering::Relaxed);
+    }
+}
+
+#[cfg(test)]
+mod tests;

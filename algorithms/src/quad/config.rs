@@ -1,0 +1,116 @@
+//! QUAD's hyper-parameters: the `[agent]` table of a preset.
+
+use crate::algorithm::{AgentError, check, read};
+use crate::hyperparameters::{Candidates, Count, NotNegative, Positive, Rate, Share, Steps};
+use quad_policy::MlpConfig;
+use serde::Deserialize;
+
+/// What pulls the policy away from the data.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub(super) enum Guidance {
+    /// Q-gradients weighted by λ, the critics' agreement (Eq. 19, 24).
+    Quad,
+    /// Unweighted Q-gradients, λ = 1 (Eq. 8).
+    Dac,
+    /// No Q-gradient: behaviour cloning. The critics are trained all the same.
+    None,
+    /// A control: Q-gradients weighted by the same λ in all samples, the user's.
+    Constant,
+    /// A control, strength without selection: weighted by the moving average of λ at the sample's denoising step.
+    Mean,
+    /// A control, distribution without selection: weighted by the λ of another sample at the same denoising step.
+    Shuffled,
+}
+
+/// How a critic's values of several sampled next actions become one.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub(super) enum TargetReduce {
+    /// Their mean (locomotion).
+    Mean,
+    /// Their maximum (AntMaze).
+    Max,
+}
+
+/// The strength η of behaviour cloning, the Lagrangian multiplier of Eq. 19.
+#[derive(Clone, Copy, Debug, PartialEq, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub(super) struct Eta {
+    /// Value at the first step.
+    pub initial: NotNegative,
+    /// Behaviour-cloning loss b that dual ascent aims at; absent: η stays at `initial`.
+    pub threshold: Option<Positive>,
+    /// Step size α_η of dual ascent.
+    pub rate: NotNegative,
+    /// Smallest η.
+    pub minimum: NotNegative,
+    /// Largest η.
+    pub maximum: NotNegative,
+}
+
+/// Everything that decides what one update does.
+#[derive(Clone, Debug, PartialEq, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub(super) struct Quad {
+    /// The noise predictor's hidden layers.
+    pub actor: MlpConfig,
+    /// The critics' hidden layers.
+    pub critic: MlpConfig,
+    /// Ensemble size K.
+    pub critics: Count,
+    /// Denoising steps T.
+    pub diffusion_steps: Count,
+    /// Discount γ.
+    pub gamma: Share,
+    /// Pessimism ρ of the lower confidence bound (Eq. 20).
+    pub rho: NotNegative,
+    /// What guides the actor.
+    pub guidance: Guidance,
+    /// Temperature τ of the uncertainty weight (Eq. 24); `inf` gives λ = ν̂²/(ν̂² + δ).
+    pub tau: f32,
+    /// Stabiliser δ of Eq. 24, on the scale of squared normalised Q-gradients.
+    pub delta: Positive,
+    /// λ of guidance `constant`, and only of it.
+    pub lambda: Option<Share>,
+    /// Next actions sampled per next state for the target, S.
+    pub samples: Count,
+    /// How their values are combined.
+    pub target_reduce: TargetReduce,
+    /// Actions that an evaluated policy draws in each state, N_a (Eq. 25).
+    pub candidates: Candidates,
+    /// Behaviour-cloning strength.
+    pub eta: Eta,
+    /// Adam's learning rate for the actor at the first step; decays to 0 along a cosine.
+    pub actor_learning_rate: Positive,
+    /// The same for the critics.
+    pub critic_learning_rate: Positive,
+    /// Global norm at which each network's gradient is clipped.
+    pub gradient_clip: Positive,
+    /// EMA rate of both target networks, α_ema.
+    pub ema_rate: Rate,
+    /// EMA rate of ν̂² (Eq. 23), and of λ's means with guidance `mean`.
+    pub nu_ema_rate: Rate,
+    /// The target actor follows in updates whose number, from 0, is a multiple of this …
+    pub actor_ema_every: Steps,
+    /// … and above this.
+    pub actor_ema_start: u64,
+}
+
+impl Quad {
+    /// Reads a table of them and checks what their types do not say.
+    pub fn read(table: &toml::Table) -> Result<Self, AgentError> {
+        let config: Self = read(table)?;
+        check("tau", config.tau, config.tau > 0.0, "above 0 (`inf` is allowed)")?;
+        match (config.guidance, config.lambda) {
+            (Guidance::Constant, None) => check("lambda", "absent", false, "given where agent.guidance is `constant`")?,
+            (Guidance::Constant, _) | (_, None) => {}
+            (_, Some(lambda)) => check("lambda", *lambda, false, "absent unless agent.guidance is `constant`")?,
+        }
+        let Eta { initial, minimum, maximum, .. } = config.eta;
+        check("eta.maximum", *maximum, *maximum >= *minimum, "at least eta.minimum")?;
+        let within = (*minimum..=*maximum).contains(&*initial);
+        check("eta.initial", *initial, within, "between eta.minimum and eta.maximum")?;
+        Ok(config)
+    }
+}

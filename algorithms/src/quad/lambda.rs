@@ -1,0 +1,81 @@
+//! What λ does in a batch, and how guidance stands to behaviour cloning, in one pass on the CPU.
+
+use super::guidance::Guide;
+use candle_core::Tensor;
+
+/// Parts of the chain t = 1…T that have a mean of their own.
+const FIFTHS: usize = 5;
+
+/// How many numbers [`measure`] gives.
+const COUNT: usize = 13;
+
+/// What [`measure`] has to know of a batch: ν̂² and δ's share, `[]`; λ and σ², `[B]`; ḡ and the error ε_θ − ε, `[B, a]`.
+pub(super) fn needed<'a>(guide: &'a Guide, error: &'a Tensor) -> [&'a Tensor; 6] {
+    [&guide.nu_squared, &guide.delta_share, &guide.lambda, &guide.sigma_squared, &guide.gradient, error]
+}
+
+/// The metrics from `delta_share` on, of the numbers of [`needed`], one tensor after the other; without guidance there are none,
+/// and the metrics are 0. `t` is each sample's, of `steps` T.
+pub(super) fn measure(numbers: &[f32], t: &[u32], steps: usize, delta: f32) -> [f32; COUNT] {
+    let [nu_squared, delta_share, rows @ ..] = numbers else { return [0.0; COUNT] };
+    let (lambda, rows) = rows.split_at(t.len());
+    let (sigma_squared, rows) = rows.split_at(t.len());
+    let (gradient, error) = rows.split_at(rows.len() / 2);
+    let lambda_mean = mean(lambda.iter().copied());
+    let [low, median, high] = quantiles(lambda);
+    let [first, second, third, fourth, fifth] = by_fifth(lambda, t, steps, lambda_mean);
+    let width = gradient.len() / t.len();
+    let cosines = gradient.chunks(width).zip(error.chunks(width)).map(|(one, other)| cosine(one, other));
+    [
+        *delta_share,
+        lambda_mean,
+        low,
+        median,
+        high,
+        first,
+        second,
+        third,
+        fourth,
+        fifth,
+        mean(lambda.iter().map(|lambda| f32::from(*lambda > 0.99))),
+        mean(sigma_squared.iter().copied()) / (nu_squared + delta),
+        mean(cosines),
+    ]
+}
+
+fn mean(values: impl ExactSizeIterator<Item = f32>) -> f32 {
+    let count = values.len() as f64;
+    (values.map(f64::from).sum::<f64>() / count) as f32
+}
+
+/// Those at 10 %, 50 % and 90 %, linear between the two nearest values.
+fn quantiles(values: &[f32]) -> [f32; 3] {
+    let mut sorted = values.to_vec();
+    sorted.sort_unstable_by(f32::total_cmp);
+    [0.1, 0.5, 0.9].map(|share| {
+        let place = share * (sorted.len() - 1) as f32;
+        let (below, above) = (sorted[place.floor() as usize], sorted[place.ceil() as usize]);
+        below + (above - below) * place.fract()
+    })
+}
+
+/// The mean of each fifth of the chain, or `otherwise` where no sample is of it.
+fn by_fifth(lambda: &[f32], t: &[u32], steps: usize, otherwise: f32) -> [f32; FIFTHS] {
+    let mut sums = [(0.0, 0); FIFTHS];
+    for (lambda, t) in lambda.iter().zip(t) {
+        let (sum, count) = &mut sums[FIFTHS * (*t as usize - 1) / steps];
+        *sum += f64::from(*lambda);
+        *count += 1;
+    }
+    sums.map(|(sum, count)| if count == 0 { otherwise } else { (sum / f64::from(count)) as f32 })
+}
+
+/// Of two vectors; 0 where one is 0.
+fn cosine(one: &[f32], other: &[f32]) -> f32 {
+    let dot = |x: &[f32], y: &[f32]| x.iter().zip(y).map(|(x, y)| x * y).sum::<f32>();
+    let size = (dot(one, one) * dot(other, other)).sqrt();
+    if size == 0.0 { 0.0 } else { dot(one, other) / size }
+}
+
+#[cfg(test)]
+mod tests;

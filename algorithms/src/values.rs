@@ -1,0 +1,77 @@
+//! An algorithm's file of hyper-parameters: what all tasks share, and what groups of tasks have of their own.
+//!
+//! `[for."PATTERN"]` holds keys of an experiment for the tasks that fit the pattern, in which `*` stands for any letters. Of
+//! several such groups the one whose pattern has more letters wins.
+
+use std::collections::BTreeMap;
+
+use anyhow::Context;
+use serde::Deserialize;
+use toml::{Table, Value};
+
+use crate::Definition;
+
+/// The file of one algorithm.
+#[derive(Debug, Deserialize)]
+pub struct Values {
+    /// What the algorithm is, in a few words.
+    pub about: String,
+    /// Patterns of the tasks for which its authors give values.
+    pub given: Vec<String>,
+    /// Keys of an experiment by pattern.
+    #[serde(rename = "for", default)]
+    groups: BTreeMap<String, Table>,
+    /// Keys of an experiment that all tasks share.
+    #[serde(flatten)]
+    shared: Table,
+}
+
+impl Values {
+    /// Those of an algorithm.
+    ///
+    /// # Errors
+    /// Its file is broken, which a test of each excludes.
+    pub fn of(definition: &Definition) -> anyhow::Result<Self> {
+        toml::from_str(definition.settings).with_context(|| format!("the file of algorithm {}", definition.name))
+    }
+
+    /// Keys of an experiment for a task; without one, what all tasks share.
+    pub fn for_task(&self, task: Option<&str>) -> Table {
+        let of_task = |pattern: &str| task.is_some_and(|task| fits(pattern, task));
+        let mut groups: Vec<_> = self.groups.iter().filter(|(pattern, _)| of_task(pattern)).collect();
+        groups.sort_by_key(|(pattern, _)| letters(pattern));
+        let mut table = self.shared.clone();
+        groups.into_iter().for_each(|(_, keys)| merge(&mut table, keys.clone()));
+        table
+    }
+}
+
+/// Whether a name fits a pattern, in which `*` stands for any letters.
+pub fn fits(pattern: &str, name: &str) -> bool {
+    match pattern.split_once('*') {
+        None => pattern == name,
+        Some((before, after)) => name.strip_prefix(before).is_some_and(|rest| {
+            let mut ends = rest.char_indices().map(|(end, _)| end).chain([rest.len()]);
+            ends.any(|end| fits(after, &rest[end..]))
+        }),
+    }
+}
+
+/// Lays `changes` over `table`: tables key by key, anything else in place of what was there. An integer that takes a
+/// number's place becomes one, so that 1 and 1.0 are the same setting.
+pub fn merge(table: &mut Table, changes: Table) {
+    for (key, change) in changes {
+        match (table.get_mut(&key), change) {
+            (Some(Value::Table(below)), Value::Table(change)) => merge(below, change),
+            (Some(Value::Float(below)), Value::Integer(change)) => *below = change as f64,
+            (_, change) => drop(table.insert(key, change)),
+        }
+    }
+}
+
+fn letters(pattern: &str) -> usize {
+    pattern.chars().filter(|letter| *letter != '*').count()
+}
+
+#[cfg(test)]
+mod tests;

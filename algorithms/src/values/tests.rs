@@ -1,0 +1,99 @@
+//! Tests of `values.rs`.
+
+use toml::toml;
+
+use super::*;
+use crate::ALGORITHMS;
+
+fn values() -> Values {
+    let file = toml! {
+        about = "an example"
+        given = ["*-v2", "antmaze-*"]
+        steps = 1
+        seed = 0
+        [agent]
+        rate = 1.0
+        width = 8
+        [for."*-demo"]
+        steps = 2
+        seed = 2
+        [for."antmaze-*"]
+        steps = 3
+        agent.rate = 3
+        [for."antmaze-*-demo"]
+        seed = 4
+    };
+    file.try_into().unwrap()
+}
+
+#[test]
+fn the_pattern_with_more_letters_wins_key_by_key() {
+    for (task, steps, seed, rate) in [
+        (None, 1, 0, 1.0),
+        (Some("hopper-medium-v2"), 1, 0, 1.0),
+        (Some("hopper-demo"), 2, 2, 1.0),
+        (Some("antmaze-umaze-v0"), 3, 0, 3.0),
+        (Some("antmaze-umaze-demo"), 3, 4, 3.0),
+    ] {
+        let expected = toml! { steps = steps seed = seed agent = { rate = rate, width = 8 } };
+        assert_eq!(values().for_task(task), expected, "{task:?}");
+    }
+}
+
+#[test]
+fn a_star_stands_for_any_letters() {
+    for (pattern, name, expected) in [
+        ("a-b", "a-b", true),
+        ("a-b", "a-bc", false),
+        ("*-b", "a-b", true),
+        ("a*", "a", true),
+        ("a-*-d", "a-b-c-d", true),
+        ("a-*-d", "a-d", false),
+        ("*ab*", "aab", true),
+        ("*é*", "aéb", true),
+    ] {
+        assert_eq!(fits(pattern, name), expected, "{pattern} {name}");
+    }
+}
+
+/// The tasks of `presets/tasks.toml`.
+fn tasks() -> Vec<String> {
+    let tasks: Table = include_str!("../../../presets/tasks.toml").parse().unwrap();
+    tasks["task"].as_array().unwrap().iter().map(|task| task["name"].as_str().unwrap().to_owned()).collect()
+}
+
+/// The keys of a group, those of its tables with a dot.
+fn keys(group: &Table) -> Vec<String> {
+    let inner = |key: &String, value: &Value| match value {
+        Value::Table(table) => keys(table).into_iter().map(|rest| format!("{key}.{rest}")).collect(),
+        _ => vec![key.clone()],
+    };
+    group.iter().flat_map(|(key, value)| inner(key, value)).collect()
+}
+
+/// Of two patterns with as many letters neither wins.
+#[test]
+fn in_no_file_two_patterns_are_equally_good_for_a_key() {
+    for definition in ALGORITHMS {
+        let values = Values::of(&definition).unwrap();
+        for task in tasks() {
+            let groups: Vec<_> = values.groups.iter().filter(|(pattern, _)| fits(pattern, &task)).collect();
+            let keys: Vec<_> = groups
+                .iter()
+                .flat_map(|(pattern, table)| keys(table).into_iter().map(|key| (letters(pattern), key)))
+                .collect();
+            let different: std::collections::BTreeSet<_> = keys.iter().collect();
+            assert_eq!(different.len(), keys.len(), "{} for {}: {keys:?}", definition.name, task);
+        }
+        for pattern in values.groups.keys().chain(&values.given) {
+            assert!(tasks().iter().any(|task| fits(pattern, task)), "no task fits {pattern}");
+        }
+    }
+}
+
+#[test]
+fn a_difference_changes_what_it_names_and_nothing_else() {
+    let mut table = toml::toml! { a = 1.5 b = [1, 2] [c] d = 1 e = "x" };
+    merge(&mut table, toml::toml! { a = 2 b = [3] [c] e = "y" f = true });
+    assert_eq!(table, toml::toml! { a = 2.0 b = [3] [c] d = 1 e = "y" f = true });
+}

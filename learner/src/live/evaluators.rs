@@ -1,0 +1,146 @@
+//! Which evaluators are connected, when each last reported progress, and the log lines about them.
+
+use std::collections::{BTreeMap, BTreeSet};
+use std::mem;
+use std::time::{Duration, Instant};
+
+use quad_protocol::{Name, Progress};
+
+use super::metrics::EvaluatorMetrics;
+use super::rejection::Rejection;
+
+/// The metrics of an evaluator that has left are dropped this long after its last progress message.
+const FORGET_AFTER: Duration = Duration::from_secs(600);
+/// Most evaluators that the learner tracks: far above any real pool. The limit bounds the memory that made-up names take.
+const MOST_EVALUATORS: usize = 1024;
+/// So many evaluators per period get a log line of their own; the rest are one line with a number.
+const ONE_BY_ONE: usize = 20;
+const PERIOD: Duration = Duration::from_secs(10);
+
+/// The connected evaluators, and those whose last message is recent.
+#[derive(Debug)]
+pub(super) struct Evaluators {
+    metrics: EvaluatorMetrics,
+    present: BTreeSet<Name>,
+    /// The connected evaluators that have the run's environment.
+    fitting: BTreeSet<Name>,
+    last_seen: BTreeMap<Name, Instant>,
+    news: News,
+}
+
+impl Evaluators {
+    pub fn new(metrics: EvaluatorMetrics, now: Instant) -> Self {
+        let news = News { since: now, told: 0, joined: 0, left: 0, lines: Vec::new() };
+        Self { metrics, present: BTreeSet::new(), fitting: BTreeSet::new(), last_seen: BTreeMap::new(), news }
+    }
+
+    /// The number of connected evaluators.
+    pub fn count(&self) -> usize {
+        self.present.len()
+    }
+
+    /// Whether a connected evaluator has the run's environment.
+    pub fn any_fits(&self) -> bool {
+        !self.fitting.is_empty()
+    }
+
+    /// The connected evaluators: whether each has the run's environment, and when its last message came.
+    pub fn present(&self) -> impl Iterator<Item = (&Name, bool, Option<Instant>)> {
+        let seen = |evaluator: &Name| self.last_seen.get(evaluator).copied();
+        self.present.iter().map(move |evaluator| (evaluator, self.fitting.contains(evaluator), seen(evaluator)))
+    }
+
+    /// Records that an evaluator asked for a job, and has the run's environment.
+    pub fn fits(&mut self, evaluator: &Name) {
+        if self.present.contains(evaluator) && !self.fitting.contains(evaluator) {
+            self.fitting.insert(evaluator.clone());
+        }
+    }
+
+    /// Records that an evaluator is connected.
+    pub fn joined(&mut self, evaluator: Name) -> Result<(), Rejection> {
+        if self.present.len() >= MOST_EVALUATORS && !self.present.contains(&evaluator) {
+            return Err(Rejection::Crowd);
+        }
+        let line = format!("evaluator {evaluator} is here");
+        if self.present.insert(evaluator) && !self.news.tell(line) {
+            self.news.joined += 1;
+        }
+        self.metrics.present.set(self.present.len() as i64);
+        Ok(())
+    }
+
+    /// Records that an evaluator has left; the learner took back `jobs` of its jobs.
+    pub fn left(&mut self, evaluator: &Name, jobs: usize) {
+        if !self.present.remove(evaluator) {
+            return;
+        }
+        self.fitting.remove(evaluator);
+        self.metrics.present.set(self.present.len() as i64);
+        let line = match jobs {
+            0 => format!("evaluator {evaluator} has left"),
+            _ => format!("evaluator {evaluator} has left; its {jobs} unfinished jobs go to others"),
+        };
+        if !self.news.tell(line) {
+            self.news.left += 1;
+        }
+    }
+
+    /// Records an evaluator's progress message.
+    pub fn heard(&mut self, progress: Progress, now: Instant) -> Result<(), Rejection> {
+        if self.last_seen.len() >= MOST_EVALUATORS && !self.last_seen.contains_key(&progress.evaluator) {
+            return Err(Rejection::Crowd);
+        }
+        self.metrics.observe(&progress);
+        self.last_seen.insert(progress.evaluator, now);
+        Ok(())
+    }
+
+    /// Forgets evaluators that left long ago. Returns the log lines since the last call.
+    pub fn tick(&mut self, now: Instant) -> Vec<String> {
+        let (present, metrics) = (&self.present, &self.metrics);
+        self.last_seen.retain(|evaluator, seen| {
+            let keep = present.contains(evaluator) || now.duration_since(*seen) < FORGET_AFTER;
+            if !keep {
+                metrics.forget(evaluator);
+            }
+            keep
+        });
+        self.news.take(now)
+    }
+}
+
+/// Log lines about evaluators that come and go: one for each of a few, a number for many.
+#[derive(Debug)]
+struct News {
+    since: Instant,
+    told: usize,
+    joined: usize,
+    left: usize,
+    lines: Vec<String>,
+}
+
+impl News {
+    /// Whether this one gets a line of its own.
+    fn tell(&mut self, line: String) -> bool {
+        self.told += 1;
+        let may = self.told <= ONE_BY_ONE;
+        if may {
+            self.lines.push(line);
+        }
+        may
+    }
+
+    fn take(&mut self, now: Instant) -> Vec<String> {
+        if now.duration_since(self.since) >= PERIOD {
+            if self.joined + self.left > 0 {
+                self.lines.push(format!("{} more evaluators came and {} left", self.joined, self.left));
+            }
+            (self.since, self.told, self.joined, self.left) = (now, 0, 0, 0);
+        }
+        mem::take(&mut self.lines)
+    }
+}
+
+#[cfg(test)]
+mod tests;

@@ -1,0 +1,52 @@
+//! A run at work: its threads, its main loop, and all its communication over Zenoh.
+//!
+//! The main loop ([`MainLoop`]) runs on the main thread: it reports events and decides when the run is over. The other threads
+//! report to it alone, through one queue of [`events`](Event). docs/architecture.md has a table of all threads. The module
+//! `command` starts a run; no module below calls this one.
+//!
+//! In reading order:
+//!
+//! - `threads` starts (with `spawn`) and ends the threads; `events` are their reports to `main_loop`; `network` opens the
+//!   session meanwhile, and `duplicate` looks for another learner of the same name.
+//! - `snapshots` is the thread that writes the output of training, and publishes snapshots through `weights`.
+//! - `wire` declares everything on Zenoh; `services` assigns each kind of message to a `pool` of threads or to the thread
+//!   `scores`, which writes scores. `requests`: queries that wait for their answer.
+//! - `coordinator` is the state that the threads share: the scoreboard and the `evaluators`. `rejection`: why the learner does
+//!   not accept a message.
+//! - `metrics` are for Prometheus; `tensorboard` is the thread that copies the run to an event file; `disk` reports a disk
+//!   that refuses writes; `display` is the terminal, `live` the state for the page.
+
+mod coordinator;
+mod disk;
+mod display;
+mod duplicate;
+mod evaluators;
+mod events;
+mod live;
+mod local_evaluators;
+mod main_loop;
+mod metrics;
+mod network;
+mod patience;
+mod pool;
+mod rejection;
+mod requests;
+mod scores;
+mod services;
+mod snapshots;
+mod spawn;
+mod tensorboard;
+#[cfg(test)]
+mod tests;
+mod threads;
+mod weights;
+mod wire;
+
+pub(crate) use display::Display;
+pub(crate) use duplicate::Life;
+pub(crate) use live::Live;
+pub(crate) use local_evaluators::{LocalEvaluators, not_encrypted, spawn_logged};
+pub(crate) use main_loop::{Ending, MainLoop};
+pub(crate) use metrics::Metrics;
+pub(crate) use network::{Opening, open_network};
+pub(crate) use threads::{Run, STUCK, Threads};

@@ -1,0 +1,168 @@
+//! The threads of a run, started together and ended in order.
+
+use std::collections::BTreeMap;
+use std::path::Path;
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::thread::JoinHandle;
+use std::time::Duration;
+
+use quad_dataset::{Task, Transitions};
+use quad_runs::config::{Experiment, RunConfig};
+use quad_runs::run::{Log, Past, RunDir};
+use quad_runtime::Health;
+
+use super::coordinator::{Coordinator, EvaluationPlan};
+use super::disk::DiskStatus;
+use super::duplicate::Life;
+use super::events::{Events, Saved};
+use super::metrics::Metrics;
+use super::scores::Scores;
+use super::services::Services;
+use super::snapshots::Snapshots;
+use super::spawn::spawn_alive;
+use super::tensorboard::TensorBoard;
+use super::weights::Weights;
+use crate::evaluation::{Earlier, Rules};
+use crate::report::Exporter;
+use crate::train::{Outbox, Training};
+
+/// Most episodes in one job, so that two evaluators share an evaluation of ten; and most when hundreds wait.
+const JOB_EPISODES: [usize; 2] = [5, 40];
+/// Lease of a job. An evaluator reports progress at least three times in it, and Zenoh notices a lost evaluator after about 5
+/// s.
+const LEASE: Duration = Duration::from_secs(15);
+/// A thread that answers or writes is stuck if it has not reported for this long.
+pub(crate) const STUCK: Duration = Duration::from_secs(30);
+/// The same for training, whose slowest steps take seconds.
+const TRAINING_STUCK: Duration = Duration::from_secs(300);
+
+/// A run and its state.
+pub(crate) struct Run<'a> {
+    pub life: Life,
+    pub config: &'a RunConfig,
+    /// The run's folder.
+    pub dir: &'a RunDir,
+    /// The run's scores, open for appending.
+    pub scores: Log,
+    /// What earlier processes of this run have reached.
+    pub past: Past,
+    /// Least time between two checkpoints.
+    pub checkpoint_every: Duration,
+    /// Folder for TensorBoard's event files, if there are any.
+    pub tensorboard: Option<&'a Path>,
+}
+
+/// The running threads.
+pub(crate) struct Threads {
+    pub(super) services: Services,
+    outbox: Outbox,
+    stop: Arc<AtomicBool>,
+    training: JoinHandle<()>,
+    snapshots: JoinHandle<()>,
+    scores: JoinHandle<()>,
+    tensorboard: Option<TensorBoard>,
+}
+
+impl Threads {
+    /// Starts all threads.
+    pub fn start(
+        run: Run<'_>,
+        transitions: Transitions,
+        metrics: &Metrics,
+        health: &Health,
+        events: &Events,
+    ) -> anyhow::Result<Self> {
+        let Run { life, config, dir, scores, past, checkpoint_every, tensorboard } = run;
+        let Past { checkpoint, snapshots: known, scores: earlier } = past;
+        let experiment = &config.experiment;
+        let task = Task::new(&experiment.environment, transitions.observation_dim(), transitions.action_dim());
+        let coordinator = coordinator(&life, experiment, task, earlier, metrics, events);
+        for (&step, &hash) in &known {
+            coordinator.open(step, hash)?;
+        }
+        let weights = Weights::new(life.run, life.incarnation, dir.clone(), coordinator.clone());
+        let (services, deliveries) =
+            Services::start(coordinator.clone(), weights.clone(), metrics.clone(), events.clone())?;
+
+        let disk = |what| DiskStatus::new(what, &metrics.disk, events.clone());
+        let scores =
+            Scores { log: scores, deliveries, coordinator, metrics: metrics.clone(), disk: disk(Saved::Scores) };
+        let scores = spawn_alive("scores", events, health.part("scores", STUCK), move |beat| scores.run(beat))?;
+
+        let step = checkpoint.as_ref().map_or(0, |checkpoint| checkpoint.step);
+        metrics.training.gradient_steps.inc_by(step);
+        let (rows, seconds_before) = dir.metrics_log(step)?;
+        // Cuts off what training will repeat now, so that the event file does not contain it.
+        let tensorboard =
+            tensorboard.map(|folder| TensorBoard::start(Exporter::new(dir.path(), folder))).transpose()?;
+        let outbox = Outbox::default();
+        let snapshots = Snapshots {
+            outbox: outbox.clone(),
+            run_dir: dir.clone(),
+            rows,
+            weights,
+            metrics: metrics.clone(),
+            events: events.clone(),
+            known,
+            disk: disk(Saved::Run),
+        };
+        let snapshots =
+            spawn_alive("snapshots", events, health.part("snapshots", STUCK), move |beat| snapshots.run(beat))?;
+
+        let stop = Arc::new(AtomicBool::new(false));
+        let training = Training {
+            experiment: experiment.clone(),
+            device: config.run.device,
+            transitions: Arc::new(transitions),
+            checkpoint,
+            checkpoint_every,
+            seconds_before,
+            metrics: metrics.training.clone(),
+            outbox: outbox.clone(),
+            stop: stop.clone(),
+        };
+        let training =
+            spawn_alive("training", events, health.part("training", TRAINING_STUCK), move |beat| training.run(beat))?;
+        Ok(Self { services, outbox, stop, training, snapshots, scores, tensorboard })
+    }
+
+    /// Asks training to end after its current step.
+    pub fn stop_training(&self) {
+        self.stop.store(true, Ordering::Relaxed);
+    }
+
+    /// Ends the threads: their output is on the disk afterwards. A thread that failed has told the main loop.
+    pub fn join(self) {
+        self.stop_training();
+        self.training.join().ok();
+        self.outbox.close();
+        self.snapshots.join().ok();
+        self.services.deliveries.send(None).ok();
+        self.scores.join().ok();
+        if let Some(tensorboard) = self.tensorboard {
+            tensorboard.end();
+        }
+    }
+}
+
+/// The shared state of jobs and scores, at the start of this process.
+fn coordinator(
+    life: &Life,
+    experiment: &Experiment,
+    task: Task,
+    earlier: BTreeMap<u64, Earlier>,
+    metrics: &Metrics,
+    events: &Events,
+) -> Coordinator {
+    let rules = Rules {
+        run: life.run.clone(),
+        incarnation: life.incarnation,
+        task,
+        environment_seed: experiment.seed,
+        job_episodes: JOB_EPISODES,
+        lease: LEASE,
+    };
+    let plan = EvaluationPlan { seed: experiment.seed, episodes: experiment.episodes };
+    Coordinator::new(rules, plan, earlier, metrics.clone(), events.clone())
+}

@@ -1,0 +1,79 @@
+//! Sends snapshots: the learner publishes each once, and evaluators that missed it can ask for it.
+
+use std::sync::{Arc, Mutex, OnceLock, PoisonError};
+
+use anyhow::Context;
+use quad_protocol::{Hash, Name, Snapshot, encode, keys};
+use quad_runs::run::RunDir;
+use tracing::debug;
+use zenoh::bytes::ZBytes;
+use zenoh::qos::CongestionControl;
+use zenoh::{Session, Wait};
+
+use super::coordinator::Coordinator;
+use super::rejection::Rejection;
+
+/// What all snapshots of a run share, and where they are. Clones share it.
+#[derive(Clone)]
+pub(super) struct Weights {
+    run: Name,
+    incarnation: u64,
+    run_dir: RunDir,
+    coordinator: Coordinator,
+    /// Set once the learner is online.
+    session: Arc<OnceLock<Session>>,
+    /// The newest snapshot with its step, ready to send; older ones come from the disk.
+    newest: Arc<Mutex<Option<(u64, ZBytes)>>>,
+}
+
+impl Weights {
+    pub fn new(run: Name, incarnation: u64, run_dir: RunDir, coordinator: Coordinator) -> Self {
+        Self { run, incarnation, run_dir, coordinator, session: Arc::default(), newest: Arc::default() }
+    }
+
+    /// Sets the session, so that later snapshots are published.
+    pub fn online(&self, session: &Session) {
+        self.session.set(session.clone()).ok();
+    }
+
+    /// Opens the evaluation of a snapshot that is on the disk, and publishes it.
+    ///
+    /// # Errors
+    /// The snapshot is too large to be sent, or the step is known with other weights.
+    pub fn publish(&self, step: u64, hash: Hash, file: Vec<u8>) -> anyhow::Result<()> {
+        let bytes = self.message(step, hash, file)?;
+        *self.newest.lock().unwrap_or_else(PoisonError::into_inner) = Some((step, bytes.clone()));
+        // The jobs must exist first: evaluators claim one as soon as the snapshot arrives.
+        self.coordinator.open(step, hash)?;
+        if let Some(session) = self.session.get() {
+            // An evaluator that does not read loses the snapshot instead of delaying others. It asks for it when it gets a
+            // job.
+            let put = session.put(keys::weights(&self.run), bytes).congestion_control(CongestionControl::Drop);
+            if let Err(error) = put.wait() {
+                debug!(%error, step, "the snapshot could not be published");
+            }
+        }
+        Ok(())
+    }
+
+    /// The snapshot of a step, for an evaluator that asks.
+    pub fn of(&self, step: u64) -> Result<ZBytes, Rejection> {
+        let newest = self.newest.lock().unwrap_or_else(PoisonError::into_inner).clone();
+        if let Some((_, bytes)) = newest.filter(|(newest, _)| *newest == step) {
+            return Ok(bytes);
+        }
+        let hash = self.coordinator.weights(step).ok_or(Rejection::NoSnapshot)?;
+        self.read(step, hash).map_err(Rejection::Unreadable)
+    }
+
+    fn read(&self, step: u64, hash: Hash) -> anyhow::Result<ZBytes> {
+        let file = self.run_dir.read_snapshot(step)?;
+        anyhow::ensure!(Hash::of(&file) == hash, "the file was changed");
+        self.message(step, hash, file)
+    }
+
+    fn message(&self, step: u64, hash: Hash, file: Vec<u8>) -> anyhow::Result<ZBytes> {
+        let snapshot = Snapshot { run: self.run.clone(), incarnation: self.incarnation, step, hash, file };
+        Ok(encode(&snapshot).context("the snapshot cannot be sent to evaluators")?.into())
+    }
+}

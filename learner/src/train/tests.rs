@@ -1,0 +1,253 @@
+//! The training loop: what it hands over and when, and how it ends.
+
+use std::sync::Arc;
+use std::sync::atomic::AtomicBool;
+use std::time::Duration;
+
+use candle_core::Device;
+use quad_algorithms::{Agent, Context};
+use quad_dataset::{BatchSampler, D4rlWriter, Metadata, ReadOptions, RewardRule, Row, Scale, Transitions, environment};
+use quad_policy::Precision;
+use quad_protocol::Origin;
+use quad_runs::config::hyperparameters::algorithm as definition;
+use quad_runs::config::{Schedule, resolve};
+use quad_runs::run::Checkpoint;
+use quad_runtime::{Beat, Health};
+
+use super::outbox::{Outbox, Work};
+use super::results::{self, Outcome};
+use super::steps::{Outlets, Plan, TrainError, train};
+use super::{Registrar, Training, TrainingMetrics};
+
+/// What a run has handed over.
+struct Result {
+    outcome: std::result::Result<Outcome, TrainError>,
+    /// Step, whether it is to be evaluated.
+    snapshots: Vec<(u64, bool)>,
+    /// The newest one.
+    checkpoint: Option<Checkpoint>,
+    rows: Vec<results::Row>,
+    metrics: TrainingMetrics,
+}
+
+fn beat() -> Beat {
+    Health::default().part("training", Duration::from_secs(60))
+}
+
+fn transitions() -> Transitions {
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("tiny.hdf5");
+    let hopper = environment::find("hopper").unwrap();
+    let mut writer = D4rlWriter::create(&path, hopper).unwrap();
+    for step in 0..100 {
+        let observation = |step: usize| Vec::from_iter((0..11).map(|i| ((step + 3 * i) as f64 * 0.1).sin()));
+        let row = Row {
+            observation: &observation(step),
+            action: &[0.1, -0.2, 0.3],
+            next_observation: &observation(step + 1),
+            reward: if step < 50 { 1.0 } else { 2.0 },
+            terminal: false,
+            timeout: step % 50 == 49,
+            qpos: &[0.0; 6],
+            qvel: &[0.0; 6],
+        };
+        writer.push(&row).unwrap();
+    }
+    writer.finish(&Metadata { algorithm: "made up", iteration: 0, seed: 0 }).unwrap();
+    Transitions::read(
+        &path,
+        &ReadOptions { environment: Some(hopper), reward: RewardRule::Locomotion, scale: Scale::default() },
+    )
+    .unwrap()
+}
+
+/// Hyper-parameters of the demonstration with small networks.
+fn small(algorithm: &str) -> toml::Table {
+    let asked = toml::Table::from_iter([("algorithm".to_owned(), algorithm.into())]);
+    let mut table = resolve("hopper-demo", &asked).unwrap().agent;
+    for name in ["actor", "critic", "value"] {
+        if let Some(layers) = table.get_mut(name) {
+            layers["hidden"] = vec![8, 8].into();
+        }
+    }
+    table
+}
+
+/// Evaluations at an interval, checkpoints after every step.
+fn plan(steps: u64, eval_interval: u64) -> Plan {
+    Plan { schedule: Schedule { steps, eval_interval }, checkpoint_every: Duration::ZERO, seconds_before: 0.0 }
+}
+
+fn run(plan: Plan, algorithm: &str, table: &toml::Table, stop: bool) -> Result {
+    run_from(None, plan, algorithm, table, stop)
+}
+
+fn run_from(from: Option<&Checkpoint>, plan: Plan, algorithm: &str, table: &toml::Table, stop: bool) -> Result {
+    run_of(plan.schedule.steps, from, plan, algorithm, table, stop)
+}
+
+/// A part of a run of so many steps in all.
+fn run_of(
+    total_steps: u64,
+    from: Option<&Checkpoint>,
+    plan: Plan,
+    algorithm: &str,
+    table: &toml::Table,
+    stop: bool,
+) -> Result {
+    let context = Context {
+        transitions: Arc::new(transitions()),
+        batch_size: 4,
+        total_steps,
+        seed: 0,
+        precision: Precision::F32,
+        device: Device::Cpu,
+    };
+    let definition = definition(algorithm).unwrap();
+    let mut agent = Agent::new(definition, table, context).unwrap();
+    if let Some(checkpoint) = from {
+        agent.load(&checkpoint.state).unwrap();
+    }
+    let mut sampler = BatchSampler::new(agent.items(), 4, 0, agent.step());
+    let make = Registrar { registry: prometheus::Registry::new() };
+    let metrics = TrainingMetrics::new(&make, plan.schedule.steps, definition.metrics).unwrap();
+    let outbox = Outbox::default();
+    let origin = Origin { environment: "hopper".to_owned(), seed: 0, step: 0, episodes: 10 };
+    let (stop, beat) = (&AtomicBool::new(stop), &beat());
+    let outlets = Outlets { metrics: &metrics, outbox: &outbox, origin: &origin, stop, beat };
+    // Nothing takes what it hands over, as with a disk that hangs: training must end all the same.
+    let outcome = train(&mut agent, &mut sampler, plan, &outlets);
+    let mut result = Result { outcome, snapshots: Vec::new(), checkpoint: None, rows: Vec::new(), metrics };
+    outbox.close();
+    while let Some(work) = outbox.next(beat) {
+        match work {
+            Work::Snapshot(policy) => result.snapshots.push((policy.step, policy.evaluate)),
+            Work::Checkpoint(checkpoint) => result.checkpoint = Some(checkpoint),
+            Work::Rows(rows) => result.rows.extend(rows),
+            Work::Ended(_) => panic!("the loop does not say so"),
+        }
+    }
+    result
+}
+
+#[test]
+fn snapshots_come_at_every_interval_and_at_the_end() {
+    let result = run(plan(25, 10), "quad", &small("quad"), false);
+    assert_eq!(result.outcome.unwrap(), Outcome::Completed);
+    assert_eq!(result.snapshots, [(10, true), (20, true), (25, true)]);
+    assert_eq!(result.metrics.gradient_steps.get(), 25);
+    assert_eq!(result.metrics.step_duration.get_sample_count(), 25);
+}
+
+#[test]
+fn without_evaluations_the_last_snapshot_is_kept_all_the_same() {
+    let result = run(plan(25, 0), "quad", &small("quad"), false);
+    assert_eq!(result.snapshots, [(25, false)]);
+}
+
+#[test]
+fn rows_average_a_hundred_steps() {
+    let result = run(plan(450, 0), "quad", &small("quad"), false);
+    assert_eq!(result.outcome.unwrap(), Outcome::Completed);
+    assert_eq!(result.rows.iter().map(|row| row.step).collect::<Vec<_>>(), [100, 200, 300, 400, 450]);
+    for row in result.rows {
+        let json = serde_json::to_value(&row).unwrap();
+        let value = |name: &str| json[name].as_f64().unwrap();
+        assert!(value("eta") == 1.0 && (0.0..=1.0).contains(&value("lambda_mean")) && value("bc_loss") > 0.0, "{json}");
+        assert_eq!(json.as_object().unwrap().len(), 2 + row.metrics.len(), "{json}");
+    }
+}
+
+#[test]
+fn a_stop_ends_after_the_step_with_a_checkpoint() {
+    let result = run(plan(25, 10), "quad", &small("quad"), true);
+    assert_eq!(result.outcome.unwrap(), Outcome::Stopped { step: 1 });
+    assert_eq!(result.snapshots, []);
+    assert_eq!(result.checkpoint.unwrap().step, 1);
+}
+
+#[test]
+fn training_goes_on_from_a_checkpoint_bit_for_bit() {
+    for algorithm in ["quad", "iql"] {
+        let setting = small(algorithm);
+        let whole = run(plan(300, 100), algorithm, &setting, false);
+        for stop_at in [1, 99, 100, 250] {
+            // Learning rates that decay know the end of the whole run.
+            let Plan { schedule, .. } = plan(300, 100);
+            let until = Plan { schedule: Schedule { steps: stop_at, ..schedule }, ..plan(300, 100) };
+            let begun = run_of(300, None, until, algorithm, &setting, false);
+            let rest = run_from(begun.checkpoint.as_ref(), plan(300, 100), algorithm, &setting, false);
+            assert!(rest.checkpoint == whole.checkpoint, "after step {stop_at}");
+            let snapshots: Vec<_> = whole.snapshots.iter().copied().filter(|(step, _)| *step > stop_at).collect();
+            assert_eq!(rest.snapshots, snapshots, "after step {stop_at}");
+        }
+    }
+}
+
+/// The disk hangs: of checkpoints the newest waits, of snapshots all, and of rows so many that none is missed for hours.
+#[test]
+fn what_the_disk_does_not_take_comes_later_in_its_order() {
+    let outbox = Outbox::default();
+    let checkpoint = |step: u64| Checkpoint { step, state: vec![step as u8] };
+    let row = |step| results::Row { step, seconds: 0.0, metrics: &[], values: vec![] };
+    (1..=3).for_each(|step| outbox.checkpoint(checkpoint(step)));
+    (1..=3).for_each(|step| outbox.row(row(step)));
+    let Some(refused) = outbox.next(&beat()) else { panic!("something waits") };
+    outbox.put_back(refused);
+    outbox.ended(Outcome::Completed);
+    assert!(matches!(outbox.next(&beat()), Some(Work::Checkpoint(newest)) if newest == checkpoint(3)));
+    let Some(Work::Rows(rows)) = outbox.next(&beat()) else { panic!("rows wait") };
+    outbox.row(row(4));
+    outbox.put_back(Work::Rows(rows));
+    let Some(Work::Rows(rows)) = outbox.next(&beat()) else { panic!("rows wait") };
+    assert_eq!(rows.iter().map(|row| row.step).collect::<Vec<_>>(), [1, 2, 3, 4]);
+    assert!(matches!(outbox.next(&beat()), Some(Work::Ended(Outcome::Completed))), "the end comes last");
+    outbox.close();
+    assert!(outbox.next(&beat()).is_none());
+}
+
+#[test]
+fn divergence_is_an_error_that_says_where_and_what() {
+    for algorithm in ["quad", "iql"] {
+        let mut table = small(algorithm);
+        table.insert("critic_learning_rate".to_owned(), 1e30.into());
+        let result = run(plan(25, 10), algorithm, &table, false);
+        let error = result.outcome.unwrap_err();
+        assert!(matches!(error, TrainError::Diverged { step: 1..10, .. }), "{error}");
+        assert!(result.snapshots.is_empty(), "nothing broken is handed to evaluation");
+    }
+}
+
+/// Networks whose policy no evaluator can be sent are refused before the first step, and trained if none is to be sent.
+#[test]
+fn a_policy_that_is_too_large_to_send_is_refused_at_the_start() {
+    // Two networks with two layers of 2048 × 2048 numbers each: 64 MiB, and a little more.
+    let large = toml::toml! {
+        steps = 1
+        batch_size = 1
+        agent = { actor.hidden = [2048, 2048, 2048], critic.hidden = [2048, 2048, 2048], critics = 1, samples = 1 }
+    };
+    for (eval_interval, refused) in [(1, true), (0, false)] {
+        let mut experiment = resolve("hopper-demo", &large).unwrap();
+        experiment.eval_interval = eval_interval;
+        let make = Registrar { registry: prometheus::Registry::new() };
+        let metrics = TrainingMetrics::new(&make, 1, experiment.definition().unwrap().metrics).unwrap();
+        let training = Training {
+            experiment,
+            device: quad_runs::config::Device::Cpu,
+            transitions: Arc::new(transitions()),
+            checkpoint: None,
+            checkpoint_every: Duration::ZERO,
+            seconds_before: 0.0,
+            metrics: metrics.clone(),
+            outbox: Outbox::default(),
+            stop: Arc::default(),
+        };
+        let result = training.run(&beat());
+        assert_eq!((result.is_err(), metrics.gradient_steps.get()), (refused, u64::from(!refused)));
+        if let Err(error) = result {
+            let with_hint = format!("{error:#?}");
+            assert!(with_hint.contains("can be sent at most") && with_hint.contains("smaller networks"), "{with_hint}");
+        }
+    }
+}

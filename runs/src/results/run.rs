@@ -1,0 +1,292 @@
+//! One run: its folder, read and summarised.
+
+use std::collections::{BTreeMap, BTreeSet};
+use std::fmt::Alignment::Right;
+use std::fmt::Write;
+use std::path::{Path, PathBuf};
+
+use anyhow::Context;
+use quad_dataset::environment;
+use serde::Serialize;
+
+use super::lambda::LambdaReport;
+use super::spread::Spread;
+use crate::config::RunConfig;
+use crate::run::{RunDir, ScoreLine};
+use crate::table::{Style, Table};
+
+/// Gradient steps at the end of a run over which the paper's appendix B takes the mean.
+const FINAL_STEPS: u64 = 50_000;
+
+/// One snapshot's episodes.
+#[derive(Clone, Debug, PartialEq, Serialize)]
+pub struct EvaluationReport {
+    /// Gradient step of the snapshot.
+    pub step: u64,
+    /// Episodes scored.
+    pub episodes: usize,
+    /// Whether these are all of them.
+    pub complete: bool,
+    /// Score over the episodes: D4RL-normalised, or the return where the environment has no reference returns.
+    pub score: Spread,
+    /// Mean undiscounted return.
+    pub mean_return: f64,
+    /// Mean length in environment steps.
+    pub mean_length: f64,
+}
+
+/// Episodes of an evaluation that have no score.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize)]
+pub struct Missing {
+    /// Gradient step of the snapshot.
+    pub step: u64,
+    /// How many.
+    pub episodes: usize,
+}
+
+/// One run.
+#[derive(Clone, Debug, PartialEq, Serialize)]
+pub struct RunReport {
+    /// Its folder.
+    pub dir: PathBuf,
+    /// Its name.
+    pub run: String,
+    /// What it learns; of a user's file that names no task, the file's name.
+    pub task: String,
+    /// Its algorithm.
+    pub algorithm: String,
+    /// The variant of the algorithm: the kind of guidance for QUAD, such as `quad`, `dac` and `none`, or another algorithm's name.
+    pub variant: String,
+    /// The hyper-parameters that matter most.
+    pub agent: String,
+    /// Seed.
+    pub seed: u64,
+    /// Gradient steps.
+    pub steps: u64,
+    /// Whether scores are D4RL-normalised; without reference returns they are returns.
+    pub normalised: bool,
+    /// Precision that the policies were scored in; several, if evaluators differed.
+    pub scored_in: String,
+    /// Mean score of the dataset's trajectories, of the same kind.
+    pub dataset_score: f64,
+    /// Its evaluations by step.
+    pub evaluations: Vec<EvaluationReport>,
+    /// What has no score, or not yet, by step.
+    pub missing: Vec<Missing>,
+    /// Mean score of the last 3 complete evaluations; absent if they are fewer.
+    pub mean_last_3: Option<f64>,
+    /// The same of the last 5.
+    pub mean_last_5: Option<f64>,
+    /// The same of those in the last 50,000 steps of the run; absent if it has no more steps than that.
+    pub mean_last_50000_steps: Option<f64>,
+    /// What λ was; absent where the algorithm has none.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub lambda: Option<LambdaReport>,
+    /// Whether the evaluators' user decides what counts as a score, such as success, and it is not the return.
+    #[serde(skip)]
+    own_score: bool,
+    #[serde(skip)]
+    pub precisions: BTreeSet<String>,
+    /// Its configuration.
+    #[serde(skip)]
+    pub config: RunConfig,
+}
+
+impl RunReport {
+    /// Reads a run folder.
+    ///
+    /// # Errors
+    /// There is no run in it, or a file is not what a learner writes.
+    pub fn read(path: &Path) -> anyhow::Result<Self> {
+        let scored = Self::scored(path)?;
+        Ok(Self { lambda: LambdaReport::read(path, &scored.variant)?, ..scored })
+    }
+
+    /// The same without what λ was, for which all of `metrics.jsonl` is read.
+    ///
+    /// # Errors
+    /// Those of [`read`](Self::read).
+    pub fn scored(path: &Path) -> anyhow::Result<Self> {
+        Ok(Self::with_scores(path)?.0)
+    }
+
+    /// The same, and the episodes' scores that it is made of.
+    ///
+    /// # Errors
+    /// Those of [`read`](Self::read).
+    pub fn with_scores(path: &Path) -> anyhow::Result<(Self, Vec<ScoreLine>)> {
+        let (dir, config) = RunDir::open(path)?;
+        let agent = config.experiment.method();
+        let agent = agent.with_context(|| format!("config.toml in {} cannot be used", path.display()))?;
+        let variant = config.experiment.variant()?.to_owned();
+        let scores = dir.read_scores()?;
+        Ok((Self::new(path, config, agent, variant, &scores), scores))
+    }
+
+    fn new(path: &Path, config: RunConfig, agent: String, variant: String, lines: &[ScoreLine]) -> Self {
+        let experiment = &config.experiment;
+        let mut by_step: BTreeMap<u64, BTreeMap<u64, &ScoreLine>> = BTreeMap::new();
+        for line in lines {
+            by_step.entry(line.step).or_default().insert(line.seed, line);
+        }
+        let scored = |step| by_step.get(&step).map_or(0, BTreeMap::len);
+        let missing = |step| Missing { step, episodes: (experiment.episodes as usize).saturating_sub(scored(step)) };
+        let missing = experiment.schedule().evaluated_steps().map(missing);
+        let missing = missing.filter(|missing| missing.episodes > 0).collect();
+        let evaluations: Vec<_> = by_step
+            .into_iter()
+            .filter_map(|(step, episodes)| {
+                evaluation(step, &Vec::from_iter(episodes.into_values()), experiment.episodes)
+            })
+            .collect();
+        let complete: Vec<_> = evaluations.iter().filter(|e| e.complete).map(|e| (e.step, e.score.mean)).collect();
+        let mean = |evaluations: &[(u64, f64)]| {
+            let scores: Vec<_> = evaluations.iter().map(|(_, score)| *score).collect();
+            Spread::of(&scores).map(|spread| spread.mean)
+        };
+        let last = |count: usize| mean(&complete[complete.len().checked_sub(count)?..]);
+        let final_steps = experiment.steps.checked_sub(FINAL_STEPS).filter(|start| *start > 0);
+        let in_final_steps = |start| mean(&complete[complete.partition_point(|(step, _)| *step <= start)..]);
+        let normalised = environment::find(&experiment.environment).is_ok();
+        let precisions: BTreeSet<String> = lines.iter().map(precision).collect();
+        Self {
+            dir: path.to_owned(),
+            run: config.run.name.clone(),
+            task: config.run.task.clone(),
+            algorithm: experiment.algorithm.clone(),
+            variant,
+            agent,
+            seed: experiment.seed,
+            steps: experiment.steps,
+            normalised,
+            own_score: !normalised && lines.iter().any(|line| line.score != line.episode_return),
+            scored_in: joined(&precisions),
+            dataset_score: config.dataset.mean_score.unwrap_or(config.dataset.mean_return),
+            mean_last_3: last(3),
+            mean_last_5: last(5),
+            mean_last_50000_steps: final_steps.and_then(in_final_steps),
+            evaluations,
+            missing,
+            lambda: None,
+            precisions,
+            config,
+        }
+    }
+
+    /// Whether every episode of every evaluation has its score.
+    pub fn is_complete(&self) -> bool {
+        self.missing.is_empty()
+    }
+
+    /// Its complete evaluation with the largest score.
+    pub fn best(&self) -> Option<&EvaluationReport> {
+        let complete = self.evaluations.iter().filter(|evaluation| evaluation.complete);
+        complete.max_by(|one, other| one.score.mean.total_cmp(&other.score.mean))
+    }
+
+    /// Its last complete evaluation.
+    pub fn newest(&self) -> Option<&EvaluationReport> {
+        self.evaluations.iter().rfind(|evaluation| evaluation.complete)
+    }
+
+    /// How many of the planned evaluations have all their scores.
+    pub fn evaluations_complete(&self) -> usize {
+        self.evaluations_planned() - self.missing.len()
+    }
+
+    fn evaluations_planned(&self) -> usize {
+        self.config.experiment.schedule().evaluated_steps().count()
+    }
+
+    /// The step of the last complete evaluation of a run that is not complete.
+    pub fn reached(&self) -> Option<u64> {
+        (!self.is_complete()).then_some(self.newest().map_or(0, |evaluation| evaluation.step))
+    }
+
+    /// How far a run has come that is not complete, in words.
+    pub fn how_complete(&self) -> String {
+        format!(
+            "{} of {} evaluations are complete, the last of them after {} of {} steps",
+            self.evaluations_complete(),
+            self.evaluations_planned(),
+            self.reached().unwrap_or(self.steps),
+            self.steps
+        )
+    }
+
+    /// What its scores are: scores of a kind, or returns.
+    pub fn measure(&self) -> &'static str {
+        if self.normalised || self.own_score { "score" } else { "return" }
+    }
+
+    /// The evaluations as a table for people.
+    pub fn table(&self) -> String {
+        let mut header = vec!["step", "episodes", self.measure(), "length"];
+        // Without reference returns the score is the return, unless the user counts something else.
+        let has_both = self.measure() == "score";
+        if has_both {
+            header.insert(3, "return");
+        }
+        let mut table = Table::new(&Vec::from_iter(header.into_iter().map(|name| (name, Right))));
+        for e in &self.evaluations {
+            let episodes = e.episodes.to_string() + if e.complete { "" } else { " (part)" };
+            let mut row = vec![e.step.to_string(), episodes, e.score.text(), format!("{:.1}", e.mean_length)];
+            if has_both {
+                row.insert(3, format!("{:.1}", e.mean_return));
+            }
+            table.push(row);
+        }
+        let mut text = format!(
+            "{}: task {}, {}, {} steps, seed {}, scored in {}\n\n",
+            self.run, self.task, self.agent, self.steps, self.seed, self.scored_in
+        ) + &table.render(Style::Text);
+        if self.evaluations.is_empty() {
+            text.push_str("(no evaluation has a score yet)\n");
+        }
+        // Writing to a string cannot fail.
+        if !self.is_complete() {
+            let episodes: usize = self.missing.iter().map(|missing| missing.episodes).sum();
+            writeln!(text, "{episodes} episodes have no score: {}", self.how_complete()).ok();
+        }
+        text.push('\n');
+        for (name, mean) in [
+            ("last 3 evaluations:", self.mean_last_3),
+            ("last 5 evaluations:", self.mean_last_5),
+            ("last 50000 steps:", self.mean_last_50000_steps),
+            ("dataset:", (!self.own_score).then_some(self.dataset_score)),
+        ] {
+            if let Some(mean) = mean {
+                writeln!(text, "mean {} of the {name:19} {mean:.2}", self.measure()).ok();
+            }
+        }
+        text + &self.lambda.as_ref().map(|lambda| lambda.text(&self.variant)).unwrap_or_default()
+    }
+}
+
+fn evaluation(step: u64, episodes: &[&ScoreLine], expected: u32) -> Option<EvaluationReport> {
+    let mean =
+        |value: fn(&ScoreLine) -> f64| episodes.iter().map(|line| value(line)).sum::<f64>() / episodes.len() as f64;
+    let scores: Vec<_> = episodes.iter().map(|line| line.score).collect();
+    Some(EvaluationReport {
+        step,
+        episodes: episodes.len(),
+        complete: episodes.len() == expected as usize,
+        score: Spread::of(&scores)?,
+        mean_return: mean(|line| line.episode_return),
+        mean_length: mean(|line| line.length.into()),
+    })
+}
+
+/// The precision of a score, whatever instructions it was computed by.
+fn precision(line: &ScoreLine) -> String {
+    match line.precision.split('-').next() {
+        None | Some("") => "unknown".to_owned(),
+        Some(precision) => precision.to_owned(),
+    }
+}
+
+/// `bf16 and f32`; a dash of none.
+pub fn joined<'a>(precisions: impl IntoIterator<Item = &'a String>) -> String {
+    let precisions: BTreeSet<&str> = precisions.into_iter().map(String::as_str).collect();
+    if precisions.is_empty() { "-".to_owned() } else { Vec::from_iter(precisions).join(" and ") }
+}

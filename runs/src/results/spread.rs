@@ -1,0 +1,39 @@
+//! Mean and standard deviation, by both of its conventions.
+
+use serde::Serialize;
+
+/// Mean and standard deviation of some values.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize)]
+pub struct Spread {
+    /// The mean.
+    pub mean: f64,
+    /// The sample's standard deviation, divided by n - 1; absent for a single value.
+    pub std: Option<f64>,
+    /// The population's standard deviation, divided by n, which DAC's code computes; absent for a single value.
+    pub population_std: Option<f64>,
+}
+
+impl Spread {
+    /// Of some values; absent without any.
+    pub fn of(values: &[f64]) -> Option<Self> {
+        let count = values.len() as f64;
+        if values.is_empty() {
+            return None;
+        }
+        let mean = values.iter().sum::<f64>() / count;
+        let squares: f64 = values.iter().map(|value| (value - mean).powi(2)).sum();
+        let std = |divisor: f64| (values.len() > 1).then(|| (squares / divisor).sqrt());
+        Some(Self { mean, std: std(count - 1.0), population_std: std(count) })
+    }
+
+    /// `mean ± std`, by n - 1.
+    pub fn text(self) -> String {
+        format!("{:.2}{}", self.mean, self.std.map(|std| format!(" ± {std:.2}")).unwrap_or_default())
+    }
+
+    /// `mean ± std (std)`, by n - 1 and by n.
+    pub fn text_of_both(self) -> String {
+        let population = self.population_std.map(|std| format!(" ({std:.2})"));
+        self.text() + &population.unwrap_or_default()
+    }
+}

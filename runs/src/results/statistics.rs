@@ -1,0 +1,165 @@
+//! Statistics over runs, each beside its definition. Pure functions: what is random has a seed of its own.
+//!
+//! Those over tasks are of Agarwal et al. 2021, "Deep reinforcement learning at the edge of the statistical precipice"
+//! (NeurIPS), as its authors' library rliable computes them. Their strata are the tasks: a task counts as much as any other,
+//! however many seeds it has.
+
+use rand::{Rng, SeedableRng};
+use rand_chacha::ChaCha8Rng;
+use serde::Serialize;
+
+/// Resamples behind an interval, and sign flips behind a p-value that is not exact.
+pub const RESAMPLES: usize = 10_000;
+/// Pairs up to which all sign flips are tried.
+const EXACT_PAIRS: usize = 16;
+const SEED: u64 = 0;
+
+/// A figure of each run of a method: a list for each task, with a value for each seed. None of them is empty.
+pub type Runs<T = f64> = Vec<Vec<T>>;
+
+/// A statistic, and the ends of its 95 % interval; without these where a task has a single seed, of whose spread nothing is known.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize)]
+pub struct Estimate {
+    /// Of the runs themselves.
+    pub value: f64,
+    /// 2.5 % of the resamples are below it.
+    pub low: Option<f64>,
+    /// 2.5 % of the resamples are above it.
+    pub high: Option<f64>,
+}
+
+impl Estimate {
+    /// `value [low, high]`.
+    pub fn text(self, digits: usize) -> String {
+        let interval = self.low.zip(self.high).map(|(low, high)| format!(" [{low:.digits$}, {high:.digits$}]"));
+        format!("{:.digits$}{}", self.value, interval.unwrap_or_default())
+    }
+}
+
+/// The mean; NaN of nothing.
+pub fn mean(values: &[f64]) -> f64 {
+    values.iter().sum::<f64>() / values.len() as f64
+}
+
+/// The mean over tasks of a task's figure.
+fn over_tasks(scores: &Runs, figure: impl Fn(&[f64]) -> f64) -> f64 {
+    scores.iter().map(|task| figure(task)).sum::<f64>() / scores.len() as f64
+}
+
+/// The mean over tasks of the mean over seeds.
+pub fn mean_of_means(scores: &Runs) -> f64 {
+    over_tasks(scores, mean)
+}
+
+/// The median over tasks of the mean over seeds; of an even number of tasks, the mean of the two in the middle.
+pub fn median_of_means(scores: &Runs) -> f64 {
+    let mut means: Vec<f64> = scores.iter().map(|task| mean(task)).collect();
+    means.sort_by(f64::total_cmp);
+    percentile(&means, 0.5)
+}
+
+/// The mean distance to an expert's score of 100, in units of it; a score above it has none.
+pub fn optimality_gap(scores: &Runs) -> f64 {
+    over_tasks(scores, |task| task.iter().map(|score| (1.0 - score / 100.0).max(0.0)).sum::<f64>() / task.len() as f64)
+}
+
+/// The interquartile mean (IQM): the mean of the scores of all tasks without the lowest and the highest quarter, ⌊n / 4⌋ of n.
+///
+/// Where tasks have unequal numbers of seeds, a score weighs as much less as its task has more of them, and the quarters
+/// are those of the weight: ⌊n / 4⌋ / n of it.
+pub fn interquartile_mean(scores: &Runs) -> f64 {
+    let weigh = |task: &Vec<f64>| 1.0 / (task.len() * scores.len()) as f64;
+    let mut weighed: Vec<_> = scores.iter().flat_map(|task| task.iter().map(|s| (*s, weigh(task)))).collect();
+    weighed.sort_by(|(one, _), (other, _)| one.total_cmp(other));
+    let cut = (weighed.len() / 4) as f64 / weighed.len() as f64;
+    let (mut below, mut sum) = (0.0f64, 0.0);
+    for (score, weight) in weighed {
+        let kept = (below + weight).min(1.0 - cut) - below.max(cut);
+        sum += score * kept.max(0.0);
+        below += weight;
+    }
+    sum / (1.0 - 2.0 * cut)
+}
+
+/// A point of the performance profile: the share of runs that score more than this.
+pub fn share_above(scores: &Runs, threshold: f64) -> f64 {
+    over_tasks(scores, |task| task.iter().filter(|score| **score > threshold).count() as f64 / task.len() as f64)
+}
+
+/// The mean over tasks of P(X > Y): that a run of one method scores more than a run of another. Equal scores count half: it
+/// is the U of Mann and Whitney (1947) over the number of pairs. Both have the same tasks.
+pub fn probability_of_improvement(x: &Runs, y: &Runs) -> f64 {
+    let wins = |x: f64, y: f64| if x == y { 0.5 } else { f64::from(u8::from(x > y)) };
+    let of_task = |(x, y): (&Vec<f64>, &Vec<f64>)| {
+        let all: f64 = x.iter().flat_map(|x| y.iter().map(|y| wins(*x, *y))).sum();
+        all / (x.len() * y.len()) as f64
+    };
+    x.iter().zip(y).map(of_task).sum::<f64>() / x.len() as f64
+}
+
+/// Statistics of some methods' runs, with 95 % percentile intervals of the stratified bootstrap: of each method and in each task,
+/// as many seeds are drawn as there are, with replacement.
+pub fn estimates<T: Copy>(methods: &[&Runs<T>], statistics: impl Fn(&[Runs<T>]) -> Vec<f64>) -> Vec<Estimate> {
+    let mut drawn: Vec<Runs<T>> = methods.iter().map(|runs| (*runs).clone()).collect();
+    let values = statistics(&drawn);
+    if methods.iter().any(|runs| runs.iter().any(|task| task.len() < 2)) {
+        return values.into_iter().map(|value| Estimate { value, low: None, high: None }).collect();
+    }
+    let mut random = ChaCha8Rng::seed_from_u64(SEED);
+    let mut resampled = vec![Vec::with_capacity(RESAMPLES); values.len()];
+    for _ in 0..RESAMPLES {
+        for (drawn, runs) in drawn.iter_mut().flatten().zip(methods.iter().copied().flatten()) {
+            drawn.fill_with(|| runs[random.random_range(0..runs.len())]);
+        }
+        resampled.iter_mut().zip(statistics(&drawn)).for_each(|(all, value)| all.push(value));
+    }
+    let estimate = |(value, mut all): (f64, Vec<f64>)| {
+        all.sort_by(f64::total_cmp);
+        Estimate { value, low: Some(percentile(&all, 0.025)), high: Some(percentile(&all, 0.975)) }
+    };
+    values.into_iter().zip(resampled).map(estimate).collect()
+}
+
+/// The share of sorted values that is below, between two values in proportion.
+fn percentile(sorted: &[f64], share: f64) -> f64 {
+    let position = share * (sorted.len() - 1) as f64;
+    let [below, above] = [position.floor(), position.ceil()].map(|index| sorted[index as usize]);
+    below + (above - below) * position.fract()
+}
+
+/// The two-sided p-value of paired differences whose mean would be 0 by chance: the share of all ways to choose their signs by
+/// which the mean is as far from 0 as it is (Fisher 1935, "The design of experiments", section 21). Of more than 16 pairs
+/// 10,000 ways are drawn, and the one at hand is counted with them (Phipson and Smyth 2010).
+pub fn sign_flip_test(differences: &[f64]) -> f64 {
+    // Sums of the same numbers differ in their last bits by their order.
+    let extreme = differences.iter().sum::<f64>().abs() * (1.0 - 1e-12);
+    let is_as_far = |is_flipped: &mut dyn FnMut(usize) -> bool| {
+        let signed = differences.iter().enumerate().map(|(pair, d)| if is_flipped(pair) { -d } else { *d });
+        signed.sum::<f64>().abs() >= extreme
+    };
+    if differences.len() <= EXACT_PAIRS {
+        let ways = 1u32 << differences.len();
+        let as_far = (0..ways).filter(|way| is_as_far(&mut |pair| way >> pair & 1 == 1)).count();
+        return as_far as f64 / f64::from(ways);
+    }
+    let mut random = ChaCha8Rng::seed_from_u64(SEED);
+    let as_far = (0..RESAMPLES).filter(|_| is_as_far(&mut |_| random.random())).count();
+    (as_far + 1) as f64 / (RESAMPLES + 1) as f64
+}
+
+/// p-values of some comparisons, corrected for their number by Holm's procedure (1979, "A simple sequentially rejective multiple
+/// test procedure"): the i-th smallest of m is multiplied by m − i + 1, and is not below a smaller one's.
+pub fn holm(p_values: &[f64]) -> Vec<f64> {
+    let mut order: Vec<usize> = (0..p_values.len()).collect();
+    order.sort_by(|one, other| p_values[*one].total_cmp(&p_values[*other]));
+    let mut corrected = vec![0.0; p_values.len()];
+    let mut least = 0.0f64;
+    for (rank, index) in order.into_iter().enumerate() {
+        least = least.max(p_values[index] * (p_values.len() - rank) as f64).min(1.0);
+        corrected[index] = least;
+    }
+    corrected
+}
+
+#[cfg(test)]
+mod tests;

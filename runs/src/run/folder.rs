@@ -1,0 +1,278 @@
+//! The folder of a run.
+//!
+//! ```text
+//! config.toml                        the resolved configuration
+//! endpoints.json                     where this learner can be reached; written as soon as it listens
+//! metrics.jsonl                      training metrics, a line every hundred gradient steps
+//! scores.jsonl                       a line per scored episode, written before the evaluator gets its acknowledgement
+//! snapshots/step_000003000.safetensors   target actor and target critics; written before the evaluation of it begins
+//! checkpoints/step_000003000_….safetensors   the newest three states of the training, to go on from
+//! report.json, learning_curve.svg    written at the end
+//! ```
+
+use std::fs::{self, File, TryLockError};
+use std::io;
+use std::path::{Path, PathBuf};
+
+use serde::{Deserialize, Serialize};
+
+use super::checkpoints::{Checkpoint, Checkpoints};
+use super::durable::{self, replace};
+use super::error::{RunDirError, content, io_error};
+use super::lines::{RunEndpoints, ScoreLine};
+use super::log::Log;
+use crate::config::RunConfig;
+
+/// The file by which a sweep remembers that a run has failed.
+const FAILED: &str = "failed";
+
+/// The folder of one run.
+#[derive(Clone, Debug)]
+pub struct RunDir {
+    path: PathBuf,
+}
+
+impl RunDir {
+    /// Whether there is a run in the folder.
+    pub fn is_occupied(path: &Path) -> bool {
+        path.join("config.toml").exists()
+    }
+
+    /// Makes the folder, locks it and saves the configuration; also gives `scores.jsonl`, which holds the lock.
+    ///
+    /// # Errors
+    /// There is a run in it, another learner is just making one, or it cannot be written to.
+    pub fn create(path: &Path, config: &RunConfig) -> Result<(Self, Log), RunDirError> {
+        let occupied = || RunDirError::Occupied(path.to_owned());
+        if Self::is_occupied(path) {
+            return Err(occupied());
+        }
+        let run = Self::at(path);
+        let snapshots = path.join("snapshots");
+        durable::create_folder(&snapshots).map_err(io_error("create", &snapshots))?;
+        // Of two that begin at once, only one gets past this; and scores of unknown origin are not those of a new run.
+        let scores = run.score_log()?;
+        if Self::is_occupied(path) || !scores.is_empty() {
+            return Err(occupied());
+        }
+        let target = path.join("config.toml");
+        let text = toml::to_string(config).map_err(|error| content(&target, None, &error))?;
+        replace(&target, text.as_bytes())?;
+        durable::synchronise_folder(path).map_err(io_error("write", path))?;
+        Ok((run, scores))
+    }
+
+    /// The folder, whatever is in it.
+    pub fn at(path: &Path) -> Self {
+        Self { path: path.to_owned() }
+    }
+
+    /// Whether a learner is at work in it, by its lock on `scores.jsonl`. Where files have no locks, none is.
+    pub fn is_in_use(&self) -> bool {
+        let log = File::open(self.path.join("scores.jsonl"));
+        log.is_ok_and(|log| matches!(log.try_lock_shared(), Err(TryLockError::WouldBlock)))
+    }
+
+    /// Remembers that a run of a sweep has failed, or forgets it.
+    pub fn mark_failed(&self, failed: bool) -> io::Result<()> {
+        let path = self.path.join(FAILED);
+        match failed {
+            true => fs::write(path, ""),
+            false => fs::remove_file(path).or_else(|error| match error.kind() {
+                io::ErrorKind::NotFound => Ok(()),
+                _ => Err(error),
+            }),
+        }
+    }
+
+    /// Whether it is remembered that it has.
+    pub fn has_failed(&self) -> bool {
+        self.path.join(FAILED).exists()
+    }
+
+    /// Renames the folder to one that says that it is older; gives the new path.
+    pub fn set_aside(self) -> Result<PathBuf, RunDirError> {
+        let name = self.path.file_name().unwrap_or_default().to_string_lossy();
+        let mut number = 1;
+        let aside = loop {
+            let candidate = self.path.with_file_name(format!("{name}.old{number}"));
+            if !candidate.exists() {
+                break candidate;
+            }
+            number += 1;
+        };
+        fs::rename(&self.path, &aside).map_err(io_error("rename", &self.path))?;
+        Ok(aside)
+    }
+
+    /// A folder that a learner has written; reads its configuration.
+    pub fn open(path: &Path) -> Result<(Self, RunConfig), RunDirError> {
+        let run = Self::at(path);
+        let config = run.read_config()?;
+        Ok((run, config))
+    }
+
+    /// The configuration that the run began with.
+    pub fn read_config(&self) -> Result<RunConfig, RunDirError> {
+        let source = self.path.join("config.toml");
+        let text = fs::read_to_string(&source).map_err(io_error("read", &source))?;
+        toml::from_str(&text).map_err(|error: toml::de::Error| {
+            let line = error.span().and_then(|at| text.get(..at.start)).map(|before| before.matches('\n').count() + 1);
+            content(&source, line, &error.message())
+        })
+    }
+
+    /// The folder's path.
+    pub fn path(&self) -> &Path {
+        &self.path
+    }
+
+    /// Where the picture of the learning curve goes.
+    pub fn learning_curve(&self) -> PathBuf {
+        self.path.join("learning_curve.svg")
+    }
+
+    /// Says where the learner can be reached.
+    pub fn write_endpoints(&self, endpoints: &RunEndpoints) -> Result<(), RunDirError> {
+        self.write_json("endpoints.json", endpoints)
+    }
+
+    /// Where the learner can be reached that wrote so last, at work or not.
+    pub fn read_endpoints(&self) -> Result<RunEndpoints, RunDirError> {
+        let path = self.path.join("endpoints.json");
+        let text = fs::read_to_string(&path).map_err(io_error("read", &path))?;
+        serde_json::from_str(&text).map_err(|error| content(&path, None, &error))
+    }
+
+    /// Forgets where an earlier learner could be reached.
+    pub fn remove_endpoints(&self) -> Result<(), RunDirError> {
+        let path = self.path.join("endpoints.json");
+        match fs::remove_file(&path) {
+            Err(error) if error.kind() == io::ErrorKind::NotFound => Ok(()),
+            removed => removed.map_err(io_error("remove", &path)),
+        }
+    }
+
+    /// Writes a value as indented JSON; a reader sees the old file or the new one, never half of it.
+    pub fn write_json(&self, name: &str, value: &impl Serialize) -> Result<(), RunDirError> {
+        let path = self.path.join(name);
+        let mut text = serde_json::to_string_pretty(value).map_err(|error| content(&path, None, &error))?;
+        text.push('\n');
+        replace(&path, text.as_bytes())
+    }
+
+    fn snapshot_path(&self, step: u64) -> PathBuf {
+        self.path.join("snapshots").join(format!("step_{step:09}.safetensors"))
+    }
+
+    /// Saves the snapshot of a gradient step. It survives a power cut from then on.
+    pub fn write_snapshot(&self, step: u64, tensors: &[u8]) -> Result<(), RunDirError> {
+        self.make_folder("snapshots")?;
+        replace(&self.snapshot_path(step), tensors)
+    }
+
+    /// Makes a folder of the run again that was removed, but not the run's own.
+    fn make_folder(&self, name: &str) -> Result<(), RunDirError> {
+        let folder = self.path.join(name);
+        match fs::create_dir(&folder) {
+            // Else a power cut could take what will be in it.
+            Ok(()) => durable::synchronise_folder(&folder).map_err(io_error("write", &folder)),
+            Err(error) if error.kind() == io::ErrorKind::NotFound => Err(RunDirError::Gone(self.path.clone())),
+            // There it is, or writing into it will say what is wrong.
+            Err(_) => Ok(()),
+        }
+    }
+
+    /// Reads the snapshot of a gradient step.
+    pub fn read_snapshot(&self, step: u64) -> Result<Vec<u8>, RunDirError> {
+        let path = self.snapshot_path(step);
+        fs::read(&path).map_err(io_error("read", &path))
+    }
+
+    /// Renames a snapshot whose contents are not what was scored, so that it does not count as one any more.
+    pub fn mark_damaged(&self, step: u64) -> Result<(), RunDirError> {
+        let path = self.snapshot_path(step);
+        fs::rename(&path, path.with_extension("damaged")).map_err(io_error("rename", &path))
+    }
+
+    /// Removes what writers that were killed have left behind.
+    pub fn remove_partial_files(&self) {
+        for folder in [self.path.clone(), self.path.join("snapshots"), self.path.join("checkpoints")] {
+            durable::remove_partial_files(&folder);
+        }
+    }
+
+    /// The gradient steps of which there are snapshots, in ascending order.
+    pub fn snapshots(&self) -> Result<Vec<u64>, RunDirError> {
+        let folder = self.path.join("snapshots");
+        let entries = match fs::read_dir(&folder) {
+            Err(error) if error.kind() == io::ErrorKind::NotFound => return Ok(Vec::new()),
+            entries => entries.map_err(io_error("read", &folder))?,
+        };
+        let step = |entry: io::Result<fs::DirEntry>| {
+            let name = entry.ok()?.file_name();
+            name.to_str()?.strip_prefix("step_")?.strip_suffix(".safetensors")?.parse().ok()
+        };
+        let mut steps: Vec<u64> = entries.filter_map(step).collect();
+        steps.sort_unstable();
+        Ok(steps)
+    }
+
+    /// Saves a state of the training, durably, and removes those that are older than the newest three.
+    pub fn write_checkpoint(&self, checkpoint: &Checkpoint) -> Result<(), RunDirError> {
+        self.make_folder("checkpoints")?;
+        Checkpoints::of_run(&self.path).save(checkpoint)
+    }
+
+    /// The newest state of the training that is not damaged; none if there is none.
+    pub fn newest_checkpoint(&self) -> Result<Option<Checkpoint>, RunDirError> {
+        Checkpoints::of_run(&self.path).newest()
+    }
+
+    /// `scores.jsonl`, opened for appending and locked. Each append is synchronised, so acknowledged scores survive a crash.
+    ///
+    /// # Errors
+    /// [`RunDirError::InUse`] if another learner works in this folder.
+    pub fn score_log(&self) -> Result<Log, RunDirError> {
+        Log::open(self.path.join("scores.jsonl"), true)
+    }
+
+    /// `metrics.jsonl`, opened for appending, without the lines after `step`: a learner that goes on from there writes them
+    /// again. Also gives the seconds of training that its last line tells.
+    pub fn metrics_log(&self, step: u64) -> Result<(Log, f64), RunDirError> {
+        #[derive(Deserialize)]
+        struct Line {
+            step: u64,
+            seconds: f64,
+        }
+        let mut log = Log::open(self.path.join("metrics.jsonl"), false)?;
+        let mut seconds = 0.0;
+        log.keep_while(|line| match serde_json::from_str::<Line>(line) {
+            Ok(line) if line.step <= step => {
+                seconds = line.seconds;
+                true
+            }
+            _ => false,
+        })?;
+        Ok((log, seconds))
+    }
+
+    /// The lines of `scores.jsonl`; none if nothing was scored yet. A last line that is not complete yet is left out.
+    pub fn read_scores(&self) -> Result<Vec<ScoreLine>, RunDirError> {
+        let path = self.path.join("scores.jsonl");
+        let text = match fs::read_to_string(&path) {
+            Err(error) if error.kind() == io::ErrorKind::NotFound => return Ok(Vec::new()),
+            other => other.map_err(io_error("read", &path))?,
+        };
+        let complete = text.rfind('\n').map_or("", |end| &text[..end]);
+        let parse = |(index, line): (usize, &str)| {
+            serde_json::from_str(line).map_err(|error| content(&path, Some(index + 1), &error))
+        };
+        complete.lines().enumerate().map(parse).collect()
+    }
+
+    /// The error for `scores.jsonl` whose lines do not go together.
+    pub fn broken_scores(&self, reason: String) -> RunDirError {
+        content(&self.path.join("scores.jsonl"), None, &reason)
+    }
+}

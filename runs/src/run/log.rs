@@ -1,0 +1,167 @@
+//! Files of JSON lines that only grow.
+
+use std::fs::{File, OpenOptions, TryLockError};
+use std::io::{self, Read, Seek, SeekFrom, Write};
+use std::path::{Path, PathBuf};
+use std::thread::sleep;
+use std::time::Duration;
+
+use serde::Serialize;
+use tracing::warn;
+
+use super::durable::synchronise_folder;
+use super::error::{RunDirError, content, io_error};
+
+/// A lock that another process has is tried again after this time.
+const GLANCE: Duration = Duration::from_millis(10);
+
+/// A file of JSON lines, opened for appending. No other process has it open for that.
+#[derive(Debug)]
+pub struct Log {
+    path: PathBuf,
+    file: File,
+    /// Of the whole lines, bytes.
+    length: u64,
+    /// Whether half a line may follow them.
+    torn: bool,
+    synchronise: bool,
+}
+
+impl Log {
+    /// Opens or makes the file and locks it. Half a line at its end, which a crash left, is cut off.
+    ///
+    /// # Errors
+    /// [`RunDirError::InUse`] if another process has it open.
+    pub(super) fn open(path: PathBuf, synchronise: bool) -> Result<Self, RunDirError> {
+        let opened = OpenOptions::new().create(true).read(true).append(true).open(&path);
+        let mut file = opened.map_err(io_error("open", &path))?;
+        // `learner list` takes the lock for microseconds, to see whether a learner has it.
+        let again = |_| {
+            sleep(GLANCE);
+            file.try_lock()
+        };
+        match file.try_lock().or_else(again) {
+            Ok(()) => {}
+            Err(TryLockError::WouldBlock) => {
+                return Err(RunDirError::InUse(path.parent().unwrap_or(&path).to_owned()));
+            }
+            // Some network file systems have no locks.
+            Err(TryLockError::Error(error)) => warn!(path = %path.display(), %error, "the file cannot be locked"),
+        }
+        let whole = whole_lines(&mut file).map_err(io_error("read", &path))?;
+        let mut log = Self { path, file, length: whole, torn: true, synchronise };
+        // Lines that a killed process did not synchronise count from now on.
+        let durable = log.mend().and_then(|()| log.synchronise()).and_then(|()| synchronise_folder(&log.path));
+        durable.map_err(io_error("open", &log.path))?;
+        Ok(log)
+    }
+
+    /// For tests: any file, neither locked nor looked at.
+    #[cfg(test)]
+    pub fn unchecked(path: PathBuf) -> Self {
+        #[allow(clippy::unwrap_used)]
+        let file = OpenOptions::new().append(true).open(&path).unwrap();
+        Self { path, file, length: 0, torn: false, synchronise: false }
+    }
+
+    /// Whether there is no whole line in it.
+    pub fn is_empty(&self) -> bool {
+        self.length == 0
+    }
+
+    /// Appends lines: all of them, or none if it fails.
+    pub fn append<T: Serialize>(&mut self, lines: &[T]) -> Result<(), RunDirError> {
+        let mut text = Vec::new();
+        for line in lines {
+            serde_json::to_writer(&mut text, line).map_err(|error| content(&self.path, None, &error))?;
+            text.push(b'\n');
+        }
+        self.write(&text).map_err(io_error("write", &self.path))
+    }
+
+    fn write(&mut self, text: &[u8]) -> io::Result<()> {
+        self.mend()?;
+        self.torn = true;
+        let written = self.file.write_all(text).and_then(|()| self.synchronise());
+        match written {
+            Ok(()) => {
+                self.torn = false;
+                self.length += text.len() as u64;
+            }
+            // At once if that is possible, else before the next line.
+            Err(_) => drop(self.mend()),
+        }
+        written
+    }
+
+    fn synchronise(&self) -> io::Result<()> {
+        match self.synchronise {
+            true => self.file.sync_data(),
+            false => Ok(()),
+        }
+    }
+
+    /// Cuts off what a failed write left: half a line would make the next one unreadable.
+    fn mend(&mut self) -> io::Result<()> {
+        if self.torn {
+            self.file.set_len(self.length)?;
+            self.torn = false;
+        }
+        Ok(())
+    }
+
+    /// Cuts off every line from the first one on that is not to be kept.
+    pub(super) fn keep_while(&mut self, mut keep: impl FnMut(&str) -> bool) -> Result<(), RunDirError> {
+        // A power cut may leave anything in a file that was not synchronised; what is no text is not kept either.
+        let bytes = self.bytes()?;
+        let lines = bytes.split_inclusive(|&byte| byte == b'\n');
+        let kept = lines.take_while(|line| std::str::from_utf8(line).is_ok_and(&mut keep));
+        self.length = kept.map(|line| line.len() as u64).sum();
+        self.torn = true;
+        self.mend().map_err(io_error("write", &self.path))
+    }
+
+    /// The whole lines.
+    fn bytes(&mut self) -> Result<Vec<u8>, RunDirError> {
+        let mut bytes = Vec::new();
+        let read = self.file.seek(SeekFrom::Start(0)).and_then(|_| self.file.read_to_end(&mut bytes));
+        read.map_err(io_error("read", &self.path))?;
+        Ok(bytes)
+    }
+}
+
+/// The whole lines that a file has beyond its first `read` bytes, which then count as read; none if it is not there. A file
+/// that has become shorter is read from its beginning.
+pub fn new_lines(path: &Path, read: &mut u64) -> io::Result<Vec<u8>> {
+    let mut file = match File::open(path) {
+        Err(error) if error.kind() == io::ErrorKind::NotFound => return Ok(Vec::new()),
+        opened => opened?,
+    };
+    if file.metadata()?.len() < *read {
+        *read = 0;
+    }
+    let mut lines = Vec::new();
+    file.seek(SeekFrom::Start(*read))?;
+    file.read_to_end(&mut lines)?;
+    lines.truncate(lines.iter().rposition(|&byte| byte == b'\n').map_or(0, |last| last + 1));
+    *read += lines.len() as u64;
+    Ok(lines)
+}
+
+/// Length of the whole lines of a file, bytes.
+fn whole_lines(file: &mut File) -> io::Result<u64> {
+    const BLOCK: u64 = 1 << 16;
+    let mut end = file.metadata()?.len();
+    let mut block = Vec::new();
+    while end > 0 {
+        let start = end.saturating_sub(BLOCK);
+        file.seek(SeekFrom::Start(start))?;
+        block.clear();
+        Read::take(&mut *file, end - start).read_to_end(&mut block)?;
+        if let Some(last) = block.iter().rposition(|&byte| byte == b'\n') {
+            return Ok(start + last as u64 + 1);
+        }
+        end = start;
+    }
+    Ok(0)
+}

@@ -1,0 +1,28 @@
+//! The folder of a run: its files, how a run continues in it, and how `learner verify` checks it.
+//!
+//! It runs on its callers' threads: `snapshots` writes snapshots, checkpoints and `metrics.jsonl`, `scores` writes
+//! `scores.jsonl`, the main thread everything else. Commands that only read may run at any time. A learner at work holds a
+//! lock on `scores.jsonl`.
+//!
+//! In reading order: `folder`, `find` (looks for such folders), `lines` (of its files), `log` (files that only grow), `checkpoints`, `durable` (files that are
+//! written whole or not at all), `error`, `resume` (continues a run), `verify` (checks a run).
+
+mod checkpoints;
+mod durable;
+mod error;
+mod find;
+mod folder;
+mod lines;
+mod log;
+mod resume;
+#[cfg(test)]
+mod tests;
+pub mod verify;
+
+pub use checkpoints::Checkpoint;
+pub use error::RunDirError;
+pub use find::{runs_in, walk};
+pub use folder::RunDir;
+pub use lines::{RunEndpoints, ScoreLine};
+pub use log::{Log, new_lines};
+pub use resume::{Begun, Earlier, Past, open};

@@ -1,0 +1,166 @@
+//! A run folder as the learner writes it.
+
+use toml::Table;
+
+use super::{RunDir, RunDirError, ScoreLine};
+use crate::config::{DatasetInfo, Device, RunConfig, RunInfo, resolve};
+
+/// The configuration of a run.
+fn config(name: &str, seed: u64) -> RunConfig {
+    let mut experiment = resolve("hopper-demo", &Table::new()).unwrap();
+    (experiment.seed, experiment.episodes) = (seed, 2);
+    RunConfig {
+        run: RunInfo {
+            name: name.into(),
+            started: 1,
+            task: "hopper-demo".into(),
+            version: "0.1.0".into(),
+            machine: None,
+            device: Device::Cpu,
+        },
+        dataset: DatasetInfo {
+            path: "data.hdf5".into(),
+            sha256: None,
+            transitions: 100,
+            episodes: 3,
+            min_return: 10.0,
+            mean_return: 20.0,
+            max_return: 30.0,
+            mean_score: Some(10.7),
+        },
+        experiment,
+    }
+}
+
+/// A line of `scores.jsonl`.
+fn line(step: u64, seed: u64, score: f64) -> ScoreLine {
+    ScoreLine {
+        step,
+        seed,
+        episode_return: 10.0 * score,
+        length: 5,
+        score,
+        weights: "00".into(),
+        precision: "f32".into(),
+        evaluator: "e".into(),
+    }
+}
+
+#[test]
+fn a_folder_with_a_run_in_it_is_not_overwritten() {
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("a");
+    assert!(!RunDir::is_occupied(&path));
+    RunDir::create(&path, &config("a", 0)).unwrap();
+    assert!(matches!(RunDir::create(&path, &config("a", 1)), Err(RunDirError::Occupied(_))));
+    let (run, found) = RunDir::open(&path).unwrap();
+    assert_eq!(found, config("a", 0));
+
+    // Set aside, it is still there, and so is one that was set aside before.
+    for _ in 0..2 {
+        RunDir::open(&path).unwrap().0.set_aside().unwrap();
+        RunDir::create(&path, &config("a", 2)).unwrap();
+    }
+    assert_eq!(RunDir::open(&folder.path().join("a.old1")).unwrap().1, config("a", 0));
+    assert_eq!(RunDir::open(&folder.path().join("a.old2")).unwrap().1, config("a", 2));
+    drop(run);
+}
+
+/// Both saw that the folder was empty.
+#[test]
+fn of_two_learners_that_begin_at_once_one_is_refused_and_changes_nothing() {
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("a");
+    std::fs::create_dir_all(&path).unwrap();
+    // What the first one does before it writes the configuration.
+    let first = RunDir::create(&path, &config("a", 0)).unwrap();
+    std::fs::remove_file(path.join("config.toml")).unwrap();
+    assert!(matches!(RunDir::create(&path, &config("a", 1)), Err(RunDirError::InUse(_))));
+    assert!(!RunDir::is_occupied(&path));
+    drop(first);
+    RunDir::create(&path, &config("a", 1)).unwrap();
+}
+
+#[test]
+fn a_new_run_does_not_take_over_scores_of_unknown_origin() {
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("a");
+    RunDir::create(&path, &config("a", 0)).unwrap().1.append(&[line(1, 1, 0.1)]).unwrap();
+    std::fs::remove_file(path.join("config.toml")).unwrap();
+    assert!(matches!(RunDir::create(&path, &config("a", 1)), Err(RunDirError::Occupied(_))));
+}
+
+#[test]
+fn one_learner_at_a_time_works_in_a_folder() {
+    let folder = tempfile::tempdir().unwrap();
+    let (run, log) = RunDir::create(&folder.path().join("a"), &config("a", 0)).unwrap();
+    assert!(matches!(run.score_log(), Err(RunDirError::InUse(path)) if path == run.path()));
+    drop(log);
+    run.score_log().unwrap();
+}
+
+#[test]
+fn metrics_of_steps_that_come_again_are_cut_off() {
+    let folder = tempfile::tempdir().unwrap();
+    let run = RunDir::create(&folder.path().join("a"), &config("a", 0)).unwrap().0;
+    let row = |step: u64| serde_json::json!({ "step": step, "seconds": step as f64 / 10.0, "eta": 1.0 });
+    let (mut log, seconds) = run.metrics_log(0).unwrap();
+    assert_eq!(seconds, 0.0);
+    log.append(&[row(100), row(200), row(300)]).unwrap();
+    drop(log);
+    let (mut log, seconds) = run.metrics_log(250).unwrap();
+    assert_eq!(seconds, 20.0);
+    log.append(&[row(300)]).unwrap();
+    let text = std::fs::read_to_string(run.path().join("metrics.jsonl")).unwrap();
+    let steps: Vec<_> =
+        text.lines().map(|line| serde_json::from_str::<serde_json::Value>(line).unwrap()["step"].clone()).collect();
+    assert_eq!(steps, [100, 200, 300]);
+}
+
+#[test]
+fn scores_survive_a_reopened_log_and_an_unfinished_line_is_left_out() {
+    let folder = tempfile::tempdir().unwrap();
+    let run = RunDir::create(&folder.path().join("a"), &config("a", 0)).unwrap().0;
+    run.score_log().unwrap().append(&[line(1, 1, 0.1)]).unwrap();
+    run.score_log().unwrap().append(&[line(1, 2, 0.2)]).unwrap();
+    let path = run.path().join("scores.jsonl");
+    let mut text = std::fs::read_to_string(&path).unwrap();
+    text.push_str("{\"step\":1,");
+    std::fs::write(&path, &text).unwrap();
+    assert_eq!(run.read_scores().unwrap(), [line(1, 1, 0.1), line(1, 2, 0.2)]);
+
+    // A learner that goes on cuts it off first, however long it is.
+    for tail in ["", &"x".repeat(200_000)] {
+        std::fs::write(&path, format!("{text}{tail}")).unwrap();
+        run.score_log().unwrap().append(&[line(1, 3, 0.3)]).unwrap();
+        assert_eq!(run.read_scores().unwrap(), [line(1, 1, 0.1), line(1, 2, 0.2), line(1, 3, 0.3)]);
+    }
+
+    std::fs::write(&path, text + "\n").unwrap();
+    let error = run.read_scores().unwrap_err().to_string();
+    assert!(error.contains("scores.jsonl, line 3"), "{error}");
+}
+
+#[test]
+fn score_lines_carry_the_words_that_scripts_read() {
+    let json = serde_json::to_value(line(3, 4, 0.5)).unwrap();
+    for key in ["step", "seed", "return", "length", "score", "weights", "evaluator"] {
+        assert!(json.get(key).is_some(), "{key}");
+    }
+}
+
+/// A user who tidies up while a learner is at work.
+#[test]
+fn a_folder_of_snapshots_that_was_removed_is_made_again_and_a_run_that_was_removed_is_an_error() {
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("a");
+    let (run, _log) = RunDir::create(&path, &config("a", 0)).unwrap();
+    std::fs::remove_dir_all(path.join("snapshots")).unwrap();
+    assert_eq!(run.snapshots().unwrap(), [] as [u64; 0]);
+    run.write_snapshot(10, b"weights").unwrap();
+    assert_eq!((run.snapshots().unwrap(), run.read_snapshot(10).unwrap()), (vec![10], b"weights".to_vec()));
+    std::fs::remove_dir_all(&path).unwrap();
+    let error = run.write_snapshot(20, b"weights").unwrap_err();
+    assert!(matches!(&error, RunDirError::Gone(gone) if *gone == path), "{error}");
+    assert!(!path.exists());
+}

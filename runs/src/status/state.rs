@@ -1,0 +1,119 @@
+//! How far a run is, by its folder alone.
+
+use std::fmt;
+use std::fs::File;
+use std::io::{self, Read, Seek, SeekFrom};
+use std::path::Path;
+
+use serde::Deserialize;
+
+use crate::results::RunReport;
+use crate::run::{RunDir, RunDirError};
+
+/// The last two lines of `metrics.jsonl` are in its last bytes, so many.
+const TAIL: u64 = 8192;
+
+/// How far a run is.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum State {
+    /// It has no folder.
+    NotBegun,
+    /// So many steps are done; perhaps all of them, while scores are missing.
+    Begun(u64),
+    /// As far as that, and the learner ended with an error.
+    Failed(u64),
+    /// All steps are done and all episodes scored.
+    Complete,
+}
+
+impl State {
+    /// That of a run whose report was read.
+    ///
+    /// # Errors
+    /// The folder of its snapshots cannot be read.
+    pub fn of(report: &RunReport) -> Result<Self, RunDirError> {
+        let (dir, experiment) = (RunDir::at(&report.dir), &report.config.experiment);
+        let trained = experiment.eval_interval > 0 || dir.snapshots()?.last() == Some(&experiment.steps);
+        let step = || rows(dir.path()).last().map_or(0, |row| row.step);
+        Ok(match (report.is_complete() && trained, dir.has_failed()) {
+            (true, _) => Self::Complete,
+            (false, true) => Self::Failed(step()),
+            (false, false) => Self::Begun(step()),
+        })
+    }
+
+    /// Steps that are done, of a run of so many.
+    pub fn step(self, steps: u64) -> u64 {
+        match self {
+            Self::NotBegun => 0,
+            Self::Begun(step) | Self::Failed(step) => step,
+            Self::Complete => steps,
+        }
+    }
+
+    /// In words, for a run of so many steps.
+    pub fn text(self, steps: u64) -> String {
+        match self {
+            Self::NotBegun => "not begun".to_owned(),
+            Self::Begun(step) if step == steps => "trained, not all scored".to_owned(),
+            Self::Begun(step) => format!("{step} of {steps} steps"),
+            Self::Failed(step) => format!("failed after {step} of {steps} steps"),
+            Self::Complete => "complete".to_owned(),
+        }
+    }
+}
+
+/// What a run at work is seen to do.
+#[derive(Default)]
+pub struct Progress {
+    /// Gradient steps done.
+    pub step: u64,
+    /// In a second.
+    pub rate: f64,
+    /// The newest whole evaluation: step and mean score.
+    pub score: Option<(u64, f64)>,
+}
+
+impl Progress {
+    /// That of the run in a folder.
+    pub fn read(dir: &Path) -> Self {
+        let rows = rows(dir);
+        let rate = match &rows[..] {
+            [.., before, last] if last.seconds > before.seconds => {
+                (last.step - before.step) as f64 / (last.seconds - before.seconds)
+            }
+            _ => 0.0,
+        };
+        let report = RunReport::scored(dir).ok();
+        let score = report.as_ref().and_then(RunReport::newest).map(|newest| (newest.step, newest.score.mean));
+        Self { step: rows.last().map_or(0, |row| row.step), rate, score }
+    }
+}
+
+impl fmt::Display for Progress {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        write!(f, "{:.1} steps/s", self.rate)?;
+        self.score.map_or(Ok(()), |(step, score)| write!(f, ", score {score:.1} @{step}"))
+    }
+}
+
+/// What is read of a line of `metrics.jsonl`.
+#[derive(Deserialize)]
+struct Row {
+    step: u64,
+    seconds: f64,
+}
+
+/// The last lines of `metrics.jsonl`; those that are half written or half read are none.
+fn rows(dir: &Path) -> Vec<Row> {
+    let read = || -> io::Result<Vec<u8>> {
+        let mut file = File::open(dir.join("metrics.jsonl"))?;
+        let length = file.metadata()?.len();
+        file.seek(SeekFrom::Start(length.saturating_sub(TAIL)))?;
+        let mut bytes = Vec::new();
+        file.read_to_end(&mut bytes)?;
+        Ok(bytes)
+    };
+    let bytes = read().unwrap_or_default();
+    bytes.split(|byte| *byte == b'\n').filter_map(|line| serde_json::from_slice(line).ok()).collect()
+}

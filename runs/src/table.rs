@@ -1,0 +1,124 @@
+//! Tables and sentences for people: aligned for a terminal, as Markdown, LaTeX or CSV.
+
+use std::fmt::Alignment::{self, Right};
+
+use serde::Serialize;
+
+/// How a report is written.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Style {
+    /// For a terminal.
+    Text,
+    /// For a document.
+    Markdown,
+    /// For a paper; tables need its package booktabs.
+    Latex,
+    /// For a spreadsheet; sentences are comments.
+    Csv,
+}
+
+/// A part of a report.
+#[derive(Serialize)]
+#[serde(rename_all = "lowercase")]
+pub enum Part {
+    /// Lines of text.
+    Words(String),
+    Table(Table),
+}
+
+impl Part {
+    pub fn render(&self, style: Style) -> String {
+        match (self, style) {
+            (Self::Table(table), _) => table.render(style),
+            (Self::Words(text), Style::Text | Style::Markdown) => text.clone(),
+            (Self::Words(text), Style::Latex) => text.lines().map(|line| format!("{}\n\n", latex(line))).collect(),
+            (Self::Words(text), Style::Csv) => text.lines().map(|line| format!("# {line}\n")).collect(),
+        }
+    }
+}
+
+/// A table: which columns are aligned to the right, and rows of cells, of which the first is the header.
+#[derive(Serialize)]
+pub struct Table {
+    right: Vec<bool>,
+    rows: Vec<Vec<String>>,
+}
+
+impl Table {
+    pub fn new<T: AsRef<str>>(header: &[(T, Alignment)]) -> Self {
+        let right = header.iter().map(|(_, alignment)| *alignment == Right).collect();
+        Self { right, rows: vec![header.iter().map(|(name, _)| name.as_ref().to_owned()).collect()] }
+    }
+
+    /// A row has a cell for each column.
+    pub fn push(&mut self, row: impl Into<Vec<String>>) {
+        self.rows.push(row.into());
+    }
+
+    pub fn render(&self, style: Style) -> String {
+        match style {
+            Style::Text => self.lines(|cells| format!("{}\n", cells.join("  ").trim_end())).concat(),
+            Style::Markdown => {
+                let mut lines = self.lines(|cells| format!("| {} |\n", cells.join(" | ")));
+                let rule = self.right.iter().map(|right| if *right { "---:" } else { "---" });
+                lines.insert(1, format!("| {} |\n", Vec::from_iter(rule).join(" | ")));
+                lines.concat()
+            }
+            Style::Latex => {
+                let line = |row: &Vec<String>| {
+                    format!("{} \\\\\n", row.iter().map(|cell| latex(cell)).collect::<Vec<_>>().join(" & "))
+                };
+                let mut lines: Vec<String> = self.rows.iter().map(line).collect();
+                lines.insert(1, "\\midrule\n".to_owned());
+                let columns = self.right.iter().map(|right| if *right { 'r' } else { 'l' });
+                let columns = String::from_iter(columns);
+                format!(
+                    "\\begin{{tabular}}{{{columns}}}\n\\toprule\n{}\\bottomrule\n\\end{{tabular}}\n",
+                    lines.concat()
+                )
+            }
+            Style::Csv => {
+                let line = |row: &Vec<String>| row.iter().map(|cell| csv(cell)).collect::<Vec<_>>().join(",") + "\n";
+                self.rows.iter().map(line).collect()
+            }
+        }
+    }
+
+    /// The rows, with cells as wide as their columns.
+    fn lines(&self, line: impl Fn(&[String]) -> String) -> Vec<String> {
+        let width = |column: usize| self.rows.iter().map(|row| row[column].chars().count()).max().unwrap_or(0);
+        let widths: Vec<usize> = (0..self.right.len()).map(width).collect();
+        let padded = |row: &Vec<String>| {
+            let cells = row.iter().zip(&widths).zip(&self.right).map(|((cell, width), right)| match right {
+                false => format!("{cell:<width$}"),
+                true => format!("{cell:>width$}"),
+            });
+            line(&Vec::from_iter(cells))
+        };
+        self.rows.iter().map(padded).collect()
+    }
+}
+
+/// Text as LaTeX has it, whatever its encoding of fonts.
+fn latex(text: &str) -> String {
+    let escaped = |c: char| match c {
+        '&' | '%' | '$' | '#' | '_' | '{' | '}' => format!("\\{c}"),
+        '\\' => "\\textbackslash{}".to_owned(),
+        '~' => "\\textasciitilde{}".to_owned(),
+        '^' => "\\textasciicircum{}".to_owned(),
+        '<' | '>' => format!("${c}$"),
+        '±' => "$\\pm$".to_owned(),
+        '−' => "$-$".to_owned(),
+        'β' => "$\\beta$".to_owned(),
+        other => other.to_string(),
+    };
+    text.chars().map(escaped).collect()
+}
+
+/// A cell as RFC 4180 has it.
+fn csv(cell: &str) -> String {
+    if cell.contains([',', '"', '\n']) { format!("\"{}\"", cell.replace('"', "\"\"")) } else { cell.to_owned() }
+}
+
+#[cfg(test)]
+mod tests;

@@ -1,0 +1,140 @@
+//! The metrics server, asked like Prometheus asks it: over TCP, in HTTP/1.1.
+#![allow(clippy::unwrap_used, clippy::expect_used)]
+
+use std::io::{Read, Write};
+use std::net::{SocketAddr, TcpStream};
+use std::time::{Duration, Instant};
+
+use axum::Router;
+use prometheus::{IntGauge, Registry};
+use quad_runtime::{Health, MetricsServer, serve_metrics};
+
+const ANY_PORT: SocketAddr = SocketAddr::new(std::net::IpAddr::V4(std::net::Ipv4Addr::LOCALHOST), 0);
+
+async fn server() -> (MetricsServer, IntGauge) {
+    server_with(Health::default()).await
+}
+
+async fn server_with(health: Health) -> (MetricsServer, IntGauge) {
+    let registry = Registry::new();
+    let gauge = IntGauge::new("quad_test_apples", "Apples in the test.").unwrap();
+    registry.register(Box::new(gauge.clone())).unwrap();
+    (serve_metrics(ANY_PORT, registry, health, Router::new()).await.unwrap(), gauge)
+}
+
+/// Head and body of the response.
+async fn get(address: SocketAddr, path: &'static str) -> (String, String) {
+    let exchange = move || {
+        let mut stream = TcpStream::connect(address).unwrap();
+        stream.set_read_timeout(Some(Duration::from_secs(10))).unwrap();
+        write!(stream, "GET {path} HTTP/1.1\r\nHost: {address}\r\nConnection: close\r\n\r\n").unwrap();
+        let mut response = String::new();
+        stream.read_to_string(&mut response).unwrap();
+        let (head, body) = response.split_once("\r\n\r\n").unwrap();
+        (head.to_ascii_lowercase(), body.to_owned())
+    };
+    tokio::task::spawn_blocking(exchange).await.unwrap()
+}
+
+#[tokio::test]
+async fn metrics_in_text_format_as_they_are_now() {
+    let (server, apples) = server().await;
+    assert_ne!(server.address.port(), 0);
+    for count in [3, 5] {
+        apples.set(count);
+        let (head, body) = get(server.address, "/metrics").await;
+        assert!(head.starts_with("http/1.1 200"), "{head}");
+        assert!(head.contains("content-type: text/plain; version=0.0.4"), "{head}");
+        let expected = "# HELP quad_test_apples Apples in the test.\n# TYPE quad_test_apples gauge\nquad_test_apples ";
+        assert_eq!(body, format!("{expected}{count}\n"));
+    }
+}
+
+#[tokio::test]
+async fn health_and_nothing_else() {
+    let (server, _) = server().await;
+    let (head, body) = get(server.address, "/healthz").await;
+    assert!(head.starts_with("http/1.1 200"), "{head}");
+    assert_eq!(body, "ok\n");
+    assert!(get(server.address, "/secret").await.0.starts_with("http/1.1 404"));
+}
+
+#[tokio::test]
+async fn ill_health_is_told_line_by_line() {
+    let health = Health::default();
+    let (server, _) = server_with(health.clone()).await;
+    let scores = health.part("scores", Duration::from_secs(3600));
+    scores.set_trouble(Some("the disk is full".to_owned()));
+    drop(health.part("training", Duration::from_secs(3600)));
+    let (head, body) = get(server.address, "/healthz").await;
+    assert!(head.starts_with("http/1.1 503"), "{head}");
+    assert_eq!(body, "scores: the disk is full\ntraining: it ended before its work was done\n");
+    let (head, _) = get(server.address, "/metrics").await;
+    assert!(head.starts_with("http/1.1 200"), "a sick process is still measured: {head}");
+}
+
+/// How long the server keeps a connection on which `sent` is all that it ever gets.
+fn kept(address: SocketAddr, sent: &str) -> Duration {
+    let mut stream = TcpStream::connect(address).unwrap();
+    stream.write_all(sent.as_bytes()).unwrap();
+    stream.set_read_timeout(Some(Duration::from_secs(30))).unwrap();
+    let start = Instant::now();
+    // Whether it says something before it hangs up does not matter, only that it does.
+    match stream.read_to_end(&mut Vec::new()) {
+        Ok(_) => {}
+        Err(error) => assert_eq!(error.kind(), std::io::ErrorKind::ConnectionReset),
+    }
+    start.elapsed()
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn half_a_request_and_silence_are_cut_off_within_seconds() {
+    let (server, _) = server().await;
+    for sent in ["GET /metrics HTTP/1.1\r\nHost: x", "GET /met", ""] {
+        let address = server.address;
+        let time = tokio::task::spawn_blocking(move || kept(address, sent)).await.unwrap();
+        assert!(time < Duration::from_secs(10), "{sent:?} was waited for {time:?}");
+    }
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn connections_are_not_kept_for_a_second_request() {
+    let (server, _) = server().await;
+    let address = server.address;
+    let request = "GET /healthz HTTP/1.1\r\nHost: x\r\n\r\n";
+    let time = tokio::task::spawn_blocking(move || kept(address, request)).await.unwrap();
+    assert!(time < Duration::from_secs(2), "it was kept for {time:?}");
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn a_hundred_idle_connections_keep_no_client_out() {
+    let (server, _) = server().await;
+    let connect = |_| TcpStream::connect(server.address).unwrap();
+    let mut idle: Vec<TcpStream> = (0..100).map(connect).collect();
+    let start = Instant::now();
+    let (head, _) = get(server.address, "/metrics").await;
+    assert!(head.starts_with("http/1.1 200"), "{head}");
+    assert!(start.elapsed() < Duration::from_secs(1), "the answer took {:?}", start.elapsed());
+    // The first ones made room for the others: there is a bound.
+    idle[0].set_read_timeout(Some(Duration::from_secs(1))).unwrap();
+    let closed =
+        idle[0].read(&mut [0]).map_or_else(|error| error.kind() == std::io::ErrorKind::ConnectionReset, |n| n == 0);
+    assert!(closed, "the oldest connection is still there");
+}
+
+#[tokio::test]
+async fn an_address_in_use_is_an_error_and_free_again_afterwards() {
+    let (server, _) = server().await;
+    let address = server.address;
+    let error = serve_metrics(address, Registry::new(), Health::default(), Router::new()).await.unwrap_err();
+    assert_eq!(error.to_string(), format!("cannot serve metrics at {address}"));
+    assert_eq!(error.source.kind(), std::io::ErrorKind::AddrInUse);
+    drop(server);
+    for _ in 0..100 {
+        if serve_metrics(address, Registry::new(), Health::default(), Router::new()).await.is_ok() {
+            return;
+        }
+        tokio::time::sleep(Duration::from_millis(50)).await;
+    }
+    panic!("{address} is still in use");
+}

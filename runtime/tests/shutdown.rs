@@ -1,0 +1,34 @@
+//! Real signals, sent to this very process; so there is only this one test in the file.
+#![allow(clippy::unwrap_used, clippy::expect_used)]
+
+use std::process::Command;
+use std::time::Duration;
+
+use quad_runtime::shutdown_signal;
+use tokio::runtime::{Builder, Runtime};
+use tokio::time::timeout;
+
+#[test]
+fn either_signal_is_noticed_even_before_it_is_awaited() {
+    let send = |signal: &str| {
+        let status = Command::new("sh").args(["-c", &format!("kill -{signal} {}", std::process::id())]).status();
+        assert!(status.unwrap().success());
+    };
+    for [signal, other] in [["INT", "TERM"], ["TERM", "INT"]] {
+        // A runtime each: the end of it ends the watch, to which another signal would be a further one.
+        runtime().block_on(async {
+            let shutdown = shutdown_signal();
+            send(signal);
+            timeout(Duration::from_secs(10), shutdown).await.unwrap_or_else(|_| panic!("SIG{signal} was not noticed"));
+            // Ctrl-C reaches a script, too, which hands it on: that would end this very process.
+            send(other);
+            tokio::time::sleep(Duration::from_secs(1)).await;
+        });
+    }
+    let quiet = runtime().block_on(async { timeout(Duration::from_millis(100), shutdown_signal()).await });
+    assert!(quiet.is_err(), "a signal of the past is no reason to leave");
+}
+
+fn runtime() -> Runtime {
+    Builder::new_multi_thread().worker_threads(1).enable_all().build().unwrap()
+}
