@@ -1,9 +1,6 @@
 //! What an environment is: the interface between a policy and a simulation, in this program or in another language.
 
-use quad_dataset::EnvironmentSpec;
 use thiserror::Error;
-
-use super::simulation::Simulation;
 
 /// The result of one step of an environment.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -54,31 +51,6 @@ pub trait Environments: Send + Sync {
     /// # Errors
     /// The name is none of [`Self::names`], or the environment cannot be made.
     fn make(&self, name: &str, environment_seed: u64) -> Result<Box<dyn Environment>, EnvironmentError>;
-}
-
-/// A simulation of this program as an environment, with D4RL's normalised score.
-pub(super) struct Simulated {
-    pub simulation: Box<dyn Simulation>,
-    pub spec: &'static EnvironmentSpec,
-}
-
-impl Environment for Simulated {
-    fn reset(&mut self, seed: u64) -> Result<(), EnvironmentError> {
-        self.simulation.reset(seed);
-        Ok(())
-    }
-
-    fn step(&mut self, action: &[f32]) -> Result<Step, EnvironmentError> {
-        Ok(self.simulation.step(action))
-    }
-
-    fn observation(&self) -> &[f64] {
-        self.simulation.observation()
-    }
-
-    fn score(&mut self, episode_return: f64) -> Result<f64, EnvironmentError> {
-        Ok(self.spec.normalised_score(episode_return))
-    }
 }
 
 /// Why an environment is missing or failed.

@@ -4,7 +4,7 @@
 use quad_dataset::environment::{self, EnvironmentSpec};
 
 use super::antmaze::{AntMaze, MAZES, Maze};
-use super::environment::{Environment, EnvironmentError, Environments, Simulated};
+use super::environment::{Environment, EnvironmentError, Environments, Step};
 use super::locomotion::{Locomotion, ROBOTS, Robot};
 use super::simulation::Simulation;
 
@@ -57,6 +57,31 @@ impl Environments for Simulations {
     fn make(&self, name: &str, environment_seed: u64) -> Result<Box<dyn Environment>, EnvironmentError> {
         let spec = environment::find(name).map_err(|_| EnvironmentError::NotSimulated(name.to_owned()))?;
         Ok(Box::new(Simulated { simulation: make(spec, environment_seed)?, spec }))
+    }
+}
+
+/// A simulation of this program as an environment, with D4RL's normalised score.
+struct Simulated {
+    simulation: Box<dyn Simulation>,
+    spec: &'static EnvironmentSpec,
+}
+
+impl Environment for Simulated {
+    fn reset(&mut self, seed: u64) -> Result<(), EnvironmentError> {
+        self.simulation.reset(seed);
+        Ok(())
+    }
+
+    fn step(&mut self, action: &[f32]) -> Result<Step, EnvironmentError> {
+        Ok(self.simulation.step(action))
+    }
+
+    fn observation(&self) -> &[f64] {
+        self.simulation.observation()
+    }
+
+    fn score(&mut self, episode_return: f64) -> Result<f64, EnvironmentError> {
+        Ok(self.spec.normalised_score(episode_return))
     }
 }
 

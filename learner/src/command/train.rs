@@ -133,7 +133,7 @@ async fn run_to_its_end(
     let tensorboard = args.tensorboard.as_deref();
     let run = Run { life: life.clone(), config, dir: &run_dir, scores, past, checkpoint_every, tensorboard };
     let threads = Threads::start(run, transitions, &metrics, &health, &tell)?;
-    live.begun(&threads);
+    live.begun(threads.coordinator());
     let main_loop = MainLoop {
         life,
         run_dir: run_dir.clone(),

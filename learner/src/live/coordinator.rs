@@ -10,9 +10,8 @@ use std::time::Instant;
 use quad_protocol::{EpisodeScore, Hash, JobReply, JobRequest, Name, Progress, ScoreReply, ScoreReport, episode_seeds};
 use tracing::{debug, warn};
 
-use super::evaluators::Evaluators;
+use super::evaluators::{EvaluatorAtWork, Evaluators, JobAtWork};
 use super::events::{Event, Events};
-use super::live::{EvaluatorAtWork, JobAtWork};
 use super::metrics::Metrics;
 use super::rejection::Rejection;
 use crate::evaluation::{

@@ -5,6 +5,7 @@ use std::mem;
 use std::time::{Duration, Instant};
 
 use quad_protocol::{Name, Progress};
+use serde::Serialize;
 
 use super::metrics::EvaluatorMetrics;
 use super::rejection::Rejection;
@@ -16,6 +17,28 @@ const MOST_EVALUATORS: usize = 1024;
 /// So many evaluators per period get a log line of their own; the rest are one line with a number.
 const ONE_BY_ONE: usize = 20;
 const PERIOD: Duration = Duration::from_secs(10);
+
+/// A connected evaluator.
+#[derive(Debug, Serialize)]
+pub(super) struct EvaluatorAtWork {
+    pub name: String,
+    /// Whether it has the run's environment, if known.
+    pub fits: bool,
+    /// Time since its last progress message.
+    pub seconds_ago: Option<f64>,
+    pub job: Option<JobAtWork>,
+}
+
+/// Its job.
+#[derive(Debug, Serialize)]
+pub(super) struct JobAtWork {
+    /// Gradient step of the snapshot.
+    pub step: u64,
+    /// Episodes that have ended.
+    pub done: u32,
+    /// Episodes.
+    pub episodes: usize,
+}
 
 /// The connected evaluators, and those whose last message is recent.
 #[derive(Debug)]

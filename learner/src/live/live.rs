@@ -4,12 +4,10 @@ use std::sync::{Arc, OnceLock};
 
 use quad_protocol::Name;
 use quad_runtime::Health;
-use serde::Serialize;
 use serde_json::{Value, json};
 
 use super::coordinator::Coordinator;
 use super::metrics::Metrics;
-use super::threads::Threads;
 
 /// A handle to the state. Clones share it.
 #[derive(Clone)]
@@ -22,28 +20,6 @@ pub(crate) struct Live {
     coordinator: Arc<OnceLock<Coordinator>>,
 }
 
-/// A connected evaluator.
-#[derive(Debug, Serialize)]
-pub(super) struct EvaluatorAtWork {
-    pub name: String,
-    /// Whether it has the run's environment, if known.
-    pub fits: bool,
-    /// Time since its last progress message.
-    pub seconds_ago: Option<f64>,
-    pub job: Option<JobAtWork>,
-}
-
-/// Its job.
-#[derive(Debug, Serialize)]
-pub(super) struct JobAtWork {
-    /// Gradient step of the snapshot.
-    pub step: u64,
-    /// Episodes that have ended.
-    pub done: u32,
-    /// Episodes.
-    pub episodes: usize,
-}
-
 impl Live {
     /// The state of a run of `steps` gradient steps that is about to begin.
     pub fn new(run: Name, steps: u64, metrics: Metrics, health: Health) -> Self {
@@ -51,8 +27,8 @@ impl Live {
     }
 
     /// Records that the run has begun.
-    pub fn begun(&self, threads: &Threads) {
-        self.coordinator.set(threads.services.coordinator.clone()).ok();
+    pub fn begun(&self, coordinator: Coordinator) {
+        self.coordinator.set(coordinator).ok();
     }
 
     /// The state as JSON.

@@ -127,6 +127,11 @@ impl Threads {
         Ok(Self { services, outbox, stop, training, snapshots, scores, tensorboard })
     }
 
+    /// The shared state of jobs and scores.
+    pub fn coordinator(&self) -> Coordinator {
+        self.services.coordinator.clone()
+    }
+
     /// Asks training to end after its current step.
     pub fn stop_training(&self) {
         self.stop.store(true, Ordering::Relaxed);

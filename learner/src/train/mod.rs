@@ -4,9 +4,8 @@
 //! metric, and for the disk only if far too much output is unwritten: it puts its output into the [`Outbox`], from which the
 //! thread `snapshots` takes it. The module `live` starts it.
 //!
-//! In reading order: `training` (the thread's work), `steps` (the loop), `agent` (an algorithm at work, saved and loaded),
-//! `device` (where it computes), `pool` (rayon's threads kept awake), `results`, `outbox`, `metrics`. Beside them, `price`
-//! estimates what a run costs, on its caller's thread.
+//! In reading order: `training` (the thread's work), `steps` (the loop), `device` (where it computes), `results`, `outbox`,
+//! `metrics`. Beside them, `price` estimates what a run costs, on its caller's thread.
 
 pub(crate) mod device;
 mod metrics;
