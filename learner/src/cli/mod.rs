@@ -184,9 +184,6 @@ pub struct ReportArgs {
     /// Also draw learning curves, performance profiles and scores over τ into this folder, each as SVG and PNG
     #[arg(long, value_name = "DIR")]
     pub figures: Option<PathBuf>,
-    /// Also write metrics and scores of each run for TensorBoard, into DIR/RUN
-    #[arg(long, value_name = "DIR")]
-    pub tensorboard: Option<PathBuf>,
 }
 
 fn parse_task(text: &str) -> Result<String, String> {

@@ -88,9 +88,6 @@ pub struct TrainArgs {
     /// Address of the page, /metrics and /healthz; port 0 takes a free one (see DIR/endpoints.json)
     #[arg(long, value_name = "ADDR:PORT", default_value = "127.0.0.1:0")]
     pub metrics: SocketAddr,
-    /// Also write metrics and scores for TensorBoard, into DIR/RUN, every ten seconds
-    #[arg(long, value_name = "DIR")]
-    pub tensorboard: Option<PathBuf>,
     /// Train on the CPU, or on the first Nvidia GPU (with a learner that deploy/cuda.sh has built)
     #[arg(long, value_name = "cpu|cuda", value_enum, hide_possible_values = true, default_value_t)]
     pub device: Device,

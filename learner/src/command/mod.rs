@@ -25,7 +25,7 @@ use crate::cli::{
     Cli, Command, DatasetsCommand, DoctorArgs, InspectArgs, ListArgs, PresetsArgs, ReportArgs, VerifyArgs,
 };
 use crate::data::{Source, cache};
-use crate::report::{Report, draw_all, export_all, write_html};
+use crate::report::{Report, draw_all, write_html};
 
 /// Runs the command.
 ///
@@ -90,10 +90,6 @@ fn report(args: &ReportArgs) -> anyhow::Result<()> {
     if let Some(path) = &args.html {
         write_html(path, &report)?;
         info!("report: {}", path.display());
-    }
-    if let Some(folder) = &args.tensorboard {
-        export_all(&report.runs, folder)?;
-        info!("to look at them: tensorboard --logdir {}", folder.display());
     }
     let style = match (args.markdown, args.latex, args.csv) {
         (true, ..) => Style::Markdown,

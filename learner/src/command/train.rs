@@ -130,8 +130,7 @@ async fn run_to_its_end(
     // A later start has a larger number; the low bits distinguish two that start in the same millisecond.
     let life = Life { run: name, incarnation: now()? << 16 | u64::from(rand::random::<u16>()) };
     let checkpoint_every = Duration::from_secs(args.checkpoint_seconds);
-    let tensorboard = args.tensorboard.as_deref();
-    let run = Run { life: life.clone(), config, dir: &run_dir, scores, past, checkpoint_every, tensorboard };
+    let run = Run { life: life.clone(), config, dir: &run_dir, scores, past, checkpoint_every };
     let threads = Threads::start(run, transitions, &metrics, &health, &tell)?;
     live.begun(threads.coordinator());
     let main_loop = MainLoop {

@@ -13,8 +13,7 @@
 //!   `scores`, which writes scores. `requests`: queries that wait for their answer.
 //! - `coordinator` is the state that the threads share: the scoreboard and the `evaluators`. `rejection`: why the learner does
 //!   not accept a message.
-//! - `metrics` are for Prometheus; `tensorboard` is the thread that copies the run to an event file; `disk` reports a disk
-//!   that refuses writes; `display` is the terminal, `live` the state for the page.
+//! - `metrics` are for Prometheus; `disk` reports a disk that refuses writes; `display` is the terminal, `live` the state for the page.
 
 mod coordinator;
 mod disk;
@@ -35,7 +34,6 @@ mod scores;
 mod services;
 mod snapshots;
 mod spawn;
-mod tensorboard;
 #[cfg(test)]
 mod tests;
 mod threads;

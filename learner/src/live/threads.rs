@@ -1,7 +1,6 @@
 //! The threads of a run, started together and ended in order.
 
 use std::collections::BTreeMap;
-use std::path::Path;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::thread::JoinHandle;
@@ -21,10 +20,8 @@ use super::scores::Scores;
 use super::services::Services;
 use super::snapshots::Snapshots;
 use super::spawn::spawn_alive;
-use super::tensorboard::TensorBoard;
 use super::weights::Weights;
 use crate::evaluation::{Earlier, Rules};
-use crate::report::Exporter;
 use crate::train::{Outbox, Training};
 
 /// Most episodes in one job, so that two evaluators share an evaluation of ten; and most when hundreds wait.
@@ -49,8 +46,6 @@ pub(crate) struct Run<'a> {
     pub past: Past,
     /// Least time between two checkpoints.
     pub checkpoint_every: Duration,
-    /// Folder for TensorBoard's event files, if there are any.
-    pub tensorboard: Option<&'a Path>,
 }
 
 /// The running threads.
@@ -61,7 +56,6 @@ pub(crate) struct Threads {
     training: JoinHandle<()>,
     snapshots: JoinHandle<()>,
     scores: JoinHandle<()>,
-    tensorboard: Option<TensorBoard>,
 }
 
 impl Threads {
@@ -73,7 +67,7 @@ impl Threads {
         health: &Health,
         events: &Events,
     ) -> anyhow::Result<Self> {
-        let Run { life, config, dir, scores, past, checkpoint_every, tensorboard } = run;
+        let Run { life, config, dir, scores, past, checkpoint_every } = run;
         let Past { checkpoint, snapshots: known, scores: earlier } = past;
         let experiment = &config.experiment;
         let task = Task::new(&experiment.environment, transitions.observation_dim(), transitions.action_dim());
@@ -93,9 +87,6 @@ impl Threads {
         let step = checkpoint.as_ref().map_or(0, |checkpoint| checkpoint.step);
         metrics.training.gradient_steps.inc_by(step);
         let (rows, seconds_before) = dir.metrics_log(step)?;
-        // Cuts off what training will repeat now, so that the event file does not contain it.
-        let tensorboard =
-            tensorboard.map(|folder| TensorBoard::start(Exporter::new(dir.path(), folder))).transpose()?;
         let outbox = Outbox::default();
         let snapshots = Snapshots {
             outbox: outbox.clone(),
@@ -124,7 +115,7 @@ impl Threads {
         };
         let training =
             spawn_alive("training", events, health.part("training", TRAINING_STUCK), move |beat| training.run(beat))?;
-        Ok(Self { services, outbox, stop, training, snapshots, scores, tensorboard })
+        Ok(Self { services, outbox, stop, training, snapshots, scores })
     }
 
     /// The shared state of jobs and scores.
@@ -145,9 +136,6 @@ impl Threads {
         self.snapshots.join().ok();
         self.services.deliveries.send(None).ok();
         self.scores.join().ok();
-        if let Some(tensorboard) = self.tensorboard {
-            tensorboard.end();
-        }
     }
 }
 

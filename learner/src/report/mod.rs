@@ -1,8 +1,8 @@
 //! The results of runs: evaluations, summaries over seeds, published figures of the same tasks, and pictures.
 //!
-//! Owns nothing: it reads run folders, which a learner may be writing, and makes text, JSON, HTML, SVG, PNG and event files.
-//! It runs on its caller's thread: `learner report`, and `train` at the end of a run call it on the main thread, `tensorboard`
-//! during a run. [`quad_runs::results`] reads the runs.
+//! Owns nothing: it reads run folders, which a learner may be writing, and makes text, JSON, HTML, SVG and PNG.
+//! It runs on its caller's thread: `learner report`, and `train` at the end of a run call it on the main thread.
+//! [`quad_runs::results`] reads the runs.
 //!
 //! The protocol is the paper's (section 5.1 and appendix B): the score of a run is the mean of its last 5 evaluations, or of
 //! the evaluations in its last 50,000 steps; several seeds give mean ± standard deviation. If the user asks for it, a run's
@@ -10,8 +10,7 @@
 //!
 //! In reading order: `seeds` groups runs that differ only in their seed; `study` applies the statistics to methods over tasks
 //! and seeds; `paper` makes the paper's tables with our figures in them; `summary` is the whole report; `figures` are its
-//! pictures, which `plot` draws; `html` puts all of it into one file, with the commands of `remake`. `tensorboard` copies a run
-//! to an event file.
+//! pictures, which `plot` draws; `html` puts all of it into one file, with the commands of `remake`.
 
 mod figures;
 mod html;
@@ -21,9 +20,7 @@ mod remake;
 mod seeds;
 mod study;
 mod summary;
-mod tensorboard;
 
 pub(crate) use figures::{draw_all, of_run};
 pub(crate) use html::write as write_html;
 pub(crate) use summary::Report;
-pub(crate) use tensorboard::{Exporter, export_all};

@@ -230,20 +230,3 @@ fn a_page_holds_all_that_is_shown_and_takes_nothing_for_html() {
         assert!(page.contains(words), "{words} is missing in\n{page}");
     }
 }
-
-#[test]
-fn event_files_of_two_runs_of_one_name_are_refused() {
-    let folder = tempfile::tempdir().unwrap();
-    let [a, b, events] = ["a", "b", "events"].map(|name| folder.path().join(name));
-    small(0, 0.0).write(&a);
-    small(1, 0.0).set(&[("run.name", "other".into())]).write(&b);
-    let arguments = ["report", a.to_str().unwrap(), b.to_str().unwrap(), "--tensorboard", events.to_str().unwrap()];
-    printed(&arguments);
-    let file = fs::read_dir(events.join("other")).unwrap().next().unwrap().unwrap();
-    assert!(file.file_name().to_str().unwrap().starts_with("events.out.tfevents."));
-
-    small(1, 0.0).write(&b);
-    let refused = learner(&arguments);
-    let said = String::from_utf8(refused.stderr).unwrap();
-    assert!(!refused.status.success() && said.contains("both have a run named r"), "{said}");
-}

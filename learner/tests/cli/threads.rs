@@ -24,7 +24,7 @@ fn the_threads_of_a_learner_are_those_of_the_table() {
         .args(["train", "--task", "hopper-demo", "--steps", "100000000", "--eval-interval", "50000000"])
         .args(["--set", "batch_size=4", "--agent", "actor.hidden=[8]", "--agent", "critic.hidden=[8]"])
         .args(["--listen", "tcp/127.0.0.1:0", "--dataset"])
-        .args([&dataset, Path::new("--run-dir"), &run, Path::new("--tensorboard"), folder.path()])
+        .args([&dataset, Path::new("--run-dir"), &run])
         .stderr(Stdio::null())
         .spawn()
         .unwrap();

@@ -45,8 +45,7 @@ def metrics(folder: str | PathLike[str]) -> list[dict[str, float]]:
 
     Each dictionary has `step`. Where the run's metrics.jsonl has that step, it has `seconds` (of training) and each metric, as
     `train/NAME`. Where all episodes of an evaluation of that step are scored, it has `evaluation/score`,
-    `evaluation/score_std` (if there are several episodes), `evaluation/return` and `evaluation/length`. Steps ascend. These are
-    the names that `learner report --tensorboard` gives.
+    `evaluation/score_std` (if there are several episodes), `evaluation/return` and `evaluation/length`. Steps ascend.
 
     A learner may be writing the folder. Raises FileNotFoundError if it holds no metrics.jsonl, else as `runs` does.
     """
