@@ -1,46 +1,26 @@
 //! What tests of several modules write into run folders.
 
-use quad_runs::config::{DatasetInfo, Device, RunConfig, RunInfo, resolve};
+use quad_runs::config::{RunConfig, resolve};
 use quad_runs::run::ScoreLine;
-use toml::Table;
+use serde_json::json;
 
-/// The configuration of a run.
+/// The configuration of a run with two episodes an evaluation.
 pub fn config(name: &str, seed: u64) -> RunConfig {
-    let mut experiment = resolve("hopper-demo", &Table::new()).unwrap();
+    let mut experiment = resolve("hopper-demo", &Default::default()).unwrap();
     (experiment.seed, experiment.episodes) = (seed, 2);
-    RunConfig {
-        run: RunInfo {
-            name: name.into(),
-            started: 1,
-            task: "hopper-demo".into(),
-            version: "0.1.0".into(),
-            machine: None,
-            device: Device::Cpu,
-        },
-        dataset: DatasetInfo {
-            path: "data.hdf5".into(),
-            sha256: None,
-            transitions: 100,
-            episodes: 3,
-            min_return: 10.0,
-            mean_return: 20.0,
-            max_return: 30.0,
-            mean_score: Some(10.7),
-        },
-        experiment,
-    }
+    let run = json!({ "name": name, "incarnation": 1, "task": "hopper-demo", "version": "0.1.0" });
+    let dataset = json!({
+        "path": "data.hdf5", "transitions": 100, "episodes": 3, "min_return": 10.0, "mean_return": 20.0, "max_return": 30.0,
+        "mean_score": 10.7,
+    });
+    serde_json::from_value(json!({ "run": run, "dataset": dataset, "experiment": experiment })).unwrap()
 }
 
 /// A line of `scores.jsonl`.
 pub fn line(step: u64, seed: u64, score: f64) -> ScoreLine {
-    ScoreLine {
-        step,
-        seed,
-        episode_return: 10.0 * score,
-        length: 5,
-        score,
-        weights: "00".into(),
-        precision: "f32".into(),
-        evaluator: "e".into(),
-    }
+    serde_json::from_value(json!({
+        "step": step, "seed": seed, "return": 10.0 * score, "length": 5, "score": score, "weights": "00",
+        "precision": "f32", "evaluator": "e",
+    }))
+    .unwrap()
 }

@@ -180,7 +180,12 @@ impl RunReport {
 
     /// Its complete evaluation with the largest score.
     pub fn best(&self) -> Option<&EvaluationReport> {
-        let complete = self.evaluations.iter().filter(|evaluation| evaluation.complete);
+        self.best_of(|_| true)
+    }
+
+    /// The best among the evaluations of some steps; of equal ones the last.
+    pub fn best_of(&self, is_one: impl Fn(u64) -> bool) -> Option<&EvaluationReport> {
+        let complete = self.evaluations.iter().filter(|evaluation| evaluation.complete && is_one(evaluation.step));
         complete.max_by(|one, other| one.score.mean.total_cmp(&other.score.mean))
     }
 

@@ -161,7 +161,8 @@ impl RunDir {
         replace(&path, text.as_bytes())
     }
 
-    fn snapshot_path(&self, step: u64) -> PathBuf {
+    /// Where the snapshot of a gradient step is or will be.
+    pub fn snapshot_path(&self, step: u64) -> PathBuf {
         self.path.join("snapshots").join(format!("step_{step:09}.safetensors"))
     }
 

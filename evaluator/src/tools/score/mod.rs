@@ -8,12 +8,13 @@ mod subject;
 
 use quad_policy::Precision;
 use quad_protocol::episode_seeds;
+use quad_runs::results::Spread;
 use rayon::prelude::*;
 use tracing::{info, warn};
 
 use crate::sim::{Environments, Simulations};
 pub(crate) use args::ScoreArgs;
-use results::{Episode, Scored, Spread, table};
+use results::{Episode, Scored, table};
 pub(crate) use subject::Subject;
 
 /// Episodes in a batch. The limit bounds memory; a larger batch is hardly faster.
@@ -51,6 +52,7 @@ fn measure(subject: &Subject) -> anyhow::Result<Scored> {
         precision: policy.precision().arithmetic(),
         episodes: batches.iter().flatten().map(Episode::from).collect(),
     };
-    info!("{}, {}: {}", path.display(), scored.title(), Spread::of(&scored.scores()));
+    let spread = scored.spread().map(Spread::text).unwrap_or_default();
+    info!("{}, {}: {spread}", path.display(), scored.title());
     Ok(scored)
 }

@@ -1,10 +1,12 @@
 //! The scores of policies, and their table.
 
 use std::collections::BTreeSet;
-use std::fmt;
+use std::fmt::Alignment::{Left, Right};
 use std::path::PathBuf;
 
 use quad_policy::Choice;
+use quad_runs::results::Spread;
+use quad_runs::table::{Style, Table};
 use serde::Serialize;
 
 use crate::sim::EpisodeOutcome;
@@ -50,9 +52,9 @@ impl Scored {
         self.choice.map_or_else(|| "no candidates".to_owned(), |choice| choice.to_string())
     }
 
-    /// The normalised score of each episode.
-    pub fn scores(&self) -> Vec<f64> {
-        self.episodes.iter().map(|episode| episode.score).collect()
+    /// The normalised scores of the episodes, of which there is at least one.
+    pub fn spread(&self) -> Option<Spread> {
+        Spread::of(&Vec::from_iter(self.episodes.iter().map(|episode| episode.score)))
     }
 }
 
@@ -60,34 +62,6 @@ impl From<&EpisodeOutcome> for Episode {
     fn from(outcome: &EpisodeOutcome) -> Self {
         let EpisodeOutcome { seed, episode_return, length, score, .. } = *outcome;
         Self { seed, episode_return, length, score }
-    }
-}
-
-/// Mean and sample standard deviation (n - 1).
-#[derive(Clone, Copy, Debug, PartialEq)]
-pub struct Spread {
-    /// The mean; NaN for no value.
-    pub mean: f64,
-    /// The standard deviation; absent for a single value.
-    pub std: Option<f64>,
-}
-
-impl Spread {
-    /// The summary of these values.
-    pub fn of(values: &[f64]) -> Self {
-        let count = values.len() as f64;
-        let mean = values.iter().sum::<f64>() / count;
-        let squares: f64 = values.iter().map(|value| (value - mean).powi(2)).sum();
-        Self { mean, std: (values.len() > 1).then(|| (squares / (count - 1.0)).sqrt()) }
-    }
-}
-
-impl fmt::Display for Spread {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        match self.std {
-            Some(std) => write!(f, "{:.2} ± {std:.2}", self.mean),
-            None => write!(f, "{:.2}", self.mean),
-        }
     }
 }
 
@@ -99,8 +73,10 @@ pub fn table(scored: &[Scored]) -> String {
             titles.push(title);
         }
     }
-    let head = ["snapshot", "step", "environment", "episodes"].map(str::to_owned);
-    let mut rows: Vec<Vec<String>> = vec![head.into_iter().chain(titles.iter().cloned()).collect()];
+    let head = [("snapshot", Left), ("step", Right), ("environment", Right), ("episodes", Right)];
+    let choices = titles.iter().map(|title| (title.as_str(), Right));
+    let mut table = Table::new(&Vec::from_iter(head.into_iter().chain(choices)));
+    let text = |spread: Option<Spread>| spread.map(Spread::text).unwrap_or_default();
 
     let snapshots: Vec<&[Scored]> = scored.chunk_by(|one, next| one.snapshot == next.snapshot).collect();
     for of_one in &snapshots {
@@ -108,9 +84,9 @@ pub fn table(scored: &[Scored]) -> String {
         let head = [snapshot.display().to_string(), step.to_string(), environment.clone(), episodes.len().to_string()];
         let score = |title: &String| {
             let found = of_one.iter().find(|scored| scored.title() == *title);
-            found.map(|scored| Spread::of(&scored.scores()).to_string()).unwrap_or_default()
+            text(found.and_then(Scored::spread))
         };
-        rows.push(head.into_iter().chain(titles.iter().map(score)).collect());
+        table.push(Vec::from_iter(head.into_iter().chain(titles.iter().map(score))));
     }
     let precisions: BTreeSet<&str> = scored.iter().map(|scored| scored.precision.as_str()).collect();
     let precisions = Vec::from_iter(precisions).join(" and ");
@@ -119,28 +95,14 @@ pub fn table(scored: &[Scored]) -> String {
         let head = [format!("mean of {} snapshots", snapshots.len()), String::new(), String::new(), String::new()];
         let mean = |title: &String| {
             let with_these = scored.iter().filter(|scored| scored.title() == *title);
-            let means: Vec<f64> = with_these.map(|scored| Spread::of(&scored.scores()).mean).collect();
+            let means = Vec::from_iter(with_these.filter_map(Scored::spread).map(|spread| spread.mean));
             // A mean over fewer snapshots would not be what the row says.
-            if means.len() == snapshots.len() { Spread::of(&means).to_string() } else { String::new() }
+            text(Spread::of(&means).filter(|_| means.len() == snapshots.len()))
         };
-        rows.push(head.into_iter().chain(titles.iter().map(mean)).collect());
+        table.push(Vec::from_iter(head.into_iter().chain(titles.iter().map(mean))));
         note.push_str("; in the last row over the snapshots");
     }
-    aligned(&rows) + &note
-}
-
-/// Makes columns as wide as needed: text to the left, numbers (in all columns but the first) to the right.
-fn aligned(rows: &[Vec<String>]) -> String {
-    let width = |column: usize| rows.iter().map(|row| row[column].chars().count()).max().unwrap_or(0);
-    let widths: Vec<usize> = (0..rows.first().map_or(0, Vec::len)).map(width).collect();
-    let line = |row: &Vec<String>| {
-        let cells = row.iter().zip(&widths).enumerate().map(|(column, (cell, &width))| match column {
-            0 => format!("{cell:<width$}"),
-            _ => format!("  {cell:>width$}"),
-        });
-        format!("{}\n", cells.collect::<String>().trim_end())
-    };
-    rows.iter().map(line).collect()
+    table.render(Style::Text) + &note
 }
 
 #[cfg(test)]
