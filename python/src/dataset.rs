@@ -46,10 +46,3 @@ pub fn inspect_dataset(py: Python<'_>, path: PathBuf) -> PyResult<(String, Strin
     let json = serde_json::to_string(&inspection);
     Ok((json.map_err(|error| PyRuntimeError::new_err(error.to_string()))?, inspection.to_string()))
 }
-
-/// A TOML file's text as JSON: Python reads TOML by itself only from 3.11.
-#[pyfunction]
-pub fn toml_to_json(text: &str) -> PyResult<String> {
-    let table = text.parse::<toml::Table>().map_err(|error| with_hint(&error, "it is what a learner writes"))?;
-    serde_json::to_string(&table).map_err(|error| PyRuntimeError::new_err(error.to_string()))
-}

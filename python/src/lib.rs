@@ -9,17 +9,20 @@ mod episodes;
 mod error;
 mod evaluate;
 mod policy;
+mod runs;
 
 use pyo3::prelude::*;
 
 #[pymodule]
 mod _quad_rl {
     #[pymodule_export]
-    use crate::dataset::{inspect_dataset, toml_to_json, write_dataset};
+    use crate::dataset::{inspect_dataset, write_dataset};
     #[pymodule_export]
     use crate::episodes::Episodes;
     #[pymodule_export]
     use crate::evaluate::{serve_environment, simulated};
     #[pymodule_export]
     use crate::policy::PyPolicy;
+    #[pymodule_export]
+    use crate::runs::read_run;
 }

@@ -5,9 +5,6 @@ from __future__ import annotations
 import glob
 import json
 import os
-import shutil
-import subprocess
-import sysconfig
 from collections.abc import Iterable
 from os import PathLike
 from pathlib import Path
@@ -27,15 +24,12 @@ def runs(folders: str | PathLike[str] | Iterable[str | PathLike[str]] = "runs/*"
     all its rows; and each setting of its `config.toml` under its name there, like `experiment.batch_size`. A run that has
     no evaluation yet has one row, in which these are None.
 
-    A learner may be writing the folders. Raises RuntimeError with what `learner report` says, FileNotFoundError if the program
-    is neither beside Python nor on the PATH.
+    A learner may be writing the folders. Raises RuntimeError if a file is not what a learner writes.
     """
     patterns = [folders] if isinstance(folders, (str, PathLike)) else folders
     found = [path for pattern in patterns for path in sorted(glob.glob(os.path.expanduser(os.fspath(pattern))))]
     found = [path for path in found if Path(path, "config.toml").is_file()]
-    if not found:
-        return []
-    return [row for run in _report(found) for row in _rows(run)]
+    return [row for path in found for row in _rows(path)]
 
 
 def metrics(folder: str | PathLike[str]) -> list[dict[str, float]]:
@@ -54,7 +48,7 @@ def metrics(folder: str | PathLike[str]) -> list[dict[str, float]]:
     for line in map(json.loads, lines):
         named = {name if name in ("step", "seconds") else f"train/{name}": value for name, value in line.items()}
         rows[line["step"]] = named
-    for scored in _rows(_report([os.fspath(folder)])[0]):
+    for scored in _rows(folder):
         if scored["complete"]:
             row = rows.setdefault(scored["step"], {"step": scored["step"]})
             values = {name: scored[name] for name in ("score", "score_std", "return", "length")}
@@ -62,14 +56,10 @@ def metrics(folder: str | PathLike[str]) -> list[dict[str, float]]:
     return [rows[step] for step in sorted(rows)]
 
 
-def _report(folders: list[str]) -> list[dict[str, Any]]:
-    runs: list[dict[str, Any]] = json.loads(_learner("report", "--json", *folders))["runs"]
-    return runs
-
-
-def _rows(run: dict[str, Any]) -> list[dict[str, Any]]:
+def _rows(folder: str | PathLike[str]) -> list[dict[str, Any]]:
+    run, config = map(json.loads, _quad_rl.read_run(folder))
     of_run = _flat("", {name: value for name, value in run.items() if name not in ("evaluations", "missing")})
-    of_run |= _flat("", json.loads(_quad_rl.toml_to_json(Path(run["dir"], "config.toml").read_text())))
+    of_run |= _flat("", config)
     evaluations = [
         {
             **{name: one[name] for name in ("step", "episodes", "complete")},
@@ -88,14 +78,3 @@ def _flat(prefix: str, table: dict[str, Any]) -> dict[str, Any]:
     for name, value in table.items():
         flat |= _flat(f"{prefix}{name}.", value) if isinstance(value, dict) else {prefix + name: value}
     return flat
-
-
-def _learner(*arguments: str) -> str:
-    """What the learner prints: the program that came with this package, or else that on the PATH."""
-    program = shutil.which("learner", path=sysconfig.get_path("scripts")) or shutil.which("learner")
-    if program is None:
-        raise FileNotFoundError("there is no program `learner`, neither beside Python nor on the PATH")
-    done = subprocess.run([program, *arguments], capture_output=True, text=True)
-    if done.returncode:
-        raise RuntimeError(done.stderr.strip())
-    return done.stdout
