@@ -15,7 +15,7 @@ use crate::array::Array;
 use crate::error::{DatasetError, Problem};
 
 /// The first bytes of an HDF5 file.
-pub(crate) const SIGNATURE: &[u8] = b"\x89HDF\r\n\x1a\n";
+pub const SIGNATURE: &[u8] = b"\x89HDF\r\n\x1a\n";
 
 /// deflate shrinks by a factor of 1032 at most, so more than that in an array is a lie about its size.
 const MAX_COMPRESSION: u64 = 1040;

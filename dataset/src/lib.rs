@@ -40,7 +40,7 @@ pub use catalogue::NamedDataset;
 pub use environment::{EnvironmentSpec, Goal, UnknownEnvironment};
 pub use error::{DatasetError, Problem};
 pub use formats::{data_file, minari_folder, recorded_environment};
-pub use hdf5_file::hdf5_library;
+pub use hdf5_file::{SIGNATURE as HDF5_SIGNATURE, hdf5_library};
 pub use inspect::{Inspection, inspect};
 pub use recorded::{RecordedRows, Row, environments_of_its_sizes};
 pub use reward::RewardRule;

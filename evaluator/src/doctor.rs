@@ -7,10 +7,9 @@ use clap::Args;
 use quad_policy::Precision;
 use quad_protocol::{JobReply, JobRequest, Name, PROTOCOL_VERSION, decode_from, encode, keys};
 use quad_runtime::doctor::{self, Findings};
-use quad_runtime::{Endpoints, Role, default_endpoint, parse_endpoint};
+use quad_runtime::{DEFAULT_PORT, Endpoints, Role, default_endpoint, parse_endpoint};
 use zenoh::Session;
 
-use crate::serve::DEFAULT_PORT;
 use crate::sim::{Environments, Rollout, Simulations};
 use crate::tools::film::{Gl, INSTALL};
 

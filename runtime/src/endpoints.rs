@@ -120,6 +120,9 @@ impl Endpoints {
     }
 }
 
+/// The port at which a learner listens and evaluators look by default.
+pub const DEFAULT_PORT: u16 = 7447;
+
 /// The default endpoint at which learner and evaluator of one machine meet.
 pub fn default_endpoint(certificates: Option<&Certificates>, port: u16) -> String {
     format!("{}127.0.0.1:{port}", if certificates.is_some() { PROTECTED } else { OPEN })

@@ -74,7 +74,7 @@ impl std::error::Error for Hinted {
 
 /// The exit code of a program that has not finished and continues when the same command is given again: EX_TEMPFAIL of
 /// `sysexits.h`, which a scheduler can tell from a failure.
-const UNFINISHED: u8 = 75;
+pub const UNFINISHED: u8 = 75;
 /// How long the program waits for a reader of stderr before it ends.
 const LAST_WORDS: Timespec = Timespec { tv_sec: 1, tv_nsec: 0 };
 /// Bytes that a pipe with free space takes without waiting.

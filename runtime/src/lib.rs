@@ -32,8 +32,8 @@ mod threads;
 
 pub use background::stay_in_background;
 pub use certificates::{Certificates, CertificatesError, Role};
-pub use endpoints::{Endpoints, SessionError, default_endpoint, parse_endpoint};
-pub use exit::{Hint, hinted, hints, print, run_main, unfinished};
+pub use endpoints::{DEFAULT_PORT, Endpoints, SessionError, default_endpoint, parse_endpoint};
+pub use exit::{Hint, UNFINISHED, hinted, hints, print, run_main, unfinished};
 pub use health::{Beat, Health};
 pub use logging::{Logging, init_logging};
 pub use metrics_server::{BindError, MetricsServer, serve_metrics};

@@ -38,8 +38,8 @@ use clap::Args;
 use quad_policy::Precision;
 use quad_protocol::Name;
 use quad_runtime::{
-    BindError, Certificates, CertificatesError, Endpoints, Health, Hint, Role, SessionError, default_endpoint,
-    parse_endpoint,
+    BindError, Certificates, CertificatesError, DEFAULT_PORT, Endpoints, Health, Hint, Role, SessionError,
+    default_endpoint, parse_endpoint,
 };
 use rand::Rng;
 use tracing::{info, warn};
@@ -84,8 +84,6 @@ pub struct ServeArgs {
     pub precision: Precision,
 }
 
-/// The default port of a learner on this machine.
-pub(crate) const DEFAULT_PORT: u16 = 7447;
 /// How long the process waits for its threads at the end.
 const LEAVE: Duration = Duration::from_secs(1);
 

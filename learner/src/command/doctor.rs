@@ -2,13 +2,10 @@
 
 use quad_policy::Precision;
 use quad_runtime::doctor::{self, Findings};
-use quad_runtime::{Endpoints, Role};
+use quad_runtime::{DEFAULT_PORT, Endpoints, Role};
 
 use crate::cli::DoctorArgs;
 use crate::data;
-
-/// Where a learner listens by default.
-const PORT: u16 = 7447;
 
 /// Runs all checks.
 ///
@@ -28,7 +25,7 @@ pub fn examine(args: &DoctorArgs) -> anyhow::Result<Findings> {
     let folder = args.certificates.as_deref();
     let certificates = folder.and_then(|folder| doctor::certificates(&mut findings, folder, Role::Learner));
     let Some(endpoint) = &args.connect else {
-        doctor::port(&mut findings, PORT);
+        doctor::port(&mut findings, DEFAULT_PORT);
         return Ok(findings);
     };
     let endpoints = Endpoints { connect: vec![endpoint.clone()], certificates, ..Endpoints::default() };

@@ -2,14 +2,14 @@
 
 use std::thread::available_parallelism;
 
-use quad_runtime::{Certificates, CertificatesError, Endpoints, Hint, Role, SessionError, default_endpoint};
+use quad_runtime::{
+    Certificates, CertificatesError, DEFAULT_PORT, Endpoints, Hint, Role, SessionError, default_endpoint,
+};
 use tracing::{info, warn};
 
 use crate::cli::TrainArgs;
 use crate::live::{LocalEvaluators, Opening, open_network};
 
-/// The port at which evaluators look by default.
-const DEFAULT_PORT: u16 = 7447;
 /// For a run that needs no known port, so that several can run at a time.
 const ANY_PORT: u16 = 0;
 

@@ -4,11 +4,9 @@ use std::fs::File;
 use std::io::{self, Read};
 use std::path::Path;
 
-use quad_dataset::NamedDataset;
+use quad_dataset::{HDF5_SIGNATURE, NamedDataset};
 use sha2::{Digest, Sha256};
 
-/// How an HDF5 file of D4RL begins. What some servers send instead of an error is a page for people.
-const HDF5_SIGNATURE: &[u8] = b"\x89HDF\r\n\x1a\n";
 /// Read at a time.
 const CHUNK: usize = 1 << 20;
 
@@ -21,6 +19,7 @@ pub fn verify(dataset: &NamedDataset, path: &Path) -> io::Result<Result<String, 
     }
     let mut start = Vec::new();
     file.by_ref().take(HDF5_SIGNATURE.len() as u64).read_to_end(&mut start)?;
+    // Some servers send a page for people in place of an error.
     if start != HDF5_SIGNATURE {
         return Ok(Err("it is not an HDF5 file".to_owned()));
     }

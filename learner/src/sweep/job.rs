@@ -8,13 +8,12 @@ use anyhow::Context;
 use quad_runs::config::tables;
 use quad_runs::run::RunDir;
 use quad_runs::status::State;
+use quad_runtime::UNFINISHED;
 use rustix::process::{Pid, Signal, kill_process};
 
 use super::study::PlannedRun;
 use crate::live::{not_encrypted, spawn_logged};
 
-/// What a learner says by its exit code: the run is not complete, and the same command goes on.
-const UNFINISHED: i32 = 75;
 /// What a line that says why a learner has failed begins with.
 const ERROR: &str = "error: ";
 
@@ -65,7 +64,7 @@ impl Job {
         let status = self.process.try_wait().ok().flatten()?;
         Some(match status.code() {
             Some(0) => End::Complete,
-            Some(UNFINISHED) => End::Unfinished,
+            Some(code) if code == i32::from(UNFINISHED) => End::Unfinished,
             _ => {
                 // On a disk that takes nothing, `--list` calls it begun.
                 RunDir::at(&self.dir).mark_failed(true).ok();
