@@ -23,10 +23,12 @@ pub enum Style {
 pub enum Part {
     /// Lines of text.
     Words(String),
+    /// A table.
     Table(Table),
 }
 
 impl Part {
+    /// The part as text.
     pub fn render(&self, style: Style) -> String {
         match (self, style) {
             (Self::Table(table), _) => table.render(style),
@@ -45,6 +47,7 @@ pub struct Table {
 }
 
 impl Table {
+    /// A table with this header and no rows.
     pub fn new<T: AsRef<str>>(header: &[(T, Alignment)]) -> Self {
         let right = header.iter().map(|(_, alignment)| *alignment == Right).collect();
         Self { right, rows: vec![header.iter().map(|(name, _)| name.as_ref().to_owned()).collect()] }
@@ -55,6 +58,7 @@ impl Table {
         self.rows.push(row.into());
     }
 
+    /// The table as text.
     pub fn render(&self, style: Style) -> String {
         match style {
             Style::Text => self.lines(|cells| format!("{}\n", cells.join("  ").trim_end())).concat(),

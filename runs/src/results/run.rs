@@ -85,6 +85,7 @@ pub struct RunReport {
     /// Whether the evaluators' user decides what counts as a score, such as success, and it is not the return.
     #[serde(skip)]
     own_score: bool,
+    /// Each precision that its policies were scored in.
     #[serde(skip)]
     pub precisions: BTreeSet<String>,
     /// Its configuration.
