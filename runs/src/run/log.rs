@@ -56,12 +56,11 @@ impl Log {
         Ok(log)
     }
 
-    /// For tests: any file, neither locked nor looked at.
-    #[cfg(test)]
-    pub fn unchecked(path: PathBuf) -> Self {
-        #[allow(clippy::unwrap_used)]
-        let file = OpenOptions::new().append(true).open(&path).unwrap();
-        Self { path, file, length: 0, torn: false, synchronise: false }
+    /// For tests, of other crates too: any file, neither locked nor looked at.
+    #[doc(hidden)]
+    pub fn unchecked(path: PathBuf) -> io::Result<Self> {
+        let file = OpenOptions::new().append(true).open(&path)?;
+        Ok(Self { path, file, length: 0, torn: false, synchronise: false })
     }
 
     /// Whether there is no whole line in it.

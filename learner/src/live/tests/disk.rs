@@ -35,7 +35,7 @@ async fn while_scores_cannot_be_written_jobs_go_out_and_no_score_is_acknowledged
 /// A full disk, and many evaluators that report together. That each keeps its job is tested with the scoreboard.
 #[tokio::test(flavor = "multi_thread")]
 async fn every_evaluator_hears_why_its_scores_could_not_be_saved() {
-    let full = |log: &mut Log| *log = Log::unchecked("/dev/full".into());
+    let full = |log: &mut Log| *log = Log::unchecked("/dev/full".into()).unwrap();
     let mut bench = Bench::with(Duration::from_secs(600), full).await;
     let client = bench.client().await;
     let mut answers = Vec::new();
