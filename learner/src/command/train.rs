@@ -132,7 +132,7 @@ async fn run_to_its_end(
     let checkpoint_every = Duration::from_secs(args.checkpoint_seconds);
     let run = Run { life: life.clone(), config, dir: &run_dir, scores, past, checkpoint_every };
     let threads = Threads::start(run, transitions, &metrics, &health, &tell)?;
-    live.begun(threads.coordinator());
+    threads.show_on(&live);
     let main_loop = MainLoop {
         life,
         run_dir: run_dir.clone(),

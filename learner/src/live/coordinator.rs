@@ -8,15 +8,14 @@ use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::Instant;
 
 use quad_protocol::{EpisodeScore, Hash, JobReply, JobRequest, Name, Progress, ScoreReply, ScoreReport, episode_seeds};
+use quad_runs::run::Earlier;
 use tracing::{debug, warn};
 
 use super::evaluators::{EvaluatorAtWork, Evaluators, JobAtWork};
 use super::events::{Event, Events};
 use super::metrics::Metrics;
 use super::rejection::Rejection;
-use crate::evaluation::{
-    Claim, Claimed, Earlier, HandedBack, Lost, OtherWeights, Refusal, Rules, Scoreboard, Validated,
-};
+use crate::evaluation::{Claim, Claimed, HandedBack, Lost, OtherWeights, Refusal, Rules, Scoreboard, Validated};
 
 /// Most characters of an evaluator's error message that the learner logs.
 const LONGEST_REASON: usize = 300;

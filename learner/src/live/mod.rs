@@ -13,7 +13,8 @@
 //!   `scores`, which writes scores. `requests`: queries that wait for their answer.
 //! - `coordinator` is the state that the threads share: the scoreboard and the `evaluators`. `rejection`: why the learner does
 //!   not accept a message.
-//! - `metrics` are for Prometheus; `disk` reports a disk that refuses writes; `display` is the terminal, `live` the state for the page.
+//! - `metrics` are for Prometheus; `disk` reports a disk that refuses writes; `display` is the terminal, `page_state` the
+//!   state for the page.
 
 mod coordinator;
 mod disk;
@@ -21,11 +22,11 @@ mod display;
 mod duplicate;
 mod evaluators;
 mod events;
-mod live;
 mod local_evaluators;
 mod main_loop;
 mod metrics;
 mod network;
+mod page_state;
 mod patience;
 mod pool;
 mod rejection;
@@ -42,9 +43,9 @@ mod wire;
 
 pub(crate) use display::Display;
 pub(crate) use duplicate::Life;
-pub(crate) use live::Live;
 pub(crate) use local_evaluators::{LocalEvaluators, not_encrypted, spawn_logged};
 pub(crate) use main_loop::{Ending, MainLoop};
 pub(crate) use metrics::Metrics;
 pub(crate) use network::{Opening, open_network};
+pub(crate) use page_state::Live;
 pub(crate) use threads::{Run, STUCK, Threads};

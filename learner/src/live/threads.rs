@@ -8,7 +8,7 @@ use std::time::Duration;
 
 use quad_dataset::{Task, Transitions};
 use quad_runs::config::{Experiment, RunConfig};
-use quad_runs::run::{Log, Past, RunDir};
+use quad_runs::run::{Earlier, Log, Past, RunDir};
 use quad_runtime::Health;
 
 use super::coordinator::{Coordinator, EvaluationPlan};
@@ -16,12 +16,13 @@ use super::disk::DiskStatus;
 use super::duplicate::Life;
 use super::events::{Events, Saved};
 use super::metrics::Metrics;
+use super::page_state::Live;
 use super::scores::Scores;
 use super::services::Services;
 use super::snapshots::Snapshots;
 use super::spawn::spawn_alive;
 use super::weights::Weights;
-use crate::evaluation::{Earlier, Rules};
+use crate::evaluation::Rules;
 use crate::train::{Outbox, Training};
 
 /// Most episodes in one job, so that two evaluators share an evaluation of ten; and most when hundreds wait.
@@ -118,9 +119,9 @@ impl Threads {
         Ok(Self { services, outbox, stop, training, snapshots, scores })
     }
 
-    /// The shared state of jobs and scores.
-    pub fn coordinator(&self) -> Coordinator {
-        self.services.coordinator.clone()
+    /// Shows the shared state of jobs and scores on the page.
+    pub fn show_on(&self, live: &Live) {
+        live.begun(self.services.coordinator.clone());
     }
 
     /// Asks training to end after its current step.

@@ -5,8 +5,8 @@ use std::fs;
 
 use serde_json::{Value, json};
 
+use crate::printed;
 use crate::run::Run;
-use crate::{learner, printed};
 
 /// What is reported of runs, which lie in folders a, b, …
 pub(super) struct Reported {

@@ -8,9 +8,10 @@ use std::collections::BTreeMap;
 use std::time::{Duration, Instant};
 
 use quad_protocol::{EpisodeScore, Hash, Job, Name, Progress, ScoreReport};
+use quad_runs::run::Earlier;
 
 use super::outcomes::Recorded;
-use super::{Claim, Claimed, Earlier, HandedBack, Lost, Refusal, Rules, Scoreboard, Validated};
+use super::{Claim, Claimed, HandedBack, Lost, Refusal, Rules, Scoreboard, Validated};
 
 const LEASE: Duration = Duration::from_secs(10);
 const INCARNATION: u64 = 77;

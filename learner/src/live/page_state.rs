@@ -27,7 +27,7 @@ impl Live {
     }
 
     /// Records that the run has begun.
-    pub fn begun(&self, coordinator: Coordinator) {
+    pub(super) fn begun(&self, coordinator: Coordinator) {
         self.coordinator.set(coordinator).ok();
     }
 
