@@ -1,7 +1,7 @@
 //! What tests of several modules write into run folders.
 
-use quad_runs::config::{RunConfig, resolve};
-use quad_runs::run::ScoreLine;
+use quad_run::config::{RunConfig, resolve};
+use quad_run::run::ScoreLine;
 use serde_json::json;
 
 /// The configuration of a run with two episodes an evaluation.

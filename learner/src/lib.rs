@@ -12,7 +12,7 @@
 //! - `evaluation` tracks which episodes wait for a score, and which evaluator has which. It does no input or output.
 //! - `data` finds or fetches the data that a run learns from.
 //!
-//! Below it: the crate `quad_runs` has the folder, settings and results of a run, `quad_algorithms` the algorithms.
+//! Below it: the crate `quad_run` has the folder, settings and results of a run, `quad_algorithms` the algorithms.
 
 #![deny(unsafe_code)]
 

@@ -4,8 +4,8 @@ use std::path::PathBuf;
 
 use pyo3::exceptions::PyRuntimeError;
 use pyo3::prelude::*;
-use quad_runs::results::RunReport;
-use quad_runs::run::RunDirError;
+use quad_run::results::RunReport;
+use quad_run::run::RunDirError;
 
 /// A run's results and its configuration, each as JSON.
 #[pyfunction]

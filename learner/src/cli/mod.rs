@@ -9,8 +9,8 @@ use std::path::PathBuf;
 use clap::{Args, Parser, Subcommand};
 use clap_complete::Shell;
 use quad_dataset::{EnvironmentSpec, environment};
-use quad_runs::config::{hyperparameters, presets, tasks};
-use quad_runs::results::Select;
+use quad_run::config::{hyperparameters, presets, tasks};
+use quad_run::results::Select;
 use quad_runtime::parse_endpoint;
 
 pub use sweep::{Shard, SweepArgs};

@@ -6,8 +6,8 @@ use std::path::PathBuf;
 
 use clap::{Args, value_parser};
 use quad_policy::Precision;
-use quad_runs::config::Device;
-use quad_runs::config::tables::{self, parse_assignment};
+use quad_run::config::Device;
+use quad_run::config::tables::{self, parse_assignment};
 use quad_runtime::parse_endpoint;
 use toml::{Table, Value};
 

@@ -5,7 +5,7 @@ use std::path::Path;
 
 use indicatif::HumanBytes;
 use quad_dataset::Transitions;
-use quad_runs::config::RunConfig;
+use quad_run::config::RunConfig;
 use quad_runtime::print;
 
 use crate::train::Price;

@@ -13,11 +13,11 @@ use clap::CommandFactory;
 use clap_complete::Shell;
 use quad_algorithms::{ALGORITHMS, Values};
 use quad_dataset::{DatasetError, environment};
-use quad_runs::config::hyperparameters;
-use quad_runs::config::{Preset, tasks};
-use quad_runs::run::{RunDirError, runs_in, verify};
-use quad_runs::status::list;
-use quad_runs::table::{Style, Table};
+use quad_run::config::hyperparameters;
+use quad_run::config::{Preset, tasks};
+use quad_run::run::{RunDirError, runs_in, verify};
+use quad_run::status::list;
+use quad_run::table::{Style, Table};
 use quad_runtime::{Hint, hinted, print};
 use tracing::{info, warn};
 

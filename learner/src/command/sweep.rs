@@ -8,8 +8,8 @@ use std::path::{Path, PathBuf};
 use std::thread::available_parallelism;
 
 use anyhow::{Context, anyhow};
-use quad_runs::status::State;
-use quad_runs::table::{Style, Table};
+use quad_run::status::State;
+use quad_run::table::{Style, Table};
 use quad_runtime::{Hint, SessionError, hinted, open_router, print, stay_in_background, unfinished};
 use tracing::info;
 

@@ -4,7 +4,7 @@ use std::path::Path;
 
 use anyhow::{Context, anyhow};
 use quad_dataset::{DatasetError, ReadOptions, Transitions, environment};
-use quad_runs::config::Experiment;
+use quad_run::config::Experiment;
 use quad_runtime::Hint;
 
 /// Reads a file or folder of transitions for an experiment.

@@ -4,7 +4,7 @@ use std::path::{Path, PathBuf};
 
 use anyhow::{Context, anyhow};
 use quad_dataset::{DatasetError, NamedDataset, catalogue, environment};
-use quad_runs::config::did_you_mean;
+use quad_run::config::did_you_mean;
 use quad_runtime::Hint;
 
 use super::cache;

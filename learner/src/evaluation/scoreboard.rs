@@ -5,7 +5,7 @@ use std::time::{Duration, Instant};
 
 use quad_dataset::Task;
 use quad_protocol::{EpisodeScore, Hash, Job, Name, Progress, ScoreReport};
-use quad_runs::run::Earlier;
+use quad_run::run::Earlier;
 
 use super::episodes::Evaluation;
 use super::jobs::{OpenJob, OpenJobs};

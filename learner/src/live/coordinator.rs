@@ -8,7 +8,7 @@ use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::Instant;
 
 use quad_protocol::{EpisodeScore, Hash, JobReply, JobRequest, Name, Progress, ScoreReply, ScoreReport, episode_seeds};
-use quad_runs::run::Earlier;
+use quad_run::run::Earlier;
 use tracing::{debug, warn};
 
 use super::evaluators::{EvaluatorAtWork, Evaluators, JobAtWork};

@@ -3,8 +3,8 @@
 use std::time::{Duration, Instant};
 
 use quad_dataset::environment;
-use quad_runs::results::Spread;
-use quad_runs::run::RunDir;
+use quad_run::results::Spread;
+use quad_run::run::RunDir;
 use quad_runtime::{Beat, Endpoints, Health};
 use tokio::sync::mpsc::UnboundedReceiver;
 use tokio::task::JoinHandle;

@@ -2,7 +2,7 @@
 
 use std::time::Duration;
 
-use quad_runs::run::{RunDir, RunEndpoints};
+use quad_run::run::{RunDir, RunEndpoints};
 use quad_runtime::{Endpoints, SessionError};
 use tokio::task::JoinHandle;
 use tokio::time::timeout;

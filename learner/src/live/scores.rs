@@ -7,7 +7,7 @@ use std::collections::BTreeSet;
 use std::sync::mpsc::{Receiver, RecvTimeoutError};
 
 use quad_protocol::ScoreReport;
-use quad_runs::run::{Log, ScoreLine};
+use quad_run::run::{Log, ScoreLine};
 use quad_runtime::Beat;
 
 use super::coordinator::Coordinator;

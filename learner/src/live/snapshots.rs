@@ -5,7 +5,7 @@ use std::collections::BTreeMap;
 use std::time::{Duration, SystemTime, UNIX_EPOCH};
 
 use quad_protocol::Hash;
-use quad_runs::run::{Checkpoint, Log, RunDir, RunDirError};
+use quad_run::run::{Checkpoint, Log, RunDir, RunDirError};
 use quad_runtime::{Beat, hinted};
 use tracing::debug;
 

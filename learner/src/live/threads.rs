@@ -7,8 +7,8 @@ use std::thread::JoinHandle;
 use std::time::Duration;
 
 use quad_dataset::{Task, Transitions};
-use quad_runs::config::{Experiment, RunConfig};
-use quad_runs::run::{Earlier, Log, Past, RunDir};
+use quad_run::config::{Experiment, RunConfig};
+use quad_run::run::{Earlier, Log, Past, RunDir};
 use quad_runtime::Health;
 
 use super::coordinator::{Coordinator, EvaluationPlan};

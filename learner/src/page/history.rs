@@ -4,7 +4,7 @@ use std::collections::BTreeMap;
 use std::io;
 use std::path::PathBuf;
 
-use quad_runs::run::new_lines;
+use quad_run::run::new_lines;
 use serde::{Serialize, Serializer};
 
 /// Most rows that are kept: more than a chart has pixels for. Even, so that pairs of rows can become one.

@@ -7,9 +7,9 @@ use std::time::{Duration, Instant};
 
 use axum::body::Bytes;
 use quad_algorithms::Metric;
-use quad_runs::results::RunReport;
-use quad_runs::run::RunDir;
-use quad_runs::status::list;
+use quad_run::results::RunReport;
+use quad_run::run::RunDir;
+use quad_run::status::list;
 use quad_runtime::stay_in_background;
 use serde_json::{Value, json};
 use tokio::sync::oneshot;

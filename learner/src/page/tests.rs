@@ -2,7 +2,7 @@
 
 use std::time::Duration;
 
-use quad_runs::run::RunDir;
+use quad_run::run::RunDir;
 use quad_runtime::{Health, serve_metrics};
 use serde_json::Value;
 use tokio::io::{AsyncReadExt, AsyncWriteExt};

@@ -4,9 +4,9 @@ use std::collections::BTreeMap;
 use std::path::Path;
 
 use anyhow::Context;
-use quad_runs::config::settings::{self, Settings};
-use quad_runs::results::RunReport;
-use quad_runs::results::statistics::{self, Estimate, Runs};
+use quad_run::config::settings::{self, Settings};
+use quad_run::results::RunReport;
+use quad_run::results::statistics::{self, Estimate, Runs};
 use quad_runtime::Hint;
 
 use super::plot::{Line, Picture};

@@ -7,9 +7,9 @@ use anyhow::Context;
 use base64::prelude::{BASE64_STANDARD, Engine};
 use minijinja::Environment;
 use minijinja::value::Serde;
-use quad_runs::results::RunReport;
-use quad_runs::results::lambda::LambdaReport;
-use quad_runs::table::Part;
+use quad_run::results::RunReport;
+use quad_run::results::lambda::LambdaReport;
+use quad_run::table::Part;
 use serde::Serialize;
 
 use super::figures;

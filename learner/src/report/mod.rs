@@ -2,7 +2,7 @@
 //!
 //! Owns nothing: it reads run folders, which a learner may be writing, and makes text, JSON, HTML, SVG and PNG.
 //! It runs on its caller's thread: `learner report`, and `train` at the end of a run call it on the main thread.
-//! [`quad_runs::results`] reads the runs.
+//! [`quad_run::results`] reads the runs.
 //!
 //! The protocol is the paper's (section 5.1 and appendix B): the score of a run is the mean of its last 5 evaluations, or of
 //! the evaluations in its last 50,000 steps; several seeds give mean ± standard deviation. If the user asks for it, a run's

@@ -2,9 +2,9 @@
 
 use std::fmt::Alignment::{Left, Right};
 
-use quad_runs::results::published::{Published, Remark};
-use quad_runs::results::{Select, Spread};
-use quad_runs::table::{Part, Table};
+use quad_run::results::published::{Published, Remark};
+use quad_run::results::{Select, Spread};
+use quad_run::table::{Part, Table};
 
 use super::seeds::GroupReport;
 

@@ -9,7 +9,7 @@ use plotters::coord::Shift;
 use plotters::coord::types::RangedCoordf64;
 use plotters::prelude::*;
 use plotters::style::register_font;
-use quad_runs::results::statistics::Estimate;
+use quad_run::results::statistics::Estimate;
 
 const SIZE: (u32, u32) = (900, 540);
 /// Pixels of a PNG for each of an SVG.

@@ -1,9 +1,9 @@
 //! The command that makes a run again.
 
-use quad_runs::config::settings::{self, differences};
-use quad_runs::config::tables::parse_assignment;
-use quad_runs::results::RunReport;
-use quad_runs::results::departures::as_given;
+use quad_run::config::settings::{self, differences};
+use quad_run::config::tables::parse_assignment;
+use quad_run::results::RunReport;
+use quad_run::results::departures::as_given;
 
 /// `learner train` with all that decides the outcome of the run. Nothing if what the run began from is no task of this
 /// learner's, but a file of its user's, or lacks a value that its task has.

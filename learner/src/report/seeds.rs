@@ -4,12 +4,12 @@ use std::collections::BTreeSet;
 use std::path::PathBuf;
 
 use quad_dataset::{Goal, environment};
-use quad_runs::config::Device;
-use quad_runs::config::settings::{self, Settings, differences};
-use quad_runs::results::departures::{as_given, departures};
-use quad_runs::results::published::{self, Published};
-use quad_runs::results::run::{RunReport, joined};
-use quad_runs::results::{Select, Spread};
+use quad_run::config::Device;
+use quad_run::config::settings::{self, Settings, differences};
+use quad_run::results::departures::{as_given, departures};
+use quad_run::results::published::{self, Published};
+use quad_run::results::run::{RunReport, joined};
+use quad_run::results::{Select, Spread};
 use serde::Serialize;
 
 /// Runs that differ in their seed alone: in task, data, device and every hyper-parameter they agree, and in how far they have

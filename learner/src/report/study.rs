@@ -3,8 +3,8 @@
 use std::collections::BTreeSet;
 use std::fmt::Alignment::{Left, Right};
 
-use quad_runs::results::statistics::{self, Estimate, RESAMPLES, Runs};
-use quad_runs::table::{Part, Table};
+use quad_run::results::statistics::{self, Estimate, RESAMPLES, Runs};
+use quad_run::table::{Part, Table};
 use serde::Serialize;
 
 use super::seeds::GroupReport;

@@ -4,9 +4,9 @@ use std::collections::BTreeSet;
 use std::fmt::Alignment::{Left, Right};
 use std::path::PathBuf;
 
-use quad_runs::results::{RunReport, Select, Spread};
-use quad_runs::run::runs_in;
-use quad_runs::table::{Part, Style, Table};
+use quad_run::results::{RunReport, Select, Spread};
+use quad_run::run::runs_in;
+use quad_run::table::{Part, Style, Table};
 use serde::Serialize;
 
 use super::paper;

@@ -1,6 +1,6 @@
 //! The axes of a study: lists of values, which are combined.
 
-use quad_runs::config::tables;
+use quad_run::config::tables;
 use toml::{Table, Value};
 
 /// One axis.

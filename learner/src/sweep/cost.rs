@@ -6,8 +6,8 @@ use std::time::Duration;
 
 use anyhow::Context;
 use indicatif::{HumanBytes, HumanDuration};
-use quad_runs::config::{Device, settings};
-use quad_runs::status::State;
+use quad_run::config::{Device, settings};
+use quad_run::status::State;
 
 use super::study::PlannedRun;
 use crate::data::load;

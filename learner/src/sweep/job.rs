@@ -5,9 +5,9 @@ use std::path::{Path, PathBuf};
 use std::process::{Child, Command};
 
 use anyhow::Context;
-use quad_runs::config::tables;
-use quad_runs::run::RunDir;
-use quad_runs::status::State;
+use quad_run::config::tables;
+use quad_run::run::RunDir;
+use quad_run::status::State;
 use quad_runtime::UNFINISHED;
 use rustix::process::{Pid, Signal, kill_process};
 

@@ -1,7 +1,7 @@
 //! Which combinations of a study's axes are runs.
 
 use quad_algorithms::fits;
-use quad_runs::config::tables;
+use quad_run::config::tables;
 use toml::{Table, Value};
 
 use super::axes::Combination;

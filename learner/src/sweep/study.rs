@@ -5,10 +5,10 @@ use std::path::Path;
 
 use anyhow::{Context, anyhow, ensure};
 use quad_protocol::Name;
-use quad_runs::config::{Experiment, Preset, did_you_mean, settings, tables};
-use quad_runs::results::RunReport;
-use quad_runs::run::RunDir;
-use quad_runs::status::State;
+use quad_run::config::{Experiment, Preset, did_you_mean, settings, tables};
+use quad_run::results::RunReport;
+use quad_run::run::RunDir;
+use quad_run::status::State;
 use quad_runtime::{Hint, hinted, hints};
 use serde::Deserialize;
 use toml::{Table, Value};

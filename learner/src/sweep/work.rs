@@ -6,7 +6,7 @@ use std::pin::pin;
 use std::time::{Duration, Instant};
 
 use indicatif::HumanDuration;
-use quad_runs::status::{Progress, State};
+use quad_run::status::{Progress, State};
 use tokio::time::interval;
 
 use super::display::Display;

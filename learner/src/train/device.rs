@@ -2,7 +2,7 @@
 
 use anyhow::{Context, anyhow};
 use quad_policy::Precision;
-use quad_runs::config::Device;
+use quad_run::config::Device;
 use quad_runtime::Hint;
 
 /// That the device is there and can compute with this precision.

@@ -10,7 +10,7 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError};
 use std::time::Duration;
 
-use quad_runs::run::Checkpoint;
+use quad_run::run::Checkpoint;
 use quad_runtime::Beat;
 
 use super::results::{Outcome, Row, TrainedPolicy};

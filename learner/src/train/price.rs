@@ -6,8 +6,8 @@ use std::time::{Duration, Instant};
 use quad_algorithms::{Agent, Context};
 use quad_dataset::{BatchSampler, Transitions};
 use quad_protocol::Origin;
-use quad_runs::config::{Device, Experiment};
-use quad_runs::run::Checkpoint;
+use quad_run::config::{Device, Experiment};
+use quad_run::run::Checkpoint;
 
 use super::device;
 

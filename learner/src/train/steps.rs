@@ -7,8 +7,8 @@ use quad_algorithms::{Agent, AlgorithmError, Metric};
 use quad_dataset::BatchSampler;
 use quad_policy::PolicyError;
 use quad_protocol::Origin;
-use quad_runs::config::Schedule;
-use quad_runs::run::Checkpoint;
+use quad_run::config::Schedule;
+use quad_run::run::Checkpoint;
 use quad_runtime::Beat;
 use tracing::debug;
 

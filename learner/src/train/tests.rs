@@ -9,9 +9,9 @@ use quad_algorithms::{Agent, Context};
 use quad_dataset::{BatchSampler, D4rlWriter, Metadata, ReadOptions, RewardRule, Row, Scale, Transitions, environment};
 use quad_policy::Precision;
 use quad_protocol::Origin;
-use quad_runs::config::hyperparameters::algorithm as definition;
-use quad_runs::config::{Schedule, resolve};
-use quad_runs::run::Checkpoint;
+use quad_run::config::hyperparameters::algorithm as definition;
+use quad_run::config::{Schedule, resolve};
+use quad_run::run::Checkpoint;
 use quad_runtime::{Beat, Health};
 
 use super::outbox::{Outbox, Work};
@@ -234,7 +234,7 @@ fn a_policy_that_is_too_large_to_send_is_refused_at_the_start() {
         let metrics = TrainingMetrics::new(&make, 1, experiment.definition().unwrap().metrics).unwrap();
         let training = Training {
             experiment,
-            device: quad_runs::config::Device::Cpu,
+            device: quad_run::config::Device::Cpu,
             transitions: Arc::new(transitions()),
             checkpoint: None,
             checkpoint_every: Duration::ZERO,

@@ -8,8 +8,8 @@ use anyhow::{Context, anyhow};
 use quad_algorithms::{Agent, Context as Learning};
 use quad_dataset::{BatchSampler, Transitions};
 use quad_protocol::{Origin, Snapshot};
-use quad_runs::config::{Device, Experiment};
-use quad_runs::run::Checkpoint;
+use quad_run::config::{Device, Experiment};
+use quad_run::run::Checkpoint;
 use quad_runtime::{Beat, hinted};
 
 use super::device;

@@ -3,8 +3,8 @@
 use std::path::{Path, PathBuf};
 
 use anyhow::{Context, anyhow};
-use quad_runs::results::RunReport;
-use quad_runs::run::RunDir;
+use quad_run::results::RunReport;
+use quad_run::run::RunDir;
 use quad_runtime::Hint;
 
 const RUN: &str =
@@ -44,7 +44,7 @@ pub fn snapshot(path: &Path, step: Option<u64>) -> anyhow::Result<PathBuf> {
 mod tests {
     use std::fs;
 
-    use quad_runs::config::{RunConfig, resolve};
+    use quad_run::config::{RunConfig, resolve};
     use serde_json::json;
 
     use super::*;

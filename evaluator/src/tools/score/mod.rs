@@ -8,7 +8,7 @@ mod subject;
 
 use quad_policy::Precision;
 use quad_protocol::episode_seeds;
-use quad_runs::results::Spread;
+use quad_run::results::Spread;
 use rayon::prelude::*;
 use tracing::{info, warn};
 

@@ -5,8 +5,8 @@ use std::fmt::Alignment::{Left, Right};
 use std::path::PathBuf;
 
 use quad_policy::Choice;
-use quad_runs::results::Spread;
-use quad_runs::table::{Style, Table};
+use quad_run::results::Spread;
+use quad_run::table::{Style, Table};
 use serde::Serialize;
 
 use crate::sim::EpisodeOutcome;

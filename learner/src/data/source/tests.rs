@@ -1,6 +1,6 @@
 //! Tests of `data/source.rs`.
 
-use quad_runs::config::{resolve, tasks};
+use quad_run::config::{resolve, tasks};
 
 use super::*;
 

@@ -8,7 +8,7 @@ use std::collections::BTreeMap;
 use std::time::{Duration, Instant};
 
 use quad_protocol::{EpisodeScore, Hash, Job, Name, Progress, ScoreReport};
-use quad_runs::run::Earlier;
+use quad_run::run::Earlier;
 
 use super::outcomes::Recorded;
 use super::{Claim, Claimed, HandedBack, Lost, Refusal, Rules, Scoreboard, Validated};

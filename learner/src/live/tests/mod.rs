@@ -12,7 +12,7 @@ use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use quad_protocol::{Hash, Job, JobReply, JobRequest, Message, Name, ScoreReply, ScoreReport, decode, encode, keys};
-use quad_runs::run::{Log, RunDir};
+use quad_run::run::{Log, RunDir};
 use quad_runtime::{Beat, Endpoints, Health, open_session};
 use tokio::sync::Mutex;
 use tokio::sync::mpsc::UnboundedReceiver;

@@ -3,8 +3,8 @@
 use std::process;
 
 use clap::Parser;
-use quad_runs::config::{Experiment, Preset, resolve};
-use quad_runs::run::RunDir;
+use quad_run::config::{Experiment, Preset, resolve};
+use quad_run::run::RunDir;
 use toml::toml;
 
 use super::*;
@@ -15,7 +15,7 @@ use crate::fixtures::config;
 fn command_for(experiment: Experiment) -> Option<String> {
     let folder = tempfile::tempdir().unwrap();
     let path = folder.path().join("it's a run");
-    RunDir::create(&path, &quad_runs::config::RunConfig { experiment, ..config("r", 7) }).unwrap();
+    RunDir::create(&path, &quad_run::config::RunConfig { experiment, ..config("r", 7) }).unwrap();
     command(&RunReport::read(&path).unwrap())
 }
 

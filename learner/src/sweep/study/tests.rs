@@ -42,7 +42,7 @@ fn a_run_is_what_its_command_line_would_be() {
     let words = tables::keys(&run.changes).into_iter().map(|(key, value)| format!("{key}={value}"));
     let mut changes = Table::new();
     words.for_each(|word| tables::merge(&mut changes, tables::parse_assignment(&word).unwrap()));
-    assert_eq!(quad_runs::config::resolve(&run.preset, &changes).unwrap(), run.experiment);
+    assert_eq!(quad_run::config::resolve(&run.preset, &changes).unwrap(), run.experiment);
     let two = "[axes]\ntask = ['hopper-demo']\nagent.actor.hidden = [[8]]\nagent.critic.hidden = [[9]]\n";
     assert_eq!(names(two), ["hopper-demo-agent.actor.hidden8-agent.critic.hidden9"]);
 }

@@ -2,7 +2,7 @@
 compare with it.
 
     python3 -m venv /tmp/rliable && /tmp/rliable/bin/pip install rliable==1.2.0 "pandas<3"
-    /tmp/rliable/bin/python runs/src/results/statistics/statistics.py
+    /tmp/rliable/bin/python run/src/results/statistics/statistics.py
 """
 
 import json
