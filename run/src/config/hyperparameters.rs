@@ -1,0 +1,42 @@
+//! Algorithms by name, and the tasks for which their authors give values.
+
+use anyhow::anyhow;
+use quad_algorithms::{ALGORITHMS, Definition, Values, fits};
+use quad_runtime::hinted;
+
+use super::nearest::did_you_mean;
+use super::tasks::Task;
+
+/// Whether a benchmark of others, a task with a dataset of its own, has no values by the algorithm's authors.
+fn lacks(values: &Values, task: &Task) -> bool {
+    task.word("dataset").is_some() && !values.given.iter().any(|pattern| fits(pattern, &task.name))
+}
+
+/// A sentence about a task for which an algorithm's authors give no values; none of others.
+///
+/// # Errors
+/// As [`Values::of`].
+pub fn not_given(definition: &Definition, task: &Task) -> anyhow::Result<Option<String>> {
+    let lacking = lacks(&Values::of(definition)?, task);
+    let (algorithm, task) = (definition.name, &task.name);
+    Ok(lacking
+        .then(|| format!("not given by the authors of {algorithm}: values for {task}; those of other tasks hold")))
+}
+
+/// The algorithm of that name.
+///
+/// # Errors
+/// There is none; the hint has similar names.
+pub fn algorithm(name: &str) -> anyhow::Result<Definition> {
+    let unknown = || hinted(anyhow!("there is no algorithm named {name}"), unknown_hint(name));
+    ALGORITHMS.into_iter().find(|known| known.name == name).ok_or_else(unknown)
+}
+
+/// What to do about a name that no algorithm has.
+pub fn unknown_hint(name: &str) -> String {
+    let names = ALGORITHMS.map(|known| known.name);
+    format!("{}there are {}", did_you_mean(name, names), names.join(", "))
+}
+
+#[cfg(test)]
+mod tests;

@@ -1,0 +1,31 @@
+//! Tests of `config/hyperparameters.rs`.
+
+use super::super::{resolve, tasks};
+use super::*;
+
+/// The file of an algorithm whose authors give values for these tasks.
+fn values(given: &[&str]) -> Values {
+    toml::from_str(&format!("about = \"an example\"\ngiven = {given:?}")).unwrap()
+}
+
+#[test]
+fn only_benchmarks_of_others_can_lack_their_authors_values() {
+    for (task, expected) in [("hopper-medium-v2", false), ("antmaze-umaze-v0", false), ("hopper-demo", false)] {
+        assert_eq!(lacks(&values(&["*-v2", "antmaze-*"]), tasks::named(task).unwrap()), expected, "{task}");
+    }
+    assert!(lacks(&values(&["*-v2"]), tasks::named("antmaze-umaze-v0").unwrap()));
+}
+
+#[test]
+fn every_algorithm_has_every_value_for_every_task() {
+    for definition in ALGORITHMS {
+        let asked = toml::Table::from_iter([("algorithm".to_owned(), definition.name.into())]);
+        for task in tasks::all() {
+            let resolved = resolve(&task.name, &asked).unwrap();
+            assert_eq!(
+                (&*resolved.algorithm, Some(&*resolved.environment)),
+                (definition.name, task.word("environment"))
+            );
+        }
+    }
+}

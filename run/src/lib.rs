@@ -1,0 +1,17 @@
+//! Runs on the disk: a run's settings, its folder, its results and its state. It is the one reader of what a learner writes.
+//!
+//! It has no thread; every program calls it on threads of its own. In reading order; each module may use those below it:
+//!
+//! - [`status`]: how far runs are, and a list of all runs.
+//! - [`results`]: a run's scores, summarised, and the paper's.
+//! - [`run`]: a run's folder.
+//! - [`config`]: a run's settings.
+//! - [`table`]: a table as text, Markdown, LaTeX and CSV.
+
+#![deny(unsafe_code)]
+
+pub mod config;
+pub mod results;
+pub mod run;
+pub mod status;
+pub mod table;
