@@ -12,7 +12,7 @@
 //! - `metrics_server`: `/metrics` and `/healthz`.
 //! - `shutdown`: the signals that end a process.
 //! - `exit`: how a program shows a result or an error to the user, and its exit code.
-//! - `progress`: shows how far a task is.
+//! - `progress_bar`: shows how far a task is.
 //! - [`doctor`]: checks of a machine, before a run starts on it.
 
 mod access;
@@ -24,7 +24,7 @@ mod exit;
 mod health;
 mod logging;
 mod metrics_server;
-mod progress;
+mod progress_bar;
 mod router;
 mod session;
 mod shutdown;
@@ -37,7 +37,7 @@ pub use exit::{Hint, UNFINISHED, hinted, hints, print, run_main, unfinished};
 pub use health::{Beat, Health};
 pub use logging::{Logging, init_logging};
 pub use metrics_server::{BindError, MetricsServer, serve_metrics};
-pub use progress::Progress;
+pub use progress_bar::ProgressBar;
 pub use router::open_router;
 pub use session::{open_session, reachable_at};
 pub use shutdown::shutdown_signal;

@@ -7,7 +7,7 @@ use std::time::Duration;
 
 use anyhow::{Error, anyhow};
 use quad_dataset::NamedDataset;
-use quad_runtime::{Hint, Progress, hinted};
+use quad_runtime::{Hint, ProgressBar, hinted};
 use ureq::Agent;
 
 use super::partial::Partial;
@@ -58,7 +58,7 @@ impl Fetcher {
         }
         fs::create_dir_all(folder).map_err(local)?;
         let mut partial = Partial::open(&path).map_err(local)?;
-        let progress = Progress::of_bytes();
+        let progress = ProgressBar::of_bytes();
         let mut refusals = String::new();
         for address in self.addresses(dataset) {
             progress.say(&format!("fetching {} from {address}", dataset.name));
@@ -92,7 +92,7 @@ impl Fetcher {
         address: &str,
         dataset: &NamedDataset,
         partial: &mut Partial,
-        progress: &Progress,
+        progress: &ProgressBar,
     ) -> Result<String, Failure> {
         // Only a size and a checksum can tell whether what is here already belongs to the file.
         if dataset.bytes.is_none_or(|bytes| partial.length > bytes) {

@@ -3,7 +3,7 @@
 use std::io::{self, Read};
 use std::time::Duration;
 
-use quad_runtime::Progress;
+use quad_runtime::ProgressBar;
 use ureq::http::{Response, StatusCode};
 use ureq::{Agent, Body, Error};
 
@@ -52,7 +52,7 @@ pub fn transfer(
     address: &str,
     expected: Option<u64>,
     partial: &mut Partial,
-    progress: &Progress,
+    progress: &ProgressBar,
 ) -> Result<(), Failure> {
     let mut request = client.get(address);
     if partial.length > 0 {
@@ -81,7 +81,7 @@ pub fn transfer(
 }
 
 /// Appends what a server sends, until there are `bytes`.
-fn append(body: &mut Body, bytes: u64, partial: &mut Partial, progress: &Progress) -> Result<(), Failure> {
+fn append(body: &mut Body, bytes: u64, partial: &mut Partial, progress: &ProgressBar) -> Result<(), Failure> {
     let mut reader = body.as_reader().take(bytes.saturating_sub(partial.length));
     let mut chunk = vec![0; CHUNK];
     while partial.length < bytes {

@@ -6,7 +6,7 @@ use std::pin::pin;
 use std::time::{Duration, Instant};
 
 use indicatif::HumanDuration;
-use quad_run::status::{Progress, State};
+use quad_run::status::{Pace, State};
 use tokio::time::interval;
 
 use super::display::Display;
@@ -114,7 +114,7 @@ impl Sweep {
                 still.push(job);
                 continue;
             };
-            let progress = Progress::read(&job.dir);
+            let progress = Pace::read(&job.dir);
             floor.done += self.seconds(&job.run, job.from, progress.step);
             let name = &job.run.name;
             match end {
@@ -140,7 +140,7 @@ impl Sweep {
     fn lines(&self, floor: &Floor) -> Vec<String> {
         let (mut lines, mut done, mut left) = (Vec::new(), floor.done, 0.0);
         for Job { run, dir, from, .. } in &floor.at_work {
-            let (progress, steps) = (Progress::read(dir), run.experiment.steps);
+            let (progress, steps) = (Pace::read(dir), run.experiment.steps);
             done += self.seconds(run, *from, progress.step);
             left += self.seconds(run, progress.step, steps);
             lines.push(format!("{}: step {}/{steps}, {progress}", run.name, progress.step));

@@ -63,9 +63,9 @@ impl State {
     }
 }
 
-/// What a run at work is seen to do.
+/// How fast a run at work is, and how good.
 #[derive(Default)]
-pub struct Progress {
+pub struct Pace {
     /// Gradient steps done.
     pub step: u64,
     /// In a second.
@@ -74,7 +74,7 @@ pub struct Progress {
     pub score: Option<(u64, f64)>,
 }
 
-impl Progress {
+impl Pace {
     /// That of the run in a folder.
     pub fn read(dir: &Path) -> Self {
         let rows = rows(dir);
@@ -90,7 +90,7 @@ impl Progress {
     }
 }
 
-impl fmt::Display for Progress {
+impl fmt::Display for Pace {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         write!(f, "{:.1} steps/s", self.rate)?;
         self.score.map_or(Ok(()), |(step, score)| write!(f, ", score {score:.1} @{step}"))

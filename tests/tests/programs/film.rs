@@ -93,7 +93,7 @@ fn what_cannot_be_filmed_is_said_in_a_sentence() {
     let refused = |arguments: &[&str], sentence: &str, hint: &str| {
         assert_refused(&film(folder, arguments).output().unwrap(), sentence, hint);
     };
-    refused(&["."], "cannot read ./snapshots", "RUN/snapshots/step_");
+    refused(&["."], "cannot read ./config.toml", "RUN/snapshots/step_");
     refused(&[snapshot, "--step", "20"], "is not the folder of a run", "--step");
     let moon = folder.join("moon.safetensors");
     let bytes = fs::read(snapshot).unwrap();

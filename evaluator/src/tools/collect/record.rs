@@ -1,7 +1,7 @@
 //! Mixes episodes of a search's policies, from the first to the last, into one dataset.
 
 use quad_dataset::{D4rlWriter, EnvironmentSpec, Row};
-use quad_runtime::Progress;
+use quad_runtime::ProgressBar;
 use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 use rand_distr::{Distribution, StandardNormal};
@@ -41,7 +41,7 @@ pub fn record(
     let mut room: Vec<f64> = mixture.iter().map(|(_, share)| share * transitions as f64).collect();
     let mut scores = Vec::new();
     let mut simulated = 0;
-    let progress = Progress::of("transitions recorded");
+    let progress = ProgressBar::of("transitions recorded");
     progress.start(0, transitions as u64);
     loop {
         // An episode beyond the end of the highest unfilled band is useless.

@@ -6,7 +6,7 @@
 //! for being alive out of the objective, in which standing still would be a local optimum.
 
 use quad_dataset::EnvironmentSpec;
-use quad_runtime::Progress;
+use quad_runtime::ProgressBar;
 use rand::Rng;
 use rand_chacha::ChaCha8Rng;
 use rand_distr::{Distribution, StandardNormal};
@@ -36,7 +36,7 @@ pub fn train(
     random: impl Fn(u64) -> ChaCha8Rng,
 ) -> Result<Vec<LinearPolicy>, EnvironmentError> {
     let mut policies = Vec::new();
-    let progress = Progress::of("steps of training");
+    let progress = ProgressBar::of("steps of training");
     let of_each = recipe.search_steps(transitions) / recipe.searches;
     progress.start(0, recipe.searches * of_each);
     for index in 0..recipe.searches {

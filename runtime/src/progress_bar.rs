@@ -3,22 +3,22 @@
 use std::cell::Cell;
 use std::time::{Duration, Instant};
 
-use indicatif::{HumanBytes, ProgressBar, ProgressDrawTarget, ProgressStyle};
+use indicatif::{HumanBytes, ProgressDrawTarget, ProgressStyle};
 use tracing::info;
 
 /// How often a log gets a line.
 const LINE: Duration = Duration::from_secs(5);
 
 /// Shows the progress of one task, such as a fetch of a file.
-pub struct Progress {
+pub struct ProgressBar {
     /// Hidden if stderr is no terminal.
-    bar: ProgressBar,
+    bar: indicatif::ProgressBar,
     /// What is counted; `None` for bytes.
     counted: Option<&'static str>,
     last_line: Cell<Instant>,
 }
 
-impl Progress {
+impl ProgressBar {
     /// A display of bytes that shows nothing yet.
     pub fn of_bytes() -> Self {
         Self::new(None)
@@ -30,7 +30,7 @@ impl Progress {
     }
 
     fn new(counted: Option<&'static str>) -> Self {
-        let bar = ProgressBar::with_draw_target(None, ProgressDrawTarget::stderr());
+        let bar = indicatif::ProgressBar::with_draw_target(None, ProgressDrawTarget::stderr());
         Self { bar, counted, last_line: Cell::new(Instant::now()) }
     }
 
@@ -71,7 +71,7 @@ impl Progress {
     }
 }
 
-impl Drop for Progress {
+impl Drop for ProgressBar {
     fn drop(&mut self) {
         self.bar.finish_and_clear();
     }
