@@ -5,7 +5,8 @@ import json
 import pathlib
 import subprocess
 
-COMMAND = "metadata --format-version 1 --locked --offline --filter-platform x86_64-unknown-linux-gnu --features"
+# Not `--offline`: cargo asks also for crates that only tests need, which a build does not fetch.
+COMMAND = "metadata --format-version 1 --locked --filter-platform x86_64-unknown-linux-gnu --features"
 FEATURES = "quad-learner/static,quad-evaluator/static,quad-python/static"
 PROGRAMS = {"quad-learner", "quad-evaluator", "quad-python"}
 # C that a crate compiles, with the licence of its own.
@@ -35,7 +36,7 @@ def texts(package):
     return [file.read_text(errors="replace").strip() for file in sorted(files) if file.is_file()]
 
 
-metadata = json.loads(subprocess.run(["cargo", *COMMAND.split(), FEATURES], check=True, capture_output=True).stdout)
+metadata = json.loads(subprocess.run(["cargo", *COMMAND.split(), FEATURES], check=True, stdout=subprocess.PIPE).stdout)
 owners = {}
 for package in linked(metadata):
     name = f"{package['name']} {package['version']}"

@@ -49,19 +49,21 @@ check_glibc() {
 # Fills $STAGE with bin/, lib/ and licenses/.
 build_portable() {
   [ "$(uname -m)" = x86_64 ] || die "this is for x86_64 only; this is $(uname -m)" "build in a clone: cargo build --release"
-  deploy/setup.sh
+  deploy/setup.sh --venv
   make_scratch
   fetch_tools
   set_environment
-  say "building the programs; the first time takes ten minutes on two cores"
-  cargo build --release --locked -p quad-learner -p quad-evaluator --features quad-learner/static,quad-evaluator/static
   rm -rf "$STAGE"
   mkdir -p "$STAGE/bin" "$STAGE/lib" "$STAGE/licenses"
+  # First, since it fetches crates: where that fails, it does so before the long build.
+  "$TOOLS/bin/python" deploy/licences.py >"$STAGE/licenses/LICENSE-third-party" ||
+    die "the crates' licences cannot be collected" "is there a network, and does this machine reach crates.io (or its mirror)?"
+  say "building the programs; the first time takes ten minutes on two cores"
+  cargo build --release --locked -p quad-learner -p quad-evaluator --features quad-learner/static,quad-evaluator/static
   install --strip "$CARGO_TARGET_DIR/release/learner" "$CARGO_TARGET_DIR/release/evaluator" "$STAGE/bin"
   install --mode=644 "$DEPS"/mujoco/libmujoco.so.?* "$STAGE/lib"
   check_glibc "$STAGE"/bin/* "$STAGE"/lib/*
   cp LICENSE-MIT LICENSE-APACHE learner/assets/LICENSE-DejaVu "$STAGE/licenses"
   cp "$DEPS/mujoco/LICENSE" "$STAGE/licenses/LICENSE-mujoco"
   cp "$DEPS/mujoco/LICENSES_THIRD_PARTY.md" "$STAGE/licenses/LICENSE-mujoco-third-party.md"
-  "$TOOLS/bin/python" deploy/licences.py >"$STAGE/licenses/LICENSE-third-party"
 }

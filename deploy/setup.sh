@@ -2,6 +2,7 @@
 # Puts in place what cargo does not: Debian packages, and libmujoco in .deps/mujoco.
 #
 #   deploy/setup.sh            what building and running needs
+#   deploy/setup.sh --venv     also what makes virtual environments of Python
 #   deploy/setup.sh --tests    also what the tests need: Python packages in .deps/venv, Prometheus in .deps/prometheus
 #
 # Installs only what is missing, so that it may be run again at any time. For Debian 12 or newer and Ubuntu 24.04 or newer.
@@ -32,12 +33,14 @@ install_packages() {
   have cc || missing+=(build-essential)
   have pkg-config || missing+=(pkg-config)
   { have pkg-config && pkg-config --exists hdf5; } || missing+=(libhdf5-dev)
-  if [ ! -e "$DEPS/mujoco/libmujoco.so" ]; then
+  if [ ! -e "$DEPS/mujoco/$MUJOCO" ]; then
     have python3 || missing+=(python3)
     python3 -m pip --version >/dev/null 2>&1 || missing+=(python3-pip)
   fi
-  if [ -n "$TESTS" ]; then
+  if [ -n "$VENV" ]; then
     python3 -c 'import ensurepip, venv' >/dev/null 2>&1 || missing+=(python3-venv)
+  fi
+  if [ -n "$TESTS" ]; then
     have shellcheck || missing+=(shellcheck)
     have openssl || missing+=(openssl)
     # A browser for the page.
@@ -64,7 +67,8 @@ install_packages() {
 # The wheel's shared library, its licence, and the unversioned link that the linker looks for.
 fetch_mujoco() {
   local target=$DEPS/mujoco
-  [ ! -e "$target/libmujoco.so" ] || return 0
+  # By its version: an older one does not fit the programs.
+  [ ! -e "$target/$MUJOCO" ] || return 0
   local machine
   machine=$(uname -m)
   case $machine in
@@ -115,10 +119,12 @@ fetch_prometheus() {
   mv "$SCRATCH/prometheus" "$DEPS/prometheus"
 }
 
+VENV=
 TESTS=
 case ${1:-} in
   '') ;;
-  --tests) TESTS=1 ;;
+  --venv) VENV=1 ;;
+  --tests) VENV=1 TESTS=1 ;;
   *) usage >&2; exit 2 ;;
 esac
 

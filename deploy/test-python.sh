@@ -1,11 +1,17 @@
 #!/usr/bin/env bash
 # Builds the wheel, installs it into a fresh virtual environment (.deps/python) and runs the Python package's tests there.
-# Arguments go to pytest.
+#
+#   deploy/test-python.sh [--built] [PYTEST ARGUMENTS]      --built: take the wheel that is in dist/
 set -euo pipefail
 cd "$(dirname "$0")/.."
 . deploy/common.sh
 
-deploy/wheel.sh
+if [ "${1:-}" = --built ]; then
+  shift
+  deploy/setup.sh --venv
+else
+  deploy/wheel.sh
+fi
 make_scratch
 venv=$DEPS/python
 say "installing the wheel and python/tests/requirements.txt in .deps/python"

@@ -67,7 +67,7 @@ def hopper_runs(tmp_path_factory, data):
         arguments = ["learner", "train", "--task", "hopper-demo", "--dataset", str(data), "--run-dir", str(run), "--steps", "20",
                      "--eval-interval", "10", "--episodes", "3", "--seed", str(seed), "--listen", "tcp/127.0.0.1:0"]
         learner = subprocess.Popen(arguments, stderr=subprocess.PIPE)
-        until = time.monotonic() + 30
+        until = time.monotonic() + 60
         while not (run / "endpoints.json").exists():
             assert learner.poll() is None and time.monotonic() < until, learner.stderr.read()
             time.sleep(0.05)

@@ -153,7 +153,7 @@ def test_workers_that_are_killed_cost_no_score_and_come_again(tmp_path, data):
             assert len(learner.scores()) == scores and verified(learner.folder)
     for program in programs:
         program.terminate()
-        assert program.wait(20) == 0
+        assert program.wait(60) == 0
 
 
 SCRIPT = """
@@ -175,8 +175,8 @@ def test_workers_end_with_the_process_that_started_them(by):
         while b"ready to serve" not in process.stderr.readline():
             assert process.poll() is None
     process.send_signal(by)
-    assert process.wait(20) == (1 if by == signal.SIGKILL else 0) or process.returncode in (-by, 130, 1)
-    wait(lambda: all(not worker.exists() or ") Z" in worker.read_text() for worker in workers), 20)
+    assert process.wait(60) == (1 if by == signal.SIGKILL else 0) or process.returncode in (-by, 130, 1)
+    wait(lambda: all(not worker.exists() or ") Z" in worker.read_text() for worker in workers))
     process.stderr.close()
 
 

@@ -16,7 +16,7 @@ use zenoh::qos::CongestionControl;
 use zenoh::sample::{Sample, SampleKind};
 
 /// For whatever must happen; on a machine busy with other things.
-const PATIENCE: Duration = Duration::from_secs(30);
+const PATIENCE: Duration = Duration::from_secs(60);
 /// For what must not happen.
 const LULL: Duration = Duration::from_millis(500);
 /// As many bytes as the paper's snapshot has, which takes many of Zenoh's fragments.

@@ -19,7 +19,7 @@ fn either_signal_is_noticed_even_before_it_is_awaited() {
         runtime().block_on(async {
             let shutdown = shutdown_signal();
             send(signal);
-            timeout(Duration::from_secs(10), shutdown).await.unwrap_or_else(|_| panic!("SIG{signal} was not noticed"));
+            timeout(Duration::from_secs(60), shutdown).await.unwrap_or_else(|_| panic!("SIG{signal} was not noticed"));
             // Ctrl-C reaches a script, too, which hands it on: that would end this very process.
             send(other);
             tokio::time::sleep(Duration::from_secs(1)).await;

@@ -17,12 +17,10 @@ use tokio::time::{sleep, timeout};
 use zenoh::query::{ConsolidationMode, QueryTarget};
 use zenoh::{Config, Session};
 
+use crate::PATIENCE;
 use crate::made_up::{self, name};
 
-/// An evaluator's patience with its learner.
-const ANSWER: Duration = Duration::from_secs(5);
-
-/// And its pause after a question without an answer.
+/// Its pause after a question without an answer.
 const PAUSE: Duration = Duration::from_millis(250);
 
 /// Most episodes of a job.
@@ -258,7 +256,7 @@ impl Member {
     /// The answer and how long it took.
     async fn ask<A: Message>(&mut self, key: String, question: &impl Message) -> Option<(A, Duration)> {
         let begin = Instant::now();
-        let get = self.session.get(&key).payload(encode(question).expect("it is small")).timeout(ANSWER);
+        let get = self.session.get(&key).payload(encode(question).expect("it is small")).timeout(PATIENCE);
         let get = get.target(QueryTarget::All).consolidation(ConsolidationMode::None).await;
         let reply = get.expect("the session is open").recv_async().await.ok();
         let Some(Ok(sample)) = reply.map(|reply| reply.into_result()) else {

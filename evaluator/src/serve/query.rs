@@ -169,6 +169,7 @@ mod tests {
         let asked = ask(&evaluator, key, Vec::new(), timeout, &metrics, |_: &JobReply| Ok(()));
         let pause = longest_pause(asked).await;
         stalls.store(false, Relaxed);
-        assert!(pause < Duration::from_millis(500), "the task stood still for {pause:?}");
+        // Who waits for the peer does so until Zenoh closes the connection, after two seconds.
+        assert!(pause < Duration::from_secs(2), "the task stood still for {pause:?}");
     }
 }

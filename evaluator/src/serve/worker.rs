@@ -153,11 +153,11 @@ mod tests {
     #[tokio::test(flavor = "multi_thread")]
     async fn an_evaluator_without_work_is_well() {
         let (health, (_keep, found)) = (Health::default(), watch::channel(Runs::new()));
-        let (name, metrics, limit) = (Name::new("idle").unwrap(), Metrics::new().unwrap(), Duration::from_secs(1));
+        let (name, metrics, limit) = (Name::new("idle").unwrap(), Metrics::new().unwrap(), Duration::from_secs(5));
         let (environments, beat) = (Arc::new(Simulations), health.part("worker", limit));
         let evaluator = Evaluator::new(name, environments, Precision::F32, metrics.clone(), beat);
         let stop = async {
-            for _ in 0..60 {
+            for _ in 0..30 {
                 tokio::time::sleep(limit / 20).await;
                 assert_eq!(health.problems(), Vec::<String>::new());
             }

@@ -221,14 +221,11 @@ pub fn reports(heard: &[Heard]) -> Vec<ScoreReport> {
 pub struct Evaluator(Child);
 
 impl Evaluator {
-    /// Tells it to leave, which takes less than nine seconds.
+    /// Tells it to leave. If that takes longer than nine seconds, it ends itself with an error.
     pub fn leave(mut self) -> ExitStatus {
-        let begin = Instant::now();
         // SAFETY: sends a signal to a process that this one has started and not waited for.
         assert_eq!(unsafe { libc::kill(self.0.id() as i32, libc::SIGTERM) }, 0);
-        let status = self.0.wait().unwrap();
-        assert!(begin.elapsed() < Duration::from_secs(9), "it took {:?}", begin.elapsed());
-        status
+        self.0.wait().unwrap()
     }
 }
 

@@ -4,11 +4,10 @@
 
 mod learner;
 
-use std::time::Duration;
-
 use quad_evaluator::sim::{EnvironmentError, Environments, Rollout, Simulations};
 use quad_policy::{Precision, load_policy};
 use quad_protocol::{EpisodeScore, Job, ScoreReport, encode, keys};
+use zenoh::qos::CongestionControl;
 
 use learner::{Answer, Heard, Learner, file, job, name, reports, snapshot};
 
@@ -45,8 +44,9 @@ async fn scores_are_of_exactly_the_weights_and_seeds_that_the_job_names() {
         // At first the evaluator may follow the learner that is dead, which was started first.
         learner.wait_for(|heard| (heard.len() >= 4).then_some(())).await;
         if published {
-            learner.session.put(keys::weights(&name("run")), encode(&learner.snapshot).unwrap()).await.unwrap();
-            tokio::time::sleep(Duration::from_millis(500)).await;
+            // Not to be dropped, and on its way before the job is.
+            let put = learner.session.put(keys::weights(&name("run")), encode(&learner.snapshot).unwrap());
+            put.congestion_control(CongestionControl::Block).await.unwrap();
         }
         learner.give(job.clone());
         let report = learner.wait_for_scores(1).await;

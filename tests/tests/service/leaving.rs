@@ -3,7 +3,6 @@
 use std::io::{PipeReader, Write};
 use std::os::fd::OwnedFd;
 use std::process::{Child, Command, Stdio};
-use std::time::{Duration, Instant};
 
 use quad_protocol::keys;
 use quad_tests::made_up::name;
@@ -12,9 +11,6 @@ use quad_tests::router::{router, router_without_scores};
 use quad_tests::setting::{ENDLESS, Setting};
 use quad_tests::system::{Scratch, free_endpoint};
 use quad_tests::{PATIENCE, eventually};
-
-/// A program that is told to leave must have left within this time (docs/reliability.md).
-const LONGEST_LEAVE: Duration = Duration::from_secs(10);
 
 /// A full pipe that is never read; and what keeps it open.
 fn full_pipe() -> (OwnedFd, PipeReader) {
@@ -25,13 +21,11 @@ fn full_pipe() -> (OwnedFd, PipeReader) {
     (writer.into(), reader)
 }
 
+/// The exit code of a program that is told to leave. One that takes longer than it may ends itself, with 130.
 fn leaves(mut child: Child) -> Option<i32> {
-    let begin = Instant::now();
     let signal = format!("kill -TERM {}", child.id());
     assert!(Command::new("sh").args(["-c", &signal]).status().unwrap().success());
-    let status = eventually("it has left", PATIENCE, || child.try_wait().unwrap());
-    assert!(begin.elapsed() < LONGEST_LEAVE, "it took {:?}", begin.elapsed());
-    status.code()
+    eventually("it has left", PATIENCE, || child.try_wait().unwrap()).code()
 }
 
 #[test]
@@ -64,9 +58,7 @@ async fn a_learner_that_waits_for_another_to_be_gone_leaves_in_order() {
     let _other = session.liveliness().declare_token(keys::live_learner(&name("run"), 1)).await.unwrap();
     let mut learner = scratch.learner_with("run", ENDLESS, &["--connect", &endpoint]);
     learner.process.wait_for_log("waiting to see if it is gone", PATIENCE);
-    let (took, status) = learner.process.terminate(PATIENCE);
-    assert_eq!(status.code(), Some(75), "{}", learner.process.log());
-    assert!(took < Duration::from_secs(5), "it took {took:?}");
+    assert_eq!(learner.process.terminate(PATIENCE).code(), Some(75), "{}", learner.process.log());
     assert!(learner.process.log().contains("the same command goes on from there"), "{}", learner.process.log());
 }
 
@@ -80,9 +72,8 @@ async fn an_evaluator_that_leaves_in_the_middle_of_a_job_hands_it_back() {
     let _router = router_without_scores(&behind, Some(&learner.endpoint())).await;
     let mut evaluator = scratch.evaluator("leaver", &behind);
     evaluator.process.wait_for_log("evaluating", PATIENCE);
-    let (duration, status) = evaluator.process.terminate(PATIENCE);
+    let status = evaluator.process.terminate(PATIENCE);
     assert_eq!(status.code(), Some(0), "the evaluator ended with {status}");
-    assert!(duration < LONGEST_LEAVE, "it took {duration:?} to leave");
     let jobs = |outcome| learner.metric("jobs_total", &format!("outcome=\"{outcome}\""));
     let [handed_back, expired] = eventually("the job is taken back", PATIENCE, || {
         let ended = [jobs("handed_back")?, jobs("expired")?];

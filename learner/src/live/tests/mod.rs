@@ -34,9 +34,9 @@ use crate::evaluation::tests::name;
 use crate::fixtures::config;
 use crate::train::{Outbox, TrainedPolicy};
 
-const PATIENCE: Duration = Duration::from_secs(20);
+const PATIENCE: Duration = Duration::from_secs(60);
 /// Of jobs that are to be lost. One that works tells it much more often, and this machine may stand still for a while.
-const LEASE: Duration = Duration::from_secs(3);
+const LEASE: Duration = Duration::from_secs(6);
 const INCARNATION: u64 = 5;
 
 /// A learner without training: its threads, its declarations, its folder.
