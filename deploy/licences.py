@@ -36,7 +36,10 @@ def texts(package):
     return [file.read_text(errors="replace").strip() for file in sorted(files) if file.is_file()]
 
 
-metadata = json.loads(subprocess.run(["cargo", *COMMAND.split(), FEATURES], check=True, stdout=subprocess.PIPE).stdout)
+asked = subprocess.run(["cargo", *COMMAND.split(), FEATURES], stdout=subprocess.PIPE)
+if asked.returncode:
+    raise SystemExit(asked.returncode)  # cargo has said why
+metadata = json.loads(asked.stdout)
 owners = {}
 for package in linked(metadata):
     name = f"{package['name']} {package['version']}"
