@@ -1,6 +1,6 @@
 #!/usr/bin/env bash
 # How fast this machine trains and evaluates, beside its own peaks and beside JAX, and each kernel beside a library's:
-# prints the tables of docs/performance.md.
+# prints the tables of docs/performance.md and kernels/benches/README.md.
 #
 #   deploy/bench.sh [ROUNDS]     five rounds if not said otherwise, of two or three minutes each; on an idle machine
 #
