@@ -6,6 +6,7 @@
 //! - `cli` is the command line; [`command`] runs a command, up to its exit code.
 //! - `sweep` runs many runs, each as a process.
 //! - `live` is a run at work: threads, main loop, Zenoh.
+//! - `local_evaluators` are evaluators that a learner or a sweep starts itself.
 //! - `page` shows runs in a browser.
 //! - `report` summarises scores as tables and figures.
 //! - `train` makes gradient steps.
@@ -23,6 +24,7 @@ mod evaluation;
 #[cfg(test)]
 mod fixtures;
 mod live;
+mod local_evaluators;
 mod page;
 mod report;
 mod sweep;

@@ -11,7 +11,7 @@
 //! | `quad/<run>/live/evaluator/<evaluator>` | evaluator's liveliness token | |
 //!
 //! A learner's answers, jobs and snapshots name its incarnation: an evaluator believes those of the incarnation that it
-//! follows by its token, and not those of an earlier life. Which peers may use these keys is up to TLS and access control.
+//! follows by its token, and not those of an earlier incarnation. Which peers may use these keys is up to TLS and access control.
 
 use crate::name::Name;
 
@@ -53,13 +53,13 @@ pub fn all_progress(run: &Name) -> String {
     format!("quad/{run}/progress/*")
 }
 
-/// The liveliness token of one life of the learner.
+/// The liveliness token of one incarnation of the learner.
 pub fn live_learner(run: &Name, incarnation: u64) -> String {
     format!("quad/{run}/live/learner/{incarnation}")
 }
 
-/// Key expression of the tokens of all lives of a run's learner, and of all learners that took the same name.
-pub fn all_lives(run: &Name) -> String {
+/// Key expression of the tokens of all incarnations of a run's learner, and of all learners that took the same name.
+pub fn all_incarnations(run: &Name) -> String {
     format!("quad/{run}/live/learner/*")
 }
 

@@ -22,7 +22,7 @@ pub struct EpisodeScore {
 }
 
 /// An evaluator delivers the episodes of a job. The learner records them even if the job has gone to another evaluator, or an
-/// earlier life of the learner handed it out: what counts is that run, step, weights and seeds are those of an evaluation.
+/// earlier incarnation of the learner handed it out: what counts is that run, step, weights and seeds are those of an evaluation.
 #[derive(Clone, Debug, PartialEq, Encode, Decode)]
 pub struct ScoreReport {
     /// Who delivers.

@@ -91,26 +91,26 @@ impl RunClient {
             complaint: String::new(),
             _token: token,
         };
-        client.follow(&found.lives);
+        client.follow(&found.incarnations);
         Ok(client)
     }
 
     /// Chooses which of these processes of a learner to follow: the one that it follows already, else the one that started
     /// first, because of two learners of one name the later one stops.
-    pub fn follow(&mut self, lives: &BTreeSet<u64>) {
+    pub fn follow(&mut self, incarnations: &BTreeSet<u64>) {
         if self.gone.take().is_some() {
             self.turn.wake(Instant::now());
         }
-        if let Some(&first) = lives.first()
-            && !lives.contains(&self.incarnation)
+        if let Some(&first) = incarnations.first()
+            && !incarnations.contains(&self.incarnation)
         {
             self.turn_to(first);
         }
     }
 
     /// Follows the next of several processes, because this one does not answer.
-    pub fn follow_next(&mut self, lives: &BTreeSet<u64>) {
-        let next = lives.range(self.incarnation.saturating_add(1)..).next().or(lives.first());
+    pub fn follow_next(&mut self, incarnations: &BTreeSet<u64>) {
+        let next = incarnations.range(self.incarnation.saturating_add(1)..).next().or(incarnations.first());
         if let Some(&next) = next.filter(|next| **next != self.incarnation) {
             self.turn_to(next);
         }

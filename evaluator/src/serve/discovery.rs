@@ -33,7 +33,7 @@ pub struct Found {
     pub session: Session,
     /// The incarnations that announce themselves, at least one: the token of a learner that was disconnected or killed may
     /// still exist when the next one starts.
-    pub lives: BTreeSet<u64>,
+    pub incarnations: BTreeSet<u64>,
 }
 
 /// The runs whose learners are connected.
@@ -117,21 +117,21 @@ fn take_in(
     key: &str,
 ) -> Result<bool, &'static str> {
     let (run, incarnation) = keys::run_of(key).zip(keys::incarnation_of(key)).ok_or("invalid_name")?;
-    let learners: usize = runs.values().map(|found| found.lives.len()).sum();
+    let learners: usize = runs.values().map(|found| found.incarnations.len()).sum();
     let place = (index, run);
     let run = &place.1;
     match (kind, runs.get_mut(&place)) {
         (SampleKind::Put, _) if learners >= MOST_LEARNERS => Err("too_many_runs"),
-        (SampleKind::Put, Some(found)) => Ok(found.lives.insert(incarnation)),
+        (SampleKind::Put, Some(found)) => Ok(found.incarnations.insert(incarnation)),
         (SampleKind::Put, None) => {
             info!(%run, incarnation, "found a run");
-            runs.insert(place, Found { session: session.clone(), lives: BTreeSet::from([incarnation]) });
+            runs.insert(place, Found { session: session.clone(), incarnations: BTreeSet::from([incarnation]) });
             Ok(true)
         }
         (SampleKind::Delete, None) => Ok(false),
         (SampleKind::Delete, Some(found)) => {
-            let changed = found.lives.remove(&incarnation);
-            if found.lives.is_empty() {
+            let changed = found.incarnations.remove(&incarnation);
+            if found.incarnations.is_empty() {
                 info!(%run, incarnation, "the run's learner is gone");
                 runs.remove(&place);
             }
@@ -149,20 +149,24 @@ mod tests {
         let endpoints = Endpoints { listen: vec!["tcp/127.0.0.1:0".to_owned()], ..Endpoints::default() };
         let session = open_session(&endpoints).await.unwrap();
         let mut runs = Runs::new();
-        let mut tell = |kind, run: usize, life: usize| {
-            let result = take_in(&mut runs, (0, &session), kind, &format!("quad/run-{run}/live/learner/{life}"));
+        let mut tell = |kind, run: usize, incarnation: usize| {
+            let result = take_in(&mut runs, (0, &session), kind, &format!("quad/run-{run}/live/learner/{incarnation}"));
             (result, runs.len())
         };
         assert_eq!(tell(SampleKind::Put, 0, 1), (Ok(true), 1));
         assert_eq!(tell(SampleKind::Put, 0, 1), (Ok(false), 1), "it is known");
-        assert_eq!(tell(SampleKind::Put, 0, 2), (Ok(true), 1), "the next life, while the first seems to be there");
+        assert_eq!(
+            tell(SampleKind::Put, 0, 2),
+            (Ok(true), 1),
+            "the next incarnation, while the first seems to be there"
+        );
         for run in 2..MOST_LEARNERS {
             assert_eq!(tell(SampleKind::Put, run, 1), (Ok(true), run));
         }
         assert_eq!(tell(SampleKind::Put, MOST_LEARNERS, 1).0, Err("too_many_runs"));
         assert_eq!(tell(SampleKind::Put, 0, 3).0, Err("too_many_runs"));
         assert_eq!(tell(SampleKind::Delete, 0, 1), (Ok(true), MOST_LEARNERS - 1));
-        assert_eq!(tell(SampleKind::Delete, 0, 2), (Ok(true), MOST_LEARNERS - 2), "the last life is gone");
+        assert_eq!(tell(SampleKind::Delete, 0, 2), (Ok(true), MOST_LEARNERS - 2), "the last incarnation is gone");
         assert_eq!(tell(SampleKind::Delete, MOST_LEARNERS, 1), (Ok(false), MOST_LEARNERS - 2));
         assert_eq!(tell(SampleKind::Put, MOST_LEARNERS, 1), (Ok(true), MOST_LEARNERS - 1), "there is room again");
     }

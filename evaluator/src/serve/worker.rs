@@ -72,7 +72,7 @@ impl Worker {
         let (found, now) = (self.found.borrow_and_update(), Instant::now());
         let over = |(key, client): (&RunKey, &mut RunClient)| {
             match found.get(key) {
-                Some(learner) => client.follow(&learner.lives),
+                Some(learner) => client.follow(&learner.incarnations),
                 None if client.has_scores() && now - *client.gone.get_or_insert(now) < KEEP_SCORES => {}
                 None => return Some(key.clone()),
             }
@@ -118,7 +118,7 @@ impl Worker {
         if let Err(error) = serve(client, &mut self.evaluator).await {
             client.back_off(&error);
             if let Some(learner) = self.found.borrow().get(key) {
-                client.follow_next(&learner.lives);
+                client.follow_next(&learner.incarnations);
             }
         }
     }

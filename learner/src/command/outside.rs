@@ -8,7 +8,8 @@ use quad_runtime::{
 use tracing::{info, warn};
 
 use crate::cli::TrainArgs;
-use crate::live::{LocalEvaluators, Opening, open_network};
+use crate::live::{Opening, open_network};
+use crate::local_evaluators::LocalEvaluators;
 
 /// For a run that needs no known port, so that several can run at a time.
 const ANY_PORT: u16 = 0;

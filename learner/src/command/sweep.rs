@@ -15,7 +15,7 @@ use tracing::info;
 
 use super::train::record_hint;
 use crate::cli::SweepArgs;
-use crate::live::LocalEvaluators;
+use crate::local_evaluators::LocalEvaluators;
 use crate::sweep::{Cost, Ended, PlannedRun, Study, Sweep};
 
 /// Runs and their states.

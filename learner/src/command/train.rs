@@ -20,7 +20,7 @@ use super::dry_run;
 use super::outside::Outside;
 use crate::cli::TrainArgs;
 use crate::data::{LocalDataset, Source, load};
-use crate::live::{Display, Ending, Life, Live, MainLoop, Metrics, Run, STUCK, Threads};
+use crate::live::{Display, Ending, Incarnation, Live, MainLoop, Metrics, Run, STUCK, Threads};
 use crate::page;
 use crate::report::of_run;
 use crate::train::device;
@@ -128,13 +128,13 @@ async fn run_to_its_end(
     let (run_dir, scores, past) = take_up(path, begun, args.fresh, config)?;
     let (tell, events) = mpsc::unbounded_channel();
     // A later start has a larger number; the low bits distinguish two that start in the same millisecond.
-    let life = Life { run: name, incarnation: now()? << 16 | u64::from(rand::random::<u16>()) };
+    let incarnation = Incarnation { run: name, number: now()? << 16 | u64::from(rand::random::<u16>()) };
     let checkpoint_every = Duration::from_secs(args.checkpoint_seconds);
-    let run = Run { life: life.clone(), config, dir: &run_dir, scores, past, checkpoint_every };
+    let run = Run { incarnation: incarnation.clone(), config, dir: &run_dir, scores, past, checkpoint_every };
     let threads = Threads::start(run, transitions, &metrics, &health, &tell)?;
     threads.show_on(&live);
     let main_loop = MainLoop {
-        life,
+        incarnation,
         run_dir: run_dir.clone(),
         display: Display::start(metrics.clone(), steps),
         metrics,

@@ -45,18 +45,18 @@ pub(crate) struct Scoreboard {
     pub(super) evaluations: BTreeMap<u64, Evaluation>,
     jobs: OpenJobs,
     next_job: u64,
-    /// Scores of an earlier life, by step, whose evaluation has not been asked for in this one.
+    /// Scores of an earlier incarnation, by step, whose evaluation has not been asked for in this one.
     earlier: BTreeMap<u64, Earlier>,
 }
 
 impl Scoreboard {
-    /// Without evaluations. The scores of an `earlier` life count as soon as the evaluation of their step is asked for.
+    /// Without evaluations. The scores of an `earlier` incarnation count as soon as the evaluation of their step is asked for.
     pub fn new(rules: Rules, earlier: BTreeMap<u64, Earlier>) -> Self {
         Self { rules, evaluations: BTreeMap::new(), jobs: OpenJobs::default(), next_job: 1, earlier }
     }
 
     /// Asks for an evaluation of the snapshot of `step`. A step that is known already stays as it is. Gives the scores if
-    /// an earlier life has completed it.
+    /// an earlier incarnation has completed it.
     ///
     /// # Errors
     /// The step is known with other weights.

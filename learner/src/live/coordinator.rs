@@ -14,7 +14,7 @@ use tracing::{debug, warn};
 use super::evaluators::{EvaluatorAtWork, Evaluators, JobAtWork};
 use super::events::{Event, Events};
 use super::metrics::Metrics;
-use super::rejection::Rejection;
+use super::requests::NotAccepted;
 use crate::evaluation::{Claim, Claimed, HandedBack, Lost, OtherWeights, Refusal, Rules, Scoreboard, Validated};
 
 /// Most characters of an evaluator's error message that the learner logs.
@@ -172,14 +172,14 @@ impl Coordinator {
     }
 
     /// Records an evaluator's progress.
-    pub fn progress(&self, progress: Progress) -> Result<(), Rejection> {
+    pub fn progress(&self, progress: Progress) -> Result<(), NotAccepted> {
         let (mut state, now) = (self.lock(), Instant::now());
         state.scoreboard.progress(&progress, now)?;
         state.evaluators.heard(progress, now)
     }
 
     /// Records that an evaluator has connected.
-    pub fn joined(&self, evaluator: Name) -> Result<(), Rejection> {
+    pub fn joined(&self, evaluator: Name) -> Result<(), NotAccepted> {
         self.lock().evaluators.joined(evaluator)
     }
 

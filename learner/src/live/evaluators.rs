@@ -8,7 +8,7 @@ use quad_protocol::{Name, Progress};
 use serde::Serialize;
 
 use super::metrics::EvaluatorMetrics;
-use super::rejection::Rejection;
+use super::requests::NotAccepted;
 
 /// The metrics of an evaluator that has left are dropped this long after its last progress message.
 const FORGET_AFTER: Duration = Duration::from_secs(600);
@@ -81,9 +81,9 @@ impl Evaluators {
     }
 
     /// Records that an evaluator is connected.
-    pub fn joined(&mut self, evaluator: Name) -> Result<(), Rejection> {
+    pub fn joined(&mut self, evaluator: Name) -> Result<(), NotAccepted> {
         if self.present.len() >= MOST_EVALUATORS && !self.present.contains(&evaluator) {
-            return Err(Rejection::Crowd);
+            return Err(NotAccepted::Crowd);
         }
         let line = format!("evaluator {evaluator} is here");
         if self.present.insert(evaluator) && !self.news.tell(line) {
@@ -110,9 +110,9 @@ impl Evaluators {
     }
 
     /// Records an evaluator's progress message.
-    pub fn heard(&mut self, progress: Progress, now: Instant) -> Result<(), Rejection> {
+    pub fn heard(&mut self, progress: Progress, now: Instant) -> Result<(), NotAccepted> {
         if self.last_seen.len() >= MOST_EVALUATORS && !self.last_seen.contains_key(&progress.evaluator) {
-            return Err(Rejection::Crowd);
+            return Err(NotAccepted::Crowd);
         }
         self.metrics.observe(&progress);
         self.last_seen.insert(progress.evaluator, now);

@@ -12,14 +12,13 @@ use tokio::time::{MissedTickBehavior, interval, timeout};
 use tracing::{error, warn};
 
 use super::display::{Display, evaluators};
-use super::duplicate::Life;
+use super::duplicate::Incarnation;
 use super::events::{Event, Saved};
-use super::local_evaluators::LocalEvaluators;
 use super::metrics::Metrics;
-use super::network::{Online, Opening, go_online};
+use super::network::{Online, Opening, Wire, go_online};
 use super::patience::{Patience, Verdict};
 use super::threads::Threads;
-use super::wire::Wire;
+use crate::local_evaluators::LocalEvaluators;
 use crate::train::Outcome;
 
 /// Time limit for closing the session, if the network hangs.
@@ -42,7 +41,7 @@ pub(crate) enum Ending {
 
 /// What the loop needs.
 pub(crate) struct MainLoop {
-    pub life: Life,
+    pub incarnation: Incarnation,
     pub run_dir: RunDir,
     pub metrics: Metrics,
     /// The address of `/metrics`.
@@ -61,7 +60,7 @@ pub(crate) struct MainLoop {
 
 /// The state of the run, as far as the loop knows.
 #[derive(Default)]
-struct Progress {
+struct Reached {
     trained: bool,
     interrupted: bool,
     wire: Option<Wire>,
@@ -78,13 +77,13 @@ impl MainLoop {
         let online = tokio::spawn(go_online(
             opening,
             self.endpoints.clone(),
-            self.life.clone(),
+            self.incarnation.clone(),
             self.threads.services.clone(),
             self.run_dir.clone(),
             self.metrics_address.clone(),
         ));
-        let mut progress = Progress::default();
-        let mut ending = self.watch(online, &mut progress).await;
+        let mut reached = Reached::default();
+        let mut ending = self.watch(online, &mut reached).await;
         self.display.finish();
         end(self.threads, &ending).await;
         while let Ok(event) = self.events.try_recv() {
@@ -96,14 +95,14 @@ impl MainLoop {
             }
         }
         self.evaluators.end().await;
-        if let Some(wire) = progress.wire {
+        if let Some(wire) = reached.wire {
             // An evaluator that misses this message notices the lost connection.
             timeout(CLOSE_PATIENCE, tokio::spawn(wire.close())).await.ok();
         }
         ending
     }
 
-    async fn watch(&mut self, mut online: JoinHandle<anyhow::Result<Online>>, progress: &mut Progress) -> Ending {
+    async fn watch(&mut self, mut online: JoinHandle<anyhow::Result<Online>>, reached: &mut Reached) -> Ending {
         let mut shutdown = std::pin::pin!(quad_runtime::shutdown_signal());
         let mut ticker = interval(self.display.interval());
         ticker.set_missed_tick_behavior(MissedTickBehavior::Skip);
@@ -114,7 +113,7 @@ impl MainLoop {
                     is_online = true;
                     match result.map_err(anyhow::Error::from).flatten() {
                         Ok(online) => {
-                            if let Err(error) = self.online(online, progress) {
+                            if let Err(error) = self.online(online, reached) {
                                 return Ending::Failed(error);
                             }
                         }
@@ -125,24 +124,24 @@ impl MainLoop {
                     Event::Failed(error) => return Ending::Failed(error),
                     Event::TrainingEnded(Outcome::Stopped { .. }) => return Ending::Interrupted,
                     // The stop came during the last step; the run does not wait for scores.
-                    Event::TrainingEnded(Outcome::Completed) if progress.interrupted => return Ending::Interrupted,
+                    Event::TrainingEnded(Outcome::Completed) if reached.interrupted => return Ending::Interrupted,
                     Event::TrainingEnded(Outcome::Completed) => {
-                        progress.trained = true;
+                        reached.trained = true;
                         self.display.say(&self.trained());
                     }
                     event => tell(event, &mut self.display),
                 },
                 _ = ticker.tick() => {
-                    if let Verdict::GiveUp = self.tick(progress) {
+                    if let Verdict::GiveUp = self.tick(reached) {
                         return Ending::Unscored;
                     }
-                    if progress.trained && self.threads.services.coordinator.pending() == 0 {
+                    if reached.trained && self.threads.services.coordinator.pending() == 0 {
                         return Ending::Complete;
                     }
                 }
-                () = &mut shutdown, if !progress.interrupted => {
-                    progress.interrupted = true;
-                    if progress.trained {
+                () = &mut shutdown, if !reached.interrupted => {
+                    reached.interrupted = true;
+                    if reached.trained {
                         return Ending::Interrupted;
                     }
                     self.display.say("stopping after this gradient step");
@@ -152,12 +151,13 @@ impl MainLoop {
         }
     }
 
-    fn online(&mut self, online: Online, progress: &mut Progress) -> anyhow::Result<()> {
+    fn online(&mut self, online: Online, reached: &mut Reached) -> anyhow::Result<()> {
         let (zenoh, metrics) = (online.reachable_at.join(", "), &self.metrics_address);
-        self.display.say(&format!("run {} is at {zenoh}, its metrics at http://{metrics}/metrics", self.life.run));
-        progress.reachable_at = online.reachable_at;
-        progress.wire = Some(online.wire);
-        self.evaluators.start(&progress.reachable_at, self.run_dir.path())
+        self.display
+            .say(&format!("run {} is at {zenoh}, its metrics at http://{metrics}/metrics", self.incarnation.run));
+        reached.reachable_at = online.reachable_at;
+        reached.wire = Some(online.wire);
+        self.evaluators.start(&reached.reachable_at, self.run_dir.path())
     }
 
     fn trained(&self) -> String {
@@ -170,22 +170,22 @@ impl MainLoop {
         }
     }
 
-    fn tick(&mut self, progress: &mut Progress) -> Verdict {
+    fn tick(&mut self, reached: &mut Reached) -> Verdict {
         self.beat.alive();
         for line in self.threads.services.coordinator.tick() {
             self.display.say(&line);
         }
-        self.watch_disk(&mut progress.hangs);
+        self.watch_disk(&mut reached.hangs);
         self.display.tick(Instant::now());
         for line in self.evaluators.news() {
             self.display.say(&line);
         }
-        if !progress.trained {
+        if !reached.trained {
             return Verdict::Wait;
         }
-        let verdict = progress.patience.look(self.threads.services.coordinator.any_fits(), Instant::now());
+        let verdict = reached.patience.look(self.threads.services.coordinator.any_fits(), Instant::now());
         if let Verdict::Advise = verdict {
-            self.display.say(&self.advice(&progress.reachable_at));
+            self.display.say(&self.advice(&reached.reachable_at));
         }
         verdict
     }

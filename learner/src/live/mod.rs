@@ -7,12 +7,11 @@
 //! In reading order:
 //!
 //! - `threads` starts (with `spawn`) and ends the threads; `events` are their reports to `main_loop`; `network` opens the
-//!   session meanwhile, and `duplicate` looks for another learner of the same name.
+//!   session meanwhile and declares everything on it, and `duplicate` looks for another learner of the same name.
 //! - `snapshots` is the thread that writes the output of training, and publishes snapshots through `weights`.
-//! - `wire` declares everything on Zenoh; `services` assigns each kind of message to a `pool` of threads or to the thread
-//!   `scores`, which writes scores. `requests`: queries that wait for their answer.
-//! - `coordinator` is the state that the threads share: the scoreboard and the `evaluators`. `rejection`: why the learner does
-//!   not accept a message.
+//! - `services` assigns each kind of message to a pool of threads or to the thread `scores`, which writes scores. `requests`:
+//!   queries that wait for their answer, and why a message was not accepted.
+//! - `coordinator` is the state that the threads share: the scoreboard and the `evaluators`.
 //! - `metrics` are for Prometheus; `disk` reports a disk that refuses writes; `display` is the terminal, `page_state` the
 //!   state for the page.
 
@@ -22,14 +21,11 @@ mod display;
 mod duplicate;
 mod evaluators;
 mod events;
-mod local_evaluators;
 mod main_loop;
 mod metrics;
 mod network;
 mod page_state;
 mod patience;
-mod pool;
-mod rejection;
 mod requests;
 mod scores;
 mod services;
@@ -39,11 +35,9 @@ mod spawn;
 mod tests;
 mod threads;
 mod weights;
-mod wire;
 
 pub(crate) use display::Display;
-pub(crate) use duplicate::Life;
-pub(crate) use local_evaluators::{LocalEvaluators, not_encrypted, spawn_logged};
+pub(crate) use duplicate::Incarnation;
 pub(crate) use main_loop::{Ending, MainLoop};
 pub(crate) use metrics::Metrics;
 pub(crate) use network::{Opening, open_network};

@@ -1,15 +1,15 @@
-//! A Zenoh query that waits for its answer.
+//! A Zenoh query that waits for its answer, and why its message was not accepted.
 
 use std::mem;
 
-use quad_protocol::{Message, decode, encode};
+use quad_protocol::{CodecError, Message, decode, encode};
 use tracing::debug;
 use zenoh::Wait;
 use zenoh::bytes::ZBytes;
 use zenoh::query::Query;
 
 use super::metrics::Metrics;
-use super::rejection::Rejection;
+use crate::evaluation::Refusal;
 
 /// Largest message to the learner, bytes; a score report of the largest job has 1.4 KB. A learner that listens receives no
 /// fragmented messages, which begin at 32,700 bytes at the earliest.
@@ -35,7 +35,7 @@ impl Request {
     }
 
     /// The query's message; the request does not keep it.
-    pub fn message<M: Message>(&mut self) -> Result<M, Rejection> {
+    pub fn message<M: Message>(&mut self) -> Result<M, NotAccepted> {
         read(&mem::take(&mut self.payload))
     }
 
@@ -56,10 +56,10 @@ impl Request {
     }
 
     /// Counts the query as not accepted, and answers with the reason.
-    pub fn reject(self, rejection: &Rejection, metrics: &Metrics) {
-        debug!(%rejection, "a message was not accepted");
-        metrics.reject(rejection.label());
-        self.send_error(&rejection.to_string());
+    pub fn reject(self, why: &NotAccepted, metrics: &Metrics) {
+        debug!(%why, "a message was not accepted");
+        metrics.reject(why.label());
+        self.send_error(&why.to_string());
     }
 
     fn send_error(self, text: &str) {
@@ -70,11 +70,48 @@ impl Request {
 }
 
 /// The message in a payload.
-pub(super) fn read<M: Message>(payload: &ZBytes) -> Result<M, Rejection> {
+pub(super) fn read<M: Message>(payload: &ZBytes) -> Result<M, NotAccepted> {
     match payload.len() {
-        0 => Err(Rejection::Empty),
+        0 => Err(NotAccepted::Empty),
         1..=MOST_BYTES => Ok(decode(&payload.to_bytes())?),
-        _ => Err(Rejection::Oversized),
+        _ => Err(NotAccepted::Oversized),
+    }
+}
+
+/// Why the learner did not accept a message.
+#[derive(Debug, thiserror::Error)]
+pub(super) enum NotAccepted {
+    #[error("the message is empty")]
+    Empty,
+    #[error("the message is too large")]
+    Oversized,
+    #[error("the message cannot be read: {0}")]
+    Codec(#[from] CodecError),
+    #[error("refused: {0}")]
+    Refused(#[from] Refusal),
+    #[error("there are too many evaluators")]
+    Crowd,
+    #[error("there is no snapshot of that step")]
+    NoSnapshot,
+    #[error("the snapshot cannot be read: {0:#}")]
+    Unreadable(anyhow::Error),
+    #[error("the scores could not be saved, try again: {0}")]
+    NotSaved(String),
+}
+
+impl NotAccepted {
+    /// The reason as a metric's label.
+    pub fn label(&self) -> &'static str {
+        match self {
+            Self::Empty => "empty",
+            Self::Oversized => "oversized",
+            Self::Codec(error) => error.label(),
+            Self::Refused(refusal) => refusal.label(),
+            Self::Crowd => "too_many_evaluators",
+            Self::NoSnapshot => "unknown_step",
+            Self::Unreadable(_) => "unreadable_snapshot",
+            Self::NotSaved(_) => "not_saved",
+        }
     }
 }
 

@@ -13,8 +13,7 @@ use quad_runtime::Beat;
 use super::coordinator::Coordinator;
 use super::disk::DiskStatus;
 use super::metrics::Metrics;
-use super::rejection::Rejection;
-use super::requests::Request;
+use super::requests::{NotAccepted, Request};
 use crate::evaluation::Validated;
 
 /// Most reports that are written together.
@@ -117,7 +116,7 @@ impl Scores {
     fn refuse(&self, reports: Vec<(Request, ScoreReport, Validated)>, error: &str) {
         for (request, report, _) in reports {
             self.coordinator.keep(&report);
-            request.reject(&Rejection::NotSaved(error.to_owned()), &self.metrics);
+            request.reject(&NotAccepted::NotSaved(error.to_owned()), &self.metrics);
         }
     }
 }

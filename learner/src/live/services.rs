@@ -9,10 +9,9 @@ use zenoh::sample::{Sample, SampleKind};
 use super::coordinator::Coordinator;
 use super::events::Events;
 use super::metrics::Metrics;
-use super::pool::Pool;
-use super::rejection::Rejection;
-use super::requests::{Request, read};
+use super::requests::{NotAccepted, Request, read};
 use super::scores::Delivery;
+use super::spawn::Pool;
 use super::weights::Weights;
 
 /// Threads that answer claims. Evaluators ask again if the queue is full.
@@ -52,7 +51,7 @@ impl Services {
         let (coordinator, metrics) = (self.coordinator.clone(), self.metrics.clone());
         let answer = move || match request.message::<JobRequest>() {
             Ok(message) => request.reply(&coordinator.job(&message)),
-            Err(rejection) => request.reject(&rejection, &metrics),
+            Err(why) => request.reject(&why, &metrics),
         };
         self.count_busy(self.answers.give(answer));
     }
@@ -64,9 +63,9 @@ impl Services {
                 self.coordinator.keep(&report);
                 self.deliveries.try_send(Some((request, report))).is_ok()
             }
-            Err(rejection) => {
+            Err(why) => {
                 let metrics = self.metrics.clone();
-                self.answers.give(move || request.reject(&rejection, &metrics))
+                self.answers.give(move || request.reject(&why, &metrics))
             }
         };
         self.count_busy(accepted);
@@ -75,9 +74,9 @@ impl Services {
     pub fn weights(&self, request: Request) {
         let (weights, metrics) = (self.weights.clone(), self.metrics.clone());
         let answer =
-            move || match keys::step_of(request.key()).ok_or(Rejection::NoSnapshot).and_then(|of| weights.of(of)) {
+            move || match keys::step_of(request.key()).ok_or(NotAccepted::NoSnapshot).and_then(|of| weights.of(of)) {
                 Ok(bytes) => request.send(bytes),
-                Err(rejection) => request.reject(&rejection, &metrics),
+                Err(why) => request.reject(&why, &metrics),
             };
         self.count_busy(self.weights_answers.give(answer));
     }
@@ -102,10 +101,10 @@ impl Services {
         }
     }
 
-    fn take_in(&self, result: Result<(), Rejection>) {
-        if let Err(rejection) = result {
-            debug!(%rejection, "a message was not accepted");
-            self.metrics.reject(rejection.label());
+    fn take_in(&self, result: Result<(), NotAccepted>) {
+        if let Err(why) = result {
+            debug!(%why, "a message was not accepted");
+            self.metrics.reject(why.label());
         }
     }
 }

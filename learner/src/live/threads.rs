@@ -13,7 +13,7 @@ use quad_runtime::Health;
 
 use super::coordinator::{Coordinator, EvaluationPlan};
 use super::disk::DiskStatus;
-use super::duplicate::Life;
+use super::duplicate::Incarnation;
 use super::events::{Events, Saved};
 use super::metrics::Metrics;
 use super::page_state::Live;
@@ -37,7 +37,7 @@ const TRAINING_STUCK: Duration = Duration::from_secs(300);
 
 /// A run and its state.
 pub(crate) struct Run<'a> {
-    pub life: Life,
+    pub incarnation: Incarnation,
     pub config: &'a RunConfig,
     /// The run's folder.
     pub dir: &'a RunDir,
@@ -68,15 +68,15 @@ impl Threads {
         health: &Health,
         events: &Events,
     ) -> anyhow::Result<Self> {
-        let Run { life, config, dir, scores, past, checkpoint_every } = run;
+        let Run { incarnation, config, dir, scores, past, checkpoint_every } = run;
         let Past { checkpoint, snapshots: known, scores: earlier } = past;
         let experiment = &config.experiment;
         let task = Task::new(&experiment.environment, transitions.observation_dim(), transitions.action_dim());
-        let coordinator = coordinator(&life, experiment, task, earlier, metrics, events);
+        let coordinator = coordinator(&incarnation, experiment, task, earlier, metrics, events);
         for (&step, &hash) in &known {
             coordinator.open(step, hash)?;
         }
-        let weights = Weights::new(life.run, life.incarnation, dir.clone(), coordinator.clone());
+        let weights = Weights::new(incarnation.run, incarnation.number, dir.clone(), coordinator.clone());
         let (services, deliveries) =
             Services::start(coordinator.clone(), weights.clone(), metrics.clone(), events.clone())?;
 
@@ -142,7 +142,7 @@ impl Threads {
 
 /// The shared state of jobs and scores, at the start of this process.
 fn coordinator(
-    life: &Life,
+    incarnation: &Incarnation,
     experiment: &Experiment,
     task: Task,
     earlier: BTreeMap<u64, Earlier>,
@@ -150,8 +150,8 @@ fn coordinator(
     events: &Events,
 ) -> Coordinator {
     let rules = Rules {
-        run: life.run.clone(),
-        incarnation: life.incarnation,
+        run: incarnation.run.clone(),
+        incarnation: incarnation.number,
         task,
         environment_seed: experiment.seed,
         job_episodes: JOB_EPISODES,

@@ -11,7 +11,7 @@ use zenoh::qos::CongestionControl;
 use zenoh::{Session, Wait};
 
 use super::coordinator::Coordinator;
-use super::rejection::Rejection;
+use super::requests::NotAccepted;
 
 /// What all snapshots of a run share, and where they are. Clones share it.
 #[derive(Clone)]
@@ -57,13 +57,13 @@ impl Weights {
     }
 
     /// The snapshot of a step, for an evaluator that asks.
-    pub fn of(&self, step: u64) -> Result<ZBytes, Rejection> {
+    pub fn of(&self, step: u64) -> Result<ZBytes, NotAccepted> {
         let newest = self.newest.lock().unwrap_or_else(PoisonError::into_inner).clone();
         if let Some((_, bytes)) = newest.filter(|(newest, _)| *newest == step) {
             return Ok(bytes);
         }
-        let hash = self.coordinator.weights(step).ok_or(Rejection::NoSnapshot)?;
-        self.read(step, hash).map_err(Rejection::Unreadable)
+        let hash = self.coordinator.weights(step).ok_or(NotAccepted::NoSnapshot)?;
+        self.read(step, hash).map_err(NotAccepted::Unreadable)
     }
 
     fn read(&self, step: u64, hash: Hash) -> anyhow::Result<ZBytes> {

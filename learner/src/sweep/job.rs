@@ -12,7 +12,7 @@ use quad_runtime::UNFINISHED;
 use rustix::process::{Pid, Signal, kill_process};
 
 use super::study::PlannedRun;
-use crate::live::{not_encrypted, spawn_logged};
+use crate::local_evaluators::{not_encrypted, spawn_logged};
 
 /// What a line that says why a learner has failed begins with.
 const ERROR: &str = "error: ";

@@ -2,7 +2,7 @@
 //!
 //! Owns the format of study files and the folder of a study, `runs/STUDY`, in which each run has its own folder. The command
 //! `learner sweep` calls it on the main thread. Each run is a process `learner train`, which meets the shared evaluators at a
-//! router in this process. It uses `live` for evaluators, [`quad_run`] for the state of a run, and
+//! router in this process. It uses `local_evaluators`, [`quad_run`] for the state of a run, and
 //! [`train`](crate::train) to measure how long steps take.
 //!
 //! In reading order: `study` is the file, `axes` are its lists of values, `rules` say which combinations, `names` what runs are

@@ -12,7 +12,7 @@ use tokio::time::interval;
 use super::display::Display;
 use super::job::{End, Job};
 use super::study::PlannedRun;
-use crate::live::LocalEvaluators;
+use crate::local_evaluators::LocalEvaluators;
 
 /// How often it looks whether a learner has ended.
 const GLANCE: Duration = Duration::from_millis(100);

@@ -28,7 +28,7 @@ pub(crate) struct Plan {
     pub schedule: Schedule,
     /// Least time between two checkpoints.
     pub checkpoint_every: Duration,
-    /// Seconds of training in earlier lives of the run.
+    /// Seconds of training in earlier incarnations of the run.
     pub seconds_before: f64,
 }
 

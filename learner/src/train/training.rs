@@ -29,11 +29,11 @@ pub(crate) struct Training {
     pub experiment: Experiment,
     pub device: Device,
     pub transitions: Arc<Transitions>,
-    /// Where an earlier life of the run has left off.
+    /// Where an earlier incarnation of the run has left off.
     pub checkpoint: Option<Checkpoint>,
     /// Least time between two checkpoints.
     pub checkpoint_every: Duration,
-    /// Seconds of training in earlier lives.
+    /// Seconds of training in earlier incarnations.
     pub seconds_before: f64,
     pub metrics: TrainingMetrics,
     pub outbox: Outbox,

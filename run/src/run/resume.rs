@@ -15,7 +15,7 @@ use super::lines::ScoreLine;
 use super::log::Log;
 use crate::config::{Experiment, RunConfig, settings};
 
-/// The scores of one step that an earlier life of the learner wrote down.
+/// The scores of one step that an earlier incarnation of the learner wrote down.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Earlier {
     /// Hash of the snapshot that was scored, as text.

@@ -33,7 +33,7 @@ impl Bench {
         Self::after(BTreeMap::new())
     }
 
-    /// The same in a later life of the run.
+    /// The same in a later incarnation of the run.
     fn after(earlier: BTreeMap<u64, Earlier>) -> Self {
         let rules = Rules {
             run: name("run"),

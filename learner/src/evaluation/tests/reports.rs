@@ -51,7 +51,7 @@ fn a_job_may_be_delivered_in_parts() {
     assert_eq!((validated.new.len(), validated.duplicates, recorded.jobs_completed), (3, 2, 1));
 }
 
-/// An older life of the learner handed the job out, or to another evaluator, or the job is not known any more.
+/// An older incarnation of the learner handed the job out, or to another evaluator, or the job is not known any more.
 #[test]
 fn any_lifes_report_is_welcome_if_step_weights_and_seeds_fit() {
     let mut bench = Bench::new();

@@ -20,15 +20,15 @@ use zenoh::Session;
 
 use super::coordinator::{Coordinator, EvaluationPlan};
 use super::disk::DiskStatus;
-use super::duplicate::Life;
+use super::duplicate::Incarnation;
 use super::events::{Event, Saved};
 use super::metrics::Metrics;
+use super::network::Wire;
 use super::scores::Scores;
 use super::services::Services;
 use super::snapshots::Snapshots;
 use super::spawn::spawn;
 use super::weights::Weights;
-use super::wire::Wire;
 use crate::evaluation::Rules;
 use crate::evaluation::tests::name;
 use crate::fixtures::config;
@@ -126,8 +126,8 @@ impl Bench {
         let endpoint = format!("tcp/127.0.0.1:{port}");
         let session =
             open_session(&Endpoints { listen: vec![endpoint.clone()], ..Endpoints::default() }).await.unwrap();
-        let life = Life { run: run.clone(), incarnation: INCARNATION };
-        let wire = Wire::declare(session, &life, &services).await.unwrap();
+        let incarnation = Incarnation { run: run.clone(), number: INCARNATION };
+        let wire = Wire::declare(session, &incarnation, &services).await.unwrap();
         Self { run, run_dir, endpoint, metrics, events, outbox, coordinator, disk, _wire: wire, _folder: folder }
     }
 
