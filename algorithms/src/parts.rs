@@ -1,6 +1,6 @@
 //! An algorithm's state as a list of named parts, by which it is saved and loaded.
 
-use candle_core::{Result, Tensor};
+use candle_core::{Device, Result, Tensor};
 use quad_policy::{Adam, Layout, PolicyError, Tensors, Weights, take};
 
 use super::trained::{Network, Trained};
@@ -11,8 +11,8 @@ enum Part<'a> {
     Adam(&'a mut Adam, Layout),
     /// A tensor `[]` or `[n]`.
     Number(&'a mut Tensor),
-    /// A tensor `[]` that may not be there yet.
-    Maybe(&'a mut Option<Tensor>),
+    /// A scalar on this device, which may be missing.
+    Maybe(&'a mut Option<Tensor>, &'a Device),
 }
 
 /// Named parts. Names of networks are prefixes of their tensors' names.
@@ -39,9 +39,9 @@ impl<'a> Parts<'a> {
         self
     }
 
-    /// A tensor `[]` that may not be there yet.
-    pub(super) fn maybe(mut self, name: &'static str, number: &'a mut Option<Tensor>) -> Self {
-        self.0.push((name, Part::Maybe(number)));
+    /// A scalar on this device, which may be missing.
+    pub(super) fn maybe(mut self, name: &'static str, number: &'a mut Option<Tensor>, device: &'a Device) -> Self {
+        self.0.push((name, Part::Maybe(number, device)));
         self
     }
 
@@ -55,10 +55,10 @@ impl<'a> Parts<'a> {
             match part {
                 Part::Weights(weights) => tensors.extend(weights.tensors(&format!("{name}."))?),
                 Part::Adam(adam, layout) => tensors.extend(adam.tensors(&layout, &format!("{name}."))?),
-                Part::Number(number) | Part::Maybe(Some(number)) => {
+                Part::Number(number) | Part::Maybe(Some(number), _) => {
                     tensors.insert(name.to_owned(), number.flatten_all()?);
                 }
-                Part::Maybe(None) => {}
+                Part::Maybe(None, _) => {}
             }
         }
         Ok(tensors)
@@ -84,10 +84,10 @@ impl<'a> Parts<'a> {
                     let saved = take(tensors, name.to_owned(), &[number.elem_count()])?;
                     *number = saved.reshape(number.shape())?.to_device(number.device())?;
                 }
-                Part::Maybe(number) if tensors.contains_key(name) => {
-                    *number = Some(take(tensors, name.to_owned(), &[1])?.reshape(())?);
+                Part::Maybe(number, device) if tensors.contains_key(name) => {
+                    *number = Some(take(tensors, name.to_owned(), &[1])?.reshape(())?.to_device(device)?);
                 }
-                Part::Maybe(number) => *number = None,
+                Part::Maybe(number, _) => *number = None,
             }
         }
         Ok(())

@@ -220,7 +220,7 @@ impl Algorithm for Quad {
             .weights("target_actor", self.target_actor.weights_mut())
             .weights("target_critic", self.target_critics.weights_mut())
             .number("eta", &mut self.eta)
-            .maybe("nu_squared", &mut self.nu_squared);
+            .maybe("nu_squared", &mut self.nu_squared, &self.context.device);
         match &mut self.lambda_means {
             Some(means) => parts.number("lambda_means", means),
             None => parts,

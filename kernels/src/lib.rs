@@ -7,6 +7,7 @@
 //! - `avx512`, `avx2`: the products that the libraries at hand do more slowly (docs/performance.md says by how much).
 //! - [`activation`]: Mish and its derivative; [`narrow`]: the first and last layer of a network, fused with it.
 //! - [`optimiser`]: Adam and EMA over whole parameter vectors.
+//! - `cuda`: what of this a GPU does in one launch, with the feature `cuda`.
 //! - [`scaling`]: between a user's units and those of networks.
 //! - [`Level`] (`level`): which of the CPU's instructions are used.
 //! - [`Buffer`] (`buffer`): memory that is used again and again, aligned to cache lines.
@@ -21,6 +22,8 @@ mod avx2;
 #[cfg(target_arch = "x86_64")]
 mod avx512;
 mod buffer;
+#[cfg(feature = "cuda")]
+pub mod cuda;
 mod level;
 pub mod narrow;
 pub mod optimiser;

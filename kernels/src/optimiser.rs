@@ -29,29 +29,39 @@ vectorised! {
 }
 
 /// Coefficients of Adam's element-wise update.
-#[derive(Clone, Copy)]
-struct Update {
-    /// Of the gradient.
-    scale: f32,
+#[derive(Clone, Copy, Debug)]
+pub struct AdamRates {
     /// Learning rate over the first moment's bias correction.
-    rate: f32,
-    /// Of the parameters themselves.
-    decay: f32,
+    pub rate: f32,
+    /// What multiplies the parameters themselves.
+    pub decay: f32,
     /// 1/sqrt of the second moment's bias correction.
-    correction: f32,
+    pub correction: f32,
+}
+
+impl AdamRates {
+    /// Those of step number `count`, from 1, with a learning rate and a weight decay.
+    pub fn new(rate: f32, decay: f32, count: u64) -> Self {
+        let count = count as f64;
+        Self {
+            rate: (f64::from(rate) / (1.0 - BETA1.powf(count))) as f32,
+            decay: rate * decay,
+            correction: (1.0 / (1.0 - BETA2.powf(count)).sqrt()) as f32,
+        }
+    }
 }
 
 vectorised! {
-    fn adam_chunk(update: Update, parameters: &mut [f32], first: &mut [f32], second: &mut [f32], gradient: &[f32]) {
+    fn adam_chunk(scale: f32, rates: AdamRates, parameters: &mut [f32], first: &mut [f32], second: &mut [f32], gradient: &[f32]) {
         // Of the new gradient: rounded from f64, since 1 - 0.999 in f32 would be off by a part in 20,000.
         const NEW: [f32; 2] = [(1.0 - BETA1) as f32, (1.0 - BETA2) as f32];
         const OLD: [f32; 2] = [BETA1 as f32, BETA2 as f32];
         for (((p, m), v), g) in parameters.iter_mut().zip(first).zip(second).zip(gradient) {
-            let g = g * update.scale;
+            let g = g * scale;
             *m = OLD[0] * *m + NEW[0] * g;
             *v = OLD[1] * *v + NEW[1] * g * g;
             // In one subtraction: a decay by itself would be too small a part of the parameter to change it.
-            *p -= update.rate * *m / (v.sqrt() * update.correction + EPSILON) + update.decay * *p;
+            *p -= rates.rate * *m / (v.sqrt() * rates.correction + EPSILON) + rates.decay * *p;
         }
     }
 }
@@ -70,29 +80,21 @@ pub fn norm(x: &[f32]) -> f32 {
     squares.iter().map(|x| f64::from(*x)).sum::<f64>().sqrt() as f32
 }
 
-/// Adam's step number `count`, from 1, along a gradient g that is first multiplied by `scale`:
+/// Adam's step number `count` along a gradient g that is first multiplied by `scale`:
 /// m = β1·m + (1 - β1)·g, v = β2·v + (1 - β2)·g², p -= rate · m/(1 - β1^count) / (√(v/(1 - β2^count)) + ε) + rate·decay·p.
 pub fn adam(
     parameters: &mut [f32],
     (first, second): (&mut [f32], &mut [f32]),
     gradient: &[f32],
     scale: f32,
-    (rate, decay): (f32, f32),
-    count: u64,
+    rates: AdamRates,
 ) {
-    let count = count as f64;
-    let update = Update {
-        scale,
-        rate: (f64::from(rate) / (1.0 - BETA1.powf(count))) as f32,
-        decay: rate * decay,
-        correction: (1.0 / (1.0 - BETA2.powf(count)).sqrt()) as f32,
-    };
     parameters
         .par_chunks_mut(CHUNK)
         .zip(first.par_chunks_mut(CHUNK))
         .zip(second.par_chunks_mut(CHUNK))
         .zip(gradient.par_chunks(CHUNK))
-        .for_each(|(((p, m), v), g)| adam_chunk(update, p, m, v, g));
+        .for_each(|(((p, m), v), g)| adam_chunk(scale, rates, p, m, v, g));
 }
 
 /// `target = (1 - rate)·target + rate·online`.

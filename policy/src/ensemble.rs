@@ -1,6 +1,7 @@
 //! K networks of one shape side by side: critics Q_1..Q_K over [s, a], a value function or a policy's mean over s.
 
 use crate::action_gradients::ActionGradients;
+use crate::composed::Pass;
 use crate::mlp::Mlp;
 use crate::operation::OnCpu;
 use crate::packed::Packing;
@@ -112,6 +113,14 @@ impl Ensemble {
     /// of their own: none has a part in another's.
     fn plain_action_gradients(&self, observations: &Tensor, actions: &Tensor) -> Result<Tensor> {
         let repeat = actions.dim(0)? / observations.dim(0)?;
+        let (action_dim, layers) = (self.shape.action_dim, &self.networks.layers);
+        if !layers.norm {
+            let x = Tensor::cat(&[&plain::repeat_rows(observations, repeat)?, actions], 1)?;
+            let pass = Pass::forward(layers, &self.weights, &x, true)?;
+            let (_, gradients) = pass.backward(&pass.out.ones_like()?, false, true)?;
+            let gradients = gradients.ok_or_else(|| candle_core::Error::Msg("no gradient was asked for".into()))?;
+            return gradients.narrow(2, self.shape.observation_dim, action_dim)?.contiguous();
+        }
         let observations = plain::repeat_rows(observations, repeat)?.broadcast_left(self.shape.members)?;
         let actions = Var::from_tensor(&actions.broadcast_left(self.shape.members)?)?;
         let inputs = Tensor::cat(&[&observations, actions.as_tensor()], 2)?;

@@ -5,6 +5,7 @@
 
 use crate::mlp_config::{Initial, MlpConfig};
 use crate::weights::{Part, Start};
+use candle_core::{Result, Tensor};
 use quad_kernels::activation::Activation;
 use std::ops::Range;
 
@@ -78,6 +79,14 @@ impl Layers {
     /// (inputs, outputs) of a layer.
     pub fn shape(&self, layer: usize) -> (usize, usize) {
         (self.widths[layer], self.widths[layer + 1])
+    }
+
+    /// Kernels `[K, in, out]` and biases `[K, out]` of a layer, as views of the vector.
+    pub fn views(&self, vector: &Tensor, layer: usize) -> Result<(Tensor, Tensor)> {
+        let ((inputs, outputs), start, members) = (self.shape(layer), self.offsets[layer], self.members);
+        let kernels = vector.narrow(0, start, members * inputs * outputs)?.reshape((members, inputs, outputs))?;
+        let biases = vector.narrow(0, start + members * inputs * outputs, members * outputs)?;
+        Ok((kernels, biases.reshape((members, outputs))?))
     }
 
     pub fn kernel<'a>(&self, weights: &'a [f32], layer: usize, member: usize) -> &'a [f32] {

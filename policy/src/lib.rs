@@ -4,7 +4,8 @@
 //!
 //! - [`MlpConfig`] (`mlp_config`): a network's hidden layers, a line of configuration; `shape`: what goes in and comes out.
 //! - `mlp`: K networks of layers act(x·W + b) as one operation of candle's, with gradients to x, W and b. It has a fast
-//!   implementation for the CPU, and a plain one (`plain`) that runs on any device and has layer norm.
+//!   implementation for the CPU, one of few operations for a GPU (`composed`), and a plain one (`plain`) that runs on any
+//!   device and has layer norm.
 //! - [`Ensemble`] (`ensemble`): such networks as critics, value functions or means; [`NoisePredictor`] (`noise_predictor`):
 //!   ε_θ; [`Schedule`] (`schedule`): the noise schedule and one reverse step. `sampler` and `action_gradients` go through
 //!   whole networks tile by tile.
@@ -16,7 +17,7 @@
 //! - [`Precision`] (`precision`): how exactly networks are evaluated that no gradient is taken of.
 //! - Below: `layers` (where each layer lies in the vector), `network` (one network on one tile of rows, over the crate
 //!   `kernels`), `saved` and `kept_gradient` (what forward and backward passes leave), `operation` (candle's custom
-//!   operations), `packed` (kernels packed once), `slices` (candle's tensors as slices), `statistics` (mean and variance
+//!   operations), `packed` (kernels packed once), `slices` (candle's tensors as slices), `gpu` (the same on a GPU), `statistics` (mean and variance
 //!   over an ensemble).
 //!
 //! Everything that draws random numbers takes them as an argument or from a seeded generator.
@@ -25,6 +26,7 @@
 
 mod action_gradients;
 mod choice;
+mod composed;
 mod diffusion;
 mod ensemble;
 mod episode;
@@ -33,6 +35,8 @@ mod gaussian;
 #[cfg(test)]
 #[allow(clippy::unwrap_used)]
 mod golden;
+#[cfg(feature = "cuda")]
+mod gpu;
 mod gradient;
 #[cfg(test)]
 #[allow(clippy::unwrap_used)]

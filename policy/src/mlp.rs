@@ -1,8 +1,9 @@
 //! K networks of one shape side by side: layers act(x·W + b), differentiable in x, W and b.
 //!
 //! On the CPU a custom operation of candle's runs all layers, cut into (member, tile of rows) and in parallel; the cut does
-//! not depend on the number of threads, so neither do the results. Elsewhere, and with a norm, plain operations do.
+//! not depend on the number of threads, so neither do the results. Elsewhere `composed` does, and with a norm plain operations do.
 
+use crate::composed::{Composed, Pass};
 use crate::kept_gradient::KeptGradient;
 use crate::layers::{Layers, TILE};
 use crate::network::{Input, Network, rows_of, with_workspace};
@@ -50,7 +51,7 @@ impl Mlp {
             bail!("{} networks of {} numbers got inputs of shape {:?}", layers.members, layers.inputs(), x.dims());
         }
         if !self.is_fast(weights) {
-            return self.plain_forward(weights, &x);
+            return if layers.norm { self.plain_forward(weights, &x) } else { self.composed_forward(weights, &x) };
         }
         let kept = if values.track_op() { weights.kept_gradient().cloned() } else { None };
         let saved = (values.track_op() || x.track_op()).then(|| self.saved.lend());
@@ -62,6 +63,12 @@ impl Mlp {
     /// Whether the fast implementation serves them.
     pub fn is_fast(&self, weights: &Weights) -> bool {
         has_fast_implementation(weights.values().device()) && !self.layers.norm
+    }
+
+    fn composed_forward(&self, weights: &Weights, x: &Tensor) -> Result<Tensor> {
+        let differentiable = weights.values().track_op() || x.track_op();
+        let pass = Pass::forward(&self.layers, weights, x, differentiable)?;
+        if differentiable { weights.values().apply_op2(x, Composed(pass)) } else { Ok(pass.out) }
     }
 
     /// [`Self::forward`] in plain candle operations; here each member may have inputs of its own, `[K, rows, in]`.

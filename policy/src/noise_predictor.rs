@@ -89,13 +89,31 @@ impl NoisePredictor {
     /// gradient flows.
     pub fn sample(&self, observations: &Tensor, noise: &Tensor) -> Result<Tensor> {
         if !self.parts.trunk.is_fast(&self.weights) {
-            return self.detach().sample_with_gradient(observations, noise);
+            return self.detach().composed_sample(observations, noise);
         }
         self.check_noise(observations, noise)?;
         let packed = self.packing.kernels(&self.parts.trunk, &self.weights)?;
         let operation = OnCpu(Sample { parts: self.parts.clone(), packed });
         let weights = self.weights.values().detach();
         weights.apply_op3_no_bwd(&observations.contiguous()?, &noise.contiguous()?, &operation)
+    }
+
+    /// [`Self::sample`] with the embeddings of all t computed once, and one operation for a reverse step on a GPU.
+    fn composed_sample(&self, observations: &Tensor, noise: &Tensor) -> Result<Tensor> {
+        self.check_noise(observations, noise)?;
+        let Parts { time, trunk, features, shape, .. } = &*self.parts;
+        let (steps, rows, _) = noise.dims3()?;
+        let features = Tensor::from_slice(features, (shape.diffusion_steps, TIME_FEATURES), noise.device())?;
+        let embeddings = time.forward(&self.weights, &[&features])?.squeeze(0)?;
+        let observations = plain::repeat_rows(observations, rows / observations.dim(0)?)?;
+        let mut actions = noise.get(0)?;
+        for t in (1..=steps).rev() {
+            let embedding = embeddings.get(t - 1)?.broadcast_left(rows)?.contiguous()?;
+            let epsilon = trunk.forward(&self.weights, &[&observations, &actions, &embedding])?.squeeze(0)?;
+            let z = if t > 1 { Some(noise.get(steps - t + 1)?) } else { None };
+            actions = self.schedule().constant_reverse(t, &actions, &epsilon, z.as_ref())?;
+        }
+        Ok(actions)
     }
 
     /// [`Self::sample`], but differentiable in the weights, through every reverse step; slower.

@@ -4,7 +4,7 @@ use crate::error::PolicyError;
 use crate::slices::{has_fast_implementation, modify, read};
 use crate::weights::{Layout, Tensors, Weights};
 use candle_core::{DType, Result, Tensor};
-use quad_kernels::optimiser::{BETA1, BETA2, EPSILON, adam, norm};
+use quad_kernels::optimiser::{AdamRates, BETA1, BETA2, EPSILON, adam, norm};
 
 /// Adam (Kingma and Ba 2015), with β = (0.9, 0.999) and ε = 1e-8, for the weights of one network; with a weight decay it is
 /// AdamW (Loshchilov and Hutter 2019).
@@ -35,6 +35,10 @@ impl Adam {
 
     /// Moves the weights down a gradient. Gives its norm before clipping, `[]`.
     pub fn descend(&mut self, weights: &mut Weights, gradient: &Tensor, step: AdamStep) -> Result<Tensor> {
+        #[cfg(feature = "cuda")]
+        if gradient.device().is_cuda() {
+            return self.gpu_step(weights, gradient, step);
+        }
         match has_fast_implementation(gradient.device()) {
             true => self.fused_step(weights, gradient, step),
             false => self.plain_step(weights, gradient, step),
@@ -45,15 +49,35 @@ impl Adam {
         let len = gradient.elem_count();
         let size = read(gradient, norm)?;
         let scale = step.clip.map_or(1.0, |clip| (clip / size).min(1.0));
-        let (rates, count) = ((step.rate, self.decay), step.count);
+        let rates = AdamRates::new(step.rate, self.decay, step.count);
         read(gradient, |gradient: &[f32]| {
             modify(&self.moments, |moments| {
                 let moments = moments.split_at_mut(len);
-                weights
-                    .change(|weights| modify(weights, |weights| adam(weights, moments, gradient, scale, rates, count)))
+                weights.change(|weights| modify(weights, |weights| adam(weights, moments, gradient, scale, rates)))
             })
         })???;
         Tensor::new(size, gradient.device())
+    }
+
+    #[cfg(feature = "cuda")]
+    fn gpu_step(&mut self, weights: &mut Weights, gradient: &Tensor, step: AdamStep) -> Result<Tensor> {
+        use crate::gpu::{modify, read, tensor};
+        let rates = AdamRates::new(step.rate, self.decay, step.count);
+        let clip = step.clip.unwrap_or(f32::INFINITY);
+        let mut size = None;
+        read(&gradient.contiguous()?, |gradient| {
+            modify(&self.moments, |_, moments| {
+                weights.change(|weights| {
+                    size = Some(modify(weights, |stream, weights| {
+                        quad_kernels::cuda::adam(stream, weights, moments, gradient, clip, rates)
+                            .map_err(candle_core::Error::wrap)
+                    })?);
+                    Ok(())
+                })
+            })
+        })?;
+        let size = size.ok_or_else(|| candle_core::Error::Msg("Adam made no step".into()))?;
+        tensor(size, (), gradient)
     }
 
     fn plain_step(&mut self, weights: &mut Weights, gradient: &Tensor, step: AdamStep) -> Result<Tensor> {

@@ -1,5 +1,5 @@
-//! The networks in plain candle operations, which candle differentiates: what runs on a GPU, and what the fast ones
-//! on the CPU are tested against.
+//! The networks in plain candle operations, which candle differentiates: those with a norm, and what the others are tested
+//! against.
 
 use crate::layers::Layers;
 use crate::weights::Tensors;

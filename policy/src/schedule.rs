@@ -1,6 +1,8 @@
 //! The variance-preserving noise schedule and one step of the reverse process.
 
 use candle_core::{Device, Result, Tensor};
+#[cfg(feature = "cuda")]
+use quad_kernels::cuda::{ReverseStep, reverse};
 use serde::{Deserialize, Serialize};
 
 /// How a reverse step is made of a predicted noise.
@@ -95,12 +97,50 @@ impl Schedule {
         if self.reverse == Reverse::ClipSample { next.clamp(-1f32, 1f32) } else { Ok(next) }
     }
 
+    /// [`Self::reverse`] of constants: on a GPU one operation.
+    pub(crate) fn constant_reverse(
+        &self,
+        t: usize,
+        x: &Tensor,
+        epsilon: &Tensor,
+        z: Option<&Tensor>,
+    ) -> Result<Tensor> {
+        #[cfg(feature = "cuda")]
+        if x.device().is_cuda() {
+            return self.reverse_on_gpu(t, x, epsilon, z);
+        }
+        self.reverse(t, x, epsilon, z)
+    }
+
+    #[cfg(feature = "cuda")]
+    fn reverse_on_gpu(&self, t: usize, x: &Tensor, epsilon: &Tensor, z: Option<&Tensor>) -> Result<Tensor> {
+        use crate::gpu::{read, tensor};
+        let Step { signal, deviation, from_clean, from_noisy, noise } = self.steps[t - 1];
+        let (clean_bound, bound) = self.bounds();
+        let noise = if z.is_some() { noise } else { 0.0 };
+        let step = ReverseStep { deviation, scale: 1.0 / signal, clean_bound, from_clean, from_noisy, noise, bound };
+        let candle_core::Device::Cuda(device) = x.device() else { candle_core::bail!("a tensor is not on the GPU") };
+        let stream = device.cuda_stream();
+        let (x, epsilon) = (x.contiguous()?, epsilon.contiguous()?);
+        let z = z.unwrap_or(&epsilon).contiguous()?;
+        let next = read(&x, |x| {
+            read(&epsilon, |epsilon| {
+                read(&z, |z| reverse(&stream, [x, epsilon, z], step).map_err(candle_core::Error::wrap))
+            })
+        })?;
+        tensor(next, x.shape(), &x)
+    }
+
+    /// Bounds of the predicted x_0 and of the outcome.
+    fn bounds(&self) -> (f32, f32) {
+        if self.reverse == Reverse::ClipSample { (f32::INFINITY, 1.0) } else { (1.0, f32::INFINITY) }
+    }
+
     /// [`Self::reverse`] on slices; `z` is not read at t = 1.
     pub(crate) fn reverse_in_place(&self, t: usize, x: &mut [f32], epsilon: &[f32], z: &[f32]) {
         let Step { signal, deviation, from_clean, from_noisy, noise } = self.steps[t - 1];
         let scale = 1.0 / signal;
-        let clips_sample = self.reverse == Reverse::ClipSample;
-        let (clean_bound, bound) = if clips_sample { (f32::INFINITY, 1.0) } else { (1.0, f32::INFINITY) };
+        let (clean_bound, bound) = self.bounds();
         for (i, (x, epsilon)) in x.iter_mut().zip(epsilon).enumerate() {
             let clean = ((*x - deviation * epsilon) * scale).clamp(-clean_bound, clean_bound);
             let mean = from_clean * clean + from_noisy * *x;

@@ -233,6 +233,16 @@ impl Weights {
     /// The EMA update of a target network: `w = (1 - rate)·w + rate·online`.
     pub fn ema_update(&mut self, online: &Self, rate: f32) -> Result<()> {
         let online = online.values.detach();
+        #[cfg(feature = "cuda")]
+        if online.device().is_cuda() {
+            return crate::gpu::read(&online, |online| {
+                self.change(|mine| {
+                    crate::gpu::modify(mine, |stream, mine| {
+                        quad_kernels::cuda::ema(stream, mine, online, rate).map_err(candle_core::Error::wrap)
+                    })
+                })
+            });
+        }
         if has_fast_implementation(online.device()) {
             return crate::slices::read(&online, |online: &[f32]| {
                 self.change(|mine| modify(mine, |mine| quad_kernels::optimiser::ema(mine, online, rate)))

@@ -1,0 +1,174 @@
+//! The loops of a gradient step on an Nvidia GPU, each one launch: activations, a reverse step, Adam and EMA. Products are
+//! cuBLAS's, through candle. `cuda.cu` has the kernels; the driver's compiler translates them for the GPU at hand when the
+//! first is launched.
+//!
+//! Every function queues its work on a stream and returns before the GPU has done it.
+
+use crate::activation::Activation;
+use crate::optimiser::AdamRates;
+use cudarc::driver::{
+    CudaModule, CudaSlice, CudaStream, CudaView, CudaViewMut, DriverError, LaunchConfig, PushKernelArg,
+};
+use cudarc::nvrtc::{CompileError, compile_ptx};
+use std::sync::{Arc, Mutex, PoisonError};
+
+/// Threads of a block; `cuda.cu` counts on it.
+const BLOCK: u32 = 256;
+/// Sums into which a gradient's norm is cut.
+const SUMS: usize = 256;
+
+/// Why a kernel does not run.
+#[derive(Debug, thiserror::Error)]
+pub enum CudaError {
+    /// The driver refuses.
+    #[error("the CUDA driver failed")]
+    Driver(#[from] DriverError),
+    /// The kernels cannot be translated.
+    #[error("the CUDA kernels cannot be compiled for this GPU")]
+    Compile(#[from] CompileError),
+}
+
+/// What a function gives.
+pub type Result<T> = std::result::Result<T, CudaError>;
+
+/// The numbers of a reverse step: `clean = clamp((x - deviation·ε)·scale)`, then
+/// `clamp(from_clean·clean + from_noisy·x + noise·z)`, each with a bound of its own, which may be infinite.
+#[derive(Clone, Copy, Debug)]
+pub struct ReverseStep {
+    /// What multiplies the predicted noise.
+    pub deviation: f32,
+    /// What multiplies the difference.
+    pub scale: f32,
+    /// Bound of `clean`.
+    pub clean_bound: f32,
+    /// What multiplies `clean`.
+    pub from_clean: f32,
+    /// What multiplies x.
+    pub from_noisy: f32,
+    /// What multiplies the noise z; 0 if there is none.
+    pub noise: f32,
+    /// Bound of the outcome.
+    pub bound: f32,
+}
+
+/// The translated kernels. A process trains on one GPU.
+fn module(stream: &CudaStream) -> Result<Arc<CudaModule>> {
+    static MODULE: Mutex<Option<Arc<CudaModule>>> = Mutex::new(None);
+    let mut module = MODULE.lock().unwrap_or_else(PoisonError::into_inner);
+    if let Some(module) = &*module {
+        return Ok(module.clone());
+    }
+    let loaded = stream.context().load_module(compile_ptx(include_str!("cuda.cu"))?)?;
+    Ok(module.insert(loaded).clone())
+}
+
+/// Enough blocks that each number has a thread.
+fn threads(count: usize) -> LaunchConfig {
+    let blocks = u32::try_from(count).unwrap_or(u32::MAX).div_ceil(BLOCK);
+    LaunchConfig { grid_dim: (blocks, 1, 1), block_dim: (BLOCK, 1, 1), shared_mem_bytes: 0 }
+}
+
+/// `f(z + bias)` of `members × rows × width` numbers, where each member has a bias of its own, `members × width`; without `f`
+/// just the sum. With `slope`, the derivatives f'(z + bias) follow behind all values.
+pub fn activate(
+    stream: &Arc<CudaStream>,
+    f: Option<Activation>,
+    z: &CudaView<'_, f32>,
+    (bias, members): (&CudaView<'_, f32>, usize),
+    slope: bool,
+) -> Result<CudaSlice<f32>> {
+    let (count, width) = (z.len(), bias.len() / members);
+    assert!(count.is_multiple_of(members * width) && u32::try_from(count).is_ok(), "whole rows");
+    let number: u32 = match f {
+        Some(Activation::Mish) => 0,
+        Some(Activation::Relu) => 1,
+        Some(Activation::Silu) => 2,
+        Some(Activation::Tanh) => 3,
+        None => 4,
+    };
+    let function = module(stream)?.load_function("activate")?;
+    // SAFETY: the kernel writes every number.
+    let mut out = unsafe { stream.alloc::<f32>(if slope { 2 * count } else { count })? };
+    let (mut y, mut derivative) = out.split_at_mut(count);
+    let (all, member, width, none) = (count as u32, (count / members) as u32, width as u32, 0_u64);
+    let mut launch = stream.launch_builder(&function);
+    launch.arg(z).arg(bias).arg(&mut y);
+    if slope {
+        launch.arg(&mut derivative)
+    } else {
+        launch.arg(&none)
+    };
+    launch.arg(&all).arg(&member).arg(&width).arg(&number);
+    // SAFETY: the arguments are those of the kernel, and the lengths were checked above.
+    unsafe { launch.launch(threads(count))? };
+    Ok(out)
+}
+
+/// x_t → x_{t-1}; z is not read if `step.noise` is 0.
+pub fn reverse(
+    stream: &Arc<CudaStream>,
+    [x, epsilon, z]: [&CudaView<'_, f32>; 3],
+    step: ReverseStep,
+) -> Result<CudaSlice<f32>> {
+    let count = x.len();
+    assert!(epsilon.len() == count && z.len() == count, "equally many numbers");
+    let function = module(stream)?.load_function("reverse_step")?;
+    // SAFETY: the kernel writes every number.
+    let mut out = unsafe { stream.alloc::<f32>(count)? };
+    let all = count as u32;
+    let mut launch = stream.launch_builder(&function);
+    launch.arg(x).arg(epsilon).arg(z).arg(&mut out).arg(&all);
+    launch.arg(&step.deviation).arg(&step.scale).arg(&step.clean_bound).arg(&step.from_clean);
+    launch.arg(&step.from_noisy).arg(&step.noise).arg(&step.bound);
+    // SAFETY: the arguments are those of the kernel, and the lengths were checked above.
+    unsafe { launch.launch(threads(count))? };
+    Ok(out)
+}
+
+/// Adam's step, as [`crate::optimiser::adam`]; the gradient is scaled down to the norm `clip` if it is longer. Gives its norm
+/// before that.
+pub fn adam(
+    stream: &Arc<CudaStream>,
+    parameters: &mut CudaViewMut<'_, f32>,
+    moments: &mut CudaViewMut<'_, f32>,
+    gradient: &CudaView<'_, f32>,
+    clip: f32,
+    rates: AdamRates,
+) -> Result<CudaSlice<f32>> {
+    let count = gradient.len();
+    assert!(parameters.len() == count && moments.len() == 2 * count, "two moments of each number");
+    let module = module(stream)?;
+    let (squares, adam) = (module.load_function("squares")?, module.load_function("adam")?);
+    // SAFETY: the kernels write every number.
+    let (mut partial, mut norm) = unsafe { (stream.alloc::<f32>(SUMS)?, stream.alloc::<f32>(1)?) };
+    let all = count as u32;
+    let mut launch = stream.launch_builder(&squares);
+    launch.arg(gradient).arg(&mut partial).arg(&all);
+    // SAFETY: the arguments are those of the kernel, which has a block for each of the sums.
+    unsafe { launch.launch(threads(SUMS * BLOCK as usize))? };
+    let (mut first, mut second) = moments.split_at_mut(count);
+    let mut launch = stream.launch_builder(&adam);
+    launch.arg(parameters).arg(&mut first).arg(&mut second).arg(gradient).arg(&partial).arg(&mut norm);
+    launch.arg(&all).arg(&clip).arg(&rates.rate).arg(&rates.decay).arg(&rates.correction);
+    // SAFETY: the arguments are those of the kernel, and the lengths were checked above.
+    unsafe { launch.launch(threads(count))? };
+    Ok(norm)
+}
+
+/// `target += rate·(online - target)`.
+pub fn ema(
+    stream: &Arc<CudaStream>,
+    target: &mut CudaViewMut<'_, f32>,
+    online: &CudaView<'_, f32>,
+    rate: f32,
+) -> Result<()> {
+    let count = target.len();
+    assert!(online.len() == count, "equally many numbers");
+    let function = module(stream)?.load_function("ema")?;
+    let all = count as u32;
+    let mut launch = stream.launch_builder(&function);
+    launch.arg(target).arg(online).arg(&all).arg(&rate);
+    // SAFETY: the arguments are those of the kernel, and the lengths were checked above.
+    unsafe { launch.launch(threads(count))? };
+    Ok(())
+}

@@ -1,0 +1,75 @@
+//! Candle's tensors on a GPU as the kernels of `quad_kernels::cuda` take them.
+
+use candle_core::cuda_backend::cudarc::driver::{CudaSlice, CudaStream, CudaView, CudaViewMut};
+use candle_core::{CpuStorage, CudaStorage, Error, InplaceOp1, Layout, Result, Shape, Storage, Tensor, bail};
+use quad_kernels::cuda::CudaError;
+use std::cell::Cell;
+use std::sync::Arc;
+
+fn range(layout: &Layout) -> Result<std::ops::Range<usize>> {
+    match layout.contiguous_offsets() {
+        Some((from, to)) => Ok(from..to),
+        None => bail!("a tensor is not contiguous"),
+    }
+}
+
+/// The numbers behind a contiguous layout.
+pub(crate) fn view<'a>(storage: &'a CudaStorage, layout: &Layout) -> Result<CudaView<'a, f32>> {
+    Ok(storage.as_cuda_slice::<f32>()?.slice(range(layout)?))
+}
+
+/// New numbers that `work` has queued on the stream of `storage`.
+pub(crate) fn with_stream(
+    storage: &CudaStorage,
+    work: impl FnOnce(&Arc<CudaStream>) -> std::result::Result<CudaSlice<f32>, CudaError>,
+) -> Result<CudaStorage> {
+    let device = storage.device.clone();
+    let numbers = work(&device.cuda_stream()).map_err(Error::wrap)?;
+    Ok(CudaStorage::wrap_cuda_slice(numbers, device))
+}
+
+/// Hands the numbers of a contiguous tensor to `work`.
+pub(crate) fn read<R>(tensor: &Tensor, work: impl FnOnce(&CudaView<'_, f32>) -> Result<R>) -> Result<R> {
+    let (storage, layout) = tensor.storage_and_layout();
+    match &*storage {
+        Storage::Cuda(storage) => work(&view(storage, layout)?),
+        _ => bail!("a tensor is not on the GPU"),
+    }
+}
+
+/// Has `work` change the numbers of a contiguous tensor in place, on its stream.
+pub(crate) fn modify<R>(
+    tensor: &Tensor,
+    work: impl FnOnce(&Arc<CudaStream>, &mut CudaViewMut<'_, f32>) -> Result<R>,
+) -> Result<R> {
+    /// Candle asks for an operation that could be applied many times; this one is applied once.
+    struct Once<F, R>(Cell<Option<F>>, Cell<Option<R>>);
+    impl<R, F: FnOnce(&Arc<CudaStream>, &mut CudaViewMut<'_, f32>) -> Result<R>> InplaceOp1 for Once<F, R> {
+        fn name(&self) -> &'static str {
+            "modify"
+        }
+
+        fn cpu_fwd(&self, _: &mut CpuStorage, _: &Layout) -> Result<()> {
+            bail!("a tensor is not on the GPU")
+        }
+
+        fn cuda_fwd(&self, storage: &mut CudaStorage, layout: &Layout) -> Result<()> {
+            let stream = storage.device.cuda_stream();
+            let mut numbers = storage.as_cuda_slice_mut::<f32>()?.slice_mut(range(layout)?);
+            if let Some(work) = self.0.take() {
+                self.1.set(Some(work(&stream, &mut numbers)?));
+            }
+            Ok(())
+        }
+    }
+    let once = Once(Cell::new(Some(work)), Cell::new(None));
+    tensor.inplace_op1(&once)?;
+    once.1.take().ok_or_else(|| Error::Msg("a tensor is not on the GPU".into()))
+}
+
+/// Numbers of the GPU as a tensor.
+pub(crate) fn tensor(numbers: CudaSlice<f32>, shape: impl Into<Shape>, like: &Tensor) -> Result<Tensor> {
+    let candle_core::Device::Cuda(device) = like.device() else { bail!("a tensor is not on the GPU") };
+    let storage = Storage::Cuda(CudaStorage::wrap_cuda_slice(numbers, device.clone()));
+    Ok(Tensor::from_storage(storage, shape, candle_core::op::BackpropOp::none(), false))
+}
