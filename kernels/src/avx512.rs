@@ -1,7 +1,7 @@
 //! A dense product for CPUs with AVX-512 that copies little.
 //!
 //! The matrices of these networks fit into a core's own cache, so the copies of both sides that a general library makes
-//! first cost more than they gain (docs/performance.md): the left side is read where it lies, and of the right one a block
+//! first cost more than they gain (benches/README.md): the left side is read where it lies, and of the right one a block
 //! of columns is copied or transposed at a time, to stay in the nearest cache.
 
 use std::arch::x86_64::{

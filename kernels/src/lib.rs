@@ -4,7 +4,7 @@
 //!
 //! - [`product`]: dense products on one thread, in f32 and with operands rounded to bfloat16.
 //! - `packed`: a product's right-hand side, laid out once for many products.
-//! - `avx512`, `avx2`: the products that the libraries at hand do more slowly (docs/performance.md says by how much).
+//! - `avx512`, `avx2`: the products that the libraries at hand do more slowly (kernels/benches/README.md says by how much).
 //! - [`activation`]: Mish and its derivative; [`narrow`]: the first and last layer of a network, fused with it.
 //! - [`optimiser`]: Adam and EMA over whole parameter vectors.
 //! - `cuda`: what of this a GPU does in one launch, with the feature `cuda`.

@@ -48,7 +48,7 @@ impl Compose {
         are_there().then_some(Compose { project, variables, _alone: alone })
     }
 
-    /// Sets one of the variables of docs/operations.md.
+    /// Sets one of the variables of docker-compose.yml.
     pub fn set(&mut self, variable: &'static str, value: &str) {
         self.variables.retain(|(earlier, _)| *earlier != variable);
         self.variables.push((variable, value.to_owned()));

@@ -1,4 +1,4 @@
-//! Prometheus's alert rules: they fire when they should, what they ask for exists, and each is explained.
+//! Prometheus's alert rules: they fire when they should, what they ask for exists, and each says what to do.
 
 use std::collections::BTreeSet;
 use std::fs;
@@ -31,15 +31,14 @@ fn each_fires_when_it_should_and_only_then() {
 }
 
 #[test]
-fn each_is_tested_and_explained_and_asks_for_what_is_documented() {
+fn each_is_tested_and_says_what_to_do_and_asks_for_what_is_documented() {
     let (rules, tests) = (read("deploy/prometheus/alerts.yml"), read("deploy/prometheus/alerts.test.yml"));
-    let (operations, metrics) = (read("docs/operations.md"), read("docs/metrics.md"));
-    let alerts: Vec<&str> = rules.lines().filter_map(|line| line.trim().strip_prefix("- alert: ")).collect();
+    let metrics = read("docs/metrics.md");
+    let alerts: Vec<_> = rules.split("- alert: ").skip(1).filter_map(|rule| rule.split_once('\n')).collect();
     assert!(alerts.len() > 10, "{alerts:?}");
-    for alert in alerts {
-        assert!(operations.contains(&format!("\n### {alert}\n")), "docs/operations.md has no section {alert}");
-        let runbook = format!("runbook: docs/operations.md#{}\n", alert.to_ascii_lowercase());
-        assert!(rules.contains(&runbook), "{alert} does not lead to its section");
+    for (alert, rule) in alerts {
+        let said = rule.split_once("description: >-\n").map_or(0, |(_, text)| text.split_whitespace().count());
+        assert!(rule.contains("summary: ") && said >= 15, "{alert} says too little of what to do");
         assert!(tests.contains(&format!("alertname=\"{alert}\"")), "{alert} fires in no test");
     }
     let words = rules.split(|c: char| !c.is_ascii_alphanumeric() && c != '_');
