@@ -1,7 +1,8 @@
 //! An algorithm at work in a run: counts its updates, hands over its policy, and saves and loads its whole state.
 
-use crate::algorithm::{Algorithm, AlgorithmError, Definition, Metric};
+use crate::algorithm::{Algorithm, AlgorithmError};
 use crate::context::Context;
+use crate::definition::{Definition, Metric};
 #[cfg(test)]
 use crate::parts::Parts;
 use crate::pool::run_awake;
@@ -17,6 +18,8 @@ pub struct Agent {
     definition: Definition,
     algorithm: Box<dyn Algorithm>,
     device: Device,
+    /// Transitions in the dataset.
+    transitions: usize,
     /// The maps between the data's units and the algorithm's, unless they are the same.
     scaling: Option<Scaling>,
     /// Updates done.
@@ -53,9 +56,10 @@ impl Agent {
     /// # Errors
     /// They cannot be used, or candle fails.
     pub fn new(definition: Definition, table: &toml::Table, context: Context) -> Result<Self, AlgorithmError> {
-        let device = context.device.clone();
+        let (device, transitions) = (context.device.clone(), context.transitions.len());
         let scaling = Some(context.transitions.scaling().clone()).filter(|scaling| *scaling != Scaling::default());
-        Ok(Self { definition, algorithm: (definition.start)(table, context)?, device, scaling, step: 0 })
+        let algorithm = (definition.start)(table, context)?;
+        Ok(Self { definition, algorithm, device, transitions, scaling, step: 0 })
     }
 
     /// The algorithm's state.
@@ -66,7 +70,7 @@ impl Agent {
 
     /// How many items updates draw from.
     pub fn items(&self) -> usize {
-        self.algorithm.items()
+        self.algorithm.items(self.transitions)
     }
 
     /// What an update measures.
@@ -74,23 +78,34 @@ impl Agent {
         self.definition.metrics
     }
 
+    /// The steps at which phases begin whose updates take another time than those before.
+    pub fn phases(&self) -> Vec<u64> {
+        self.algorithm.phases()
+    }
+
     /// Updates done.
     pub fn step(&self) -> u64 {
         self.step
     }
 
-    /// One update on the items of these numbers. Gives the values of the metrics, in their order.
+    /// Goes on as if so many updates were done, to measure what those of a later phase take.
+    pub fn skip_to(&mut self, step: u64) {
+        self.step = step;
+    }
+
+    /// One update on the items of these numbers. Gives the values of the metrics, in the order of their table.
     ///
     /// # Errors
     /// Candle fails.
     pub fn update(&mut self, items: &[u32]) -> Result<Vec<f32>, AlgorithmError> {
         let (algorithm, step) = (&mut self.algorithm, self.step);
-        let values = match self.device.is_cpu() {
+        let measured = match self.device.is_cpu() {
             true => run_awake(|| algorithm.update(step, items))?,
             false => algorithm.update(step, items)?,
         };
         self.step += 1;
-        Ok(values)
+        let value = |name| measured.iter().find(|(known, _)| *known == name).map_or(0.0, |(_, value)| *value);
+        Ok(self.metrics().iter().map(|metric| value(metric.name)).collect())
     }
 
     /// The file of the policy as it is now, which says where it is from.

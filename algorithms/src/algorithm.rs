@@ -1,55 +1,31 @@
-//! What the learner and an algorithm know of each other: hyper-parameters, an update, a policy to publish, a state
-//! as one list of named parts, and a table of metrics.
+//! An algorithm in the middle of a run: its update, the policy to publish, its state as one list of named parts, and its errors.
 
 use candle_core::{Result, Tensor};
 use quad_policy::{PolicyConfig, PolicyError, Tensors};
-use serde::de::DeserializeOwned;
 
-use super::context::Context;
 use super::parts::Parts;
 
-/// What is known of an algorithm before it runs.
-#[derive(Clone, Copy)]
-pub struct Definition {
-    /// Its name on the command line and in files.
-    pub name: &'static str,
-    /// The file of its values for each task, `presets/NAME.toml`.
-    pub settings: &'static str,
-    /// The hyper-parameter that tells its variants apart in run names and tables, if it has any.
-    pub variant: Option<&'static str>,
-    /// What each update measures, in the order of the values that it gives.
-    pub metrics: &'static [Metric],
-    /// Checks its hyper-parameters, the `[agent]` table of a preset.
-    pub check: fn(&toml::Table) -> std::result::Result<(), AgentError>,
-    /// The algorithm at step 0, of such a table.
-    pub start: fn(&toml::Table, Context) -> Started,
-}
-
-/// An algorithm, or why it cannot start.
-pub type Started = std::result::Result<Box<dyn Algorithm>, AlgorithmError>;
-
-/// A number that an update measures. Gauges, `metrics.jsonl`, the progress display and docs/metrics.md derive from it.
-#[derive(Clone, Copy, Debug)]
-pub struct Metric {
-    /// Its name in `metrics.jsonl`; Prometheus sees `quad_learner_<name>`.
-    pub name: &'static str,
-    /// What it is, with its equation and, where it has one, its unit.
-    pub help: &'static str,
-    /// What the progress display calls it; empty where it does not show it.
-    pub label: &'static str,
-}
+/// What an update measured, by the names in the algorithm's table of metrics.
+pub type Measured = Vec<(&'static str, f32)>;
 
 /// An algorithm in the middle of a run.
 pub trait Algorithm: Send {
-    /// How many items updates draw from: the transitions, unless it says otherwise.
-    fn items(&self) -> usize;
+    /// How many items updates draw from, of a dataset with so many transitions: these, unless it says otherwise.
+    fn items(&self, transitions: usize) -> usize {
+        transitions
+    }
+
+    /// The steps at which phases begin whose updates take another time than those before; one phase, unless it says otherwise.
+    fn phases(&self) -> Vec<u64> {
+        vec![0]
+    }
 
     /// Update number `step`, from 0, on the items of these numbers; its random numbers are a function of the run's seed and of
-    /// `step`. Gives the values of the algorithm's metrics.
+    /// `step`.
     ///
     /// # Errors
     /// Candle fails.
-    fn update(&mut self, step: u64, items: &[u32]) -> Result<Vec<f32>>;
+    fn update(&mut self, step: u64, items: &[u32]) -> Result<Measured>;
 
     /// The policy to be evaluated: what it is, and its tensors.
     ///
@@ -70,9 +46,27 @@ pub enum AlgorithmError {
     /// Its hyper-parameters cannot be used.
     #[error(transparent)]
     Agent(#[from] AgentError),
+    /// The dataset has nothing that the algorithm learns from.
+    #[error("no transition of the dataset has a next action, which this algorithm learns from")]
+    NoNextAction,
     /// A tensor cannot be computed or moved.
     #[error("candle failed")]
     Candle(#[from] candle_core::Error),
+}
+
+impl AlgorithmError {
+    /// What the user can do about it.
+    pub fn hint(&self) -> &'static str {
+        match self {
+            Self::NoNextAction => {
+                "a transition has one if the next row of the file continues its episode: `learner datasets inspect` says how long \
+                 episodes are; other algorithms learn from single transitions (--algorithm iql, say)"
+            }
+            Self::Policy(_) | Self::Agent(_) | Self::Candle(_) => {
+                "`learner presets TASK` prints hyper-parameters that work; smaller networks and batches take less memory"
+            }
+        }
+    }
 }
 
 /// Hyper-parameters that cannot be used.
@@ -93,12 +87,7 @@ pub enum AgentError {
     },
 }
 
-/// Reads a table of hyper-parameters, whose types say their ranges.
-pub(super) fn read<T: DeserializeOwned>(table: &toml::Table) -> std::result::Result<T, AgentError> {
-    Ok(T::deserialize(table.clone())?)
-}
-
-/// That a hyper-parameter is in its range.
+/// Checks that a hyper-parameter is in its range.
 pub(super) fn check(
     field: &'static str,
     value: impl ToString,
@@ -108,14 +97,20 @@ pub(super) fn check(
     if holds { Ok(()) } else { Err(AgentError::Range { field, value: value.to_string(), range }) }
 }
 
-/// The smaller of the critics' values, `[K, B]` → `[B]`. (A minimum would drop a NaN; zero times the sum does not.)
+/// The smaller of the critics' values, `[K, B]` → `[B]`. (`min` ignores NaN; adding 0·sum keeps it.)
 pub(super) fn smaller(values: &Tensor) -> Result<Tensor> {
     values.min(0)? + (values.sum(0)? * 0.0)?
 }
 
-/// The largest along a dimension, which is no more. (A maximum would drop a NaN; zero times the sum does not.)
+/// The largest along a dimension, which it removes. (`max` ignores NaN; adding 0·sum keeps it.)
 pub(super) fn largest(values: &Tensor, dimension: usize) -> Result<Tensor> {
     values.max(dimension)? + (values.sum(dimension)? * 0.0)?
+}
+
+/// Scalars `[]` by their names.
+pub(super) fn measured<const N: usize>(scalars: [(&'static str, &Tensor); N]) -> Result<Measured> {
+    let values = numbers(&scalars.map(|(_, scalar)| scalar))?;
+    Ok(scalars.into_iter().map(|(name, _)| name).zip(values).collect())
 }
 
 /// The numbers of some tensors, one tensor after the other; from a GPU in one copy, because each copy waits for the GPU.

@@ -8,63 +8,45 @@
 #[path = "golden/align_iql.rs"]
 mod golden;
 
-use super::algorithm::{Algorithm, AlgorithmError, Definition, Metric, numbers, read, smaller};
+use super::algorithm::{Measured, measured, smaller};
 use super::context::{Context, Minibatch};
-use super::diffusion::{Denoising, noise_predictor};
+use super::definition::{Definition, Metric, Reporting, metrics, read, readable};
+use super::denoising::Denoising;
+use super::diffusion::{Diffusion, Networks, Update};
 use super::hyperparameters::{Candidates, Count, NotNegative, Positive, Quantile, Rate, Share};
 use super::iql::expectile_loss;
 use super::parts::Parts;
-use super::random::{Purpose, stream};
 use super::trained::{Trained, ensemble};
-use candle_core::Result;
+use candle_core::{Device, Result};
 use quad_policy::{
-    AdamStep, Choice, DiffusionPolicy, DiffusionShape, Ensemble, EnsembleShape, Gradients, MlpConfig, NoisePredictor,
-    PolicyConfig, Reduce, Reverse, Rule, Tensors, cosine_decay,
+    AdamStep, Choice, DiffusionPolicy, DiffusionShape, Ensemble, EnsembleShape, MlpConfig, Reduce, Reverse, Rule,
+    Tensors, cosine_decay,
 };
+use rand_chacha::ChaCha8Rng;
 use serde::Deserialize;
 
 /// What the learner has to know of it.
 pub(super) const DEFINITION: Definition = Definition {
     name: "align-iql",
     settings: include_str!("../../presets/align-iql.toml"),
-    variant: None,
     metrics: METRICS,
-    check: |table| read::<Config>(table).map(drop),
-    start: |table, context| Ok(Box::new(AlignIql::new(read(table)?, context)?)),
+    report: Reporting { counts: &["candidates"], ..Reporting::PLAIN },
+    check: readable::<Config>,
+    start: |table, context| Ok(Box::new(read::<Config>(table)?.start(context)?)),
 };
 
 /// Critics, of whose values the smaller counts.
 const CRITICS: usize = 2;
 
-const METRICS: &[Metric] = &[
-    Metric {
-        name: "q_mean",
-        label: "",
-        help: "Mean over the batch of the critics' target y = r + γ·mask·V(s') (IQL's Eq. 6).",
-    },
-    Metric { name: "v_mean", label: "V", help: "Mean over the batch of the value V(s) after its step." },
-    Metric {
-        name: "value_loss",
-        label: "value loss",
-        help: "Expectile loss of V: mean over the batch of |expectile − 1(u < 0)|·u² with u = min_k Q̂_k(s, a) − V(s) (IQL's Eq. 5).",
-    },
-    Metric {
-        name: "critic_loss",
-        label: "critic loss",
-        help: "Mean over critics and batch of (Q_k(s, a) − y)² (IQL's Eq. 6).",
-    },
-    Metric {
-        name: "bc_loss",
-        label: "BC loss",
-        help: "Mean over the batch of the sum over dimensions of (ε − ε_θ(a^t, s, t))². The number of dimensions is a predictor that always says 0.",
-    },
-    Metric {
-        name: "advantage_mean",
-        label: "",
-        help: "Mean over the batch of the advantage min_k Q̂_k(s, a) − V(s): the policy takes the sample for which it is closest to 0.",
-    },
-    Metric { name: "learning_rate", label: "", help: "The actor's learning rate; falls to 0 along a cosine." },
-];
+const METRICS: &[Metric] = &metrics! {
+    q_mean: "Mean over the batch of the critics' target y = r + γ·mask·V(s') (IQL's Eq. 6).";
+    v_mean ["V"]: "Mean over the batch of the value V(s) after its step.";
+    value_loss ["value loss"]: "Expectile loss of V: mean over the batch of |expectile − 1(u < 0)|·u² with u = min_k Q̂_k(s, a) − V(s) (IQL's Eq. 5).";
+    critic_loss ["critic loss"]: "Mean over critics and batch of (Q_k(s, a) − y)² (IQL's Eq. 6).";
+    bc_loss ["BC loss"]: "Mean over the batch of the sum over dimensions of (ε − ε_θ(a^t, s, t))². A network that always outputs 0 has the number of dimensions as its loss.";
+    advantage_mean: "Mean over the batch of the advantage min_k Q̂_k(s, a) − V(s): the policy takes the sample for which it is closest to 0.";
+    learning_rate: "The actor's learning rate; falls to 0 along a cosine.";
+};
 
 /// AlignIQL's hyper-parameters: the `[agent]` table of a preset.
 #[derive(Deserialize)]
@@ -92,115 +74,88 @@ struct Config {
     candidates: Candidates,
 }
 
-/// AlignIQL in the middle of a run.
+/// AlignIQL beside its diffusion policy and critics.
 struct AlignIql {
     config: Config,
-    context: Context,
-    shape: DiffusionShape,
-    /// ε_θ and its EMA.
-    actor: Trained<NoisePredictor>,
-    target_actor: NoisePredictor,
-    /// Q_1 and Q_2, and their EMA Q̂.
-    critics: Trained<Ensemble>,
-    target_critics: Ensemble,
     /// V.
     value: Trained<Ensemble>,
 }
 
-impl AlignIql {
-    fn new(config: Config, context: Context) -> std::result::Result<Self, AlgorithmError> {
+impl Config {
+    fn start(self, context: Context) -> Result<Diffusion<AlignIql>> {
         let shape = DiffusionShape {
             observation_dim: context.observation_dim(),
             action_dim: context.action_dim(),
-            actor: config.actor.clone(),
-            critic: config.critic.clone(),
-            value: Some(config.value.clone()),
+            actor: self.actor.clone(),
+            critic: self.critic.clone(),
+            value: Some(self.value.clone()),
             critics: CRITICS,
-            diffusion_steps: *config.diffusion_steps,
+            diffusion_steps: *self.diffusion_steps,
             reverse: Reverse::ClipSample,
         };
-        let (actor, target_actor) = noise_predictor(shape.actor(), *config.weight_decay, &context, 0)?;
-        let critics = ensemble(shape.critics(), &context, 1)?;
-        let value = EnsembleShape { members: 1, action_dim: 0, layers: config.value.clone(), ..shape.critics() };
-        Ok(Self {
-            actor,
-            target_actor,
-            target_critics: critics.network.copy()?,
-            critics,
-            value: ensemble(value, &context, 2)?,
-            shape,
-            config,
-            context,
+        let value = EnsembleShape { members: 1, action_dim: 0, layers: self.value.clone(), ..shape.critics() };
+        let value = ensemble(value, &context, 2)?;
+        Ok(Diffusion {
+            networks: Networks::new(shape, *self.weight_decay, context)?,
+            update: AlignIql { config: self, value },
         })
-    }
-
-    fn noise(&self, step: u64) -> Result<Denoising> {
-        let mut generator = stream(self.context.seed, Purpose::Noise, step);
-        Denoising::draw(self.actor.network.shape(), self.context.batch_size, &mut generator, &self.context.device)
-    }
-
-    fn step(&mut self, step: u64, batch: &Minibatch, noise: &Denoising) -> Result<Vec<f32>> {
-        let adam = |rate: f32| AdamStep { rate, clip: None, count: step + 1 };
-
-        // The policy: cloning, whatever the actions are worth.
-        let noisy = noise.noisy(self.actor.network.schedule(), &batch.actions)?;
-        let predicted = self.actor.network.predict(&batch.observations, &noisy.actions, &noisy.t)?;
-        let bc_loss = (predicted - &noise.epsilon)?.sqr()?.sum(1)?.mean_all()?;
-        let rate = *self.config.actor_learning_rate * cosine_decay(step, self.context.total_steps);
-        self.actor.descend(&Gradients::of(&bc_loss)?, adam(rate))?;
-        self.target_actor.weights_mut().ema_update(self.actor.network.weights(), *self.config.actor_ema_rate)?;
-
-        // V(s) towards an expectile of the smaller Q̂(s, a), IQL's Eq. 5.
-        let q = smaller(&self.target_critics.values(&batch.observations, &batch.actions)?)?;
-        let u = (&q - self.value.network.state_values(&batch.observations)?.squeeze(0)?)?;
-        let value_loss = expectile_loss(&u, *self.config.expectile)?;
-        self.value.descend(&Gradients::of(&value_loss)?, adam(*self.config.value_learning_rate))?;
-
-        // Q(s, a) towards r + γ·V(s'), IQL's Eq. 6.
-        let value = self.value.network.detach();
-        let next = value.state_values(&batch.next_observations)?.squeeze(0)?;
-        let targets = batch.target(*self.config.gamma, &next)?;
-        let critic_loss = self.critics.network.squared_error(&batch.observations, &batch.actions, &targets)?;
-        self.critics.descend(&Gradients::of(&critic_loss)?, adam(*self.config.critic_learning_rate))?;
-        self.target_critics.weights_mut().ema_update(self.critics.network.weights(), *self.config.ema_rate)?;
-
-        let v = value.state_values(&batch.observations)?.squeeze(0)?;
-        let mut metrics = numbers(&[
-            &targets.mean_all()?,
-            &v.mean_all()?,
-            &value_loss,
-            &critic_loss,
-            &bc_loss,
-            &(q - &v)?.mean_all()?,
-        ])?;
-        metrics.push(rate);
-        Ok(metrics)
     }
 }
 
-impl Algorithm for AlignIql {
-    fn items(&self) -> usize {
-        self.context.transitions.len()
+impl Update for AlignIql {
+    type Noise = Denoising;
+
+    fn noise(&self, networks: &Networks, generator: &mut ChaCha8Rng) -> Result<Denoising> {
+        networks.denoising(generator)
     }
 
-    fn update(&mut self, step: u64, items: &[u32]) -> Result<Vec<f32>> {
-        let (batch, noise) = (self.context.batch(items)?, self.noise(step)?);
-        self.step(step, &batch, &noise)
+    fn step(&mut self, networks: &mut Networks, step: u64, batch: &Minibatch, noise: &Denoising) -> Result<Measured> {
+        let Self { config, value } = self;
+        let adam = |rate: f32| AdamStep { rate, clip: None, count: step + 1 };
+
+        // The policy: cloning, whatever the actions are worth.
+        let (_, predicted) = networks.denoise(batch, noise)?;
+        let Networks { context, actor, target_actor, critics, target_critics, .. } = networks;
+        let bc_loss = (predicted - &noise.epsilon)?.sqr()?.sum(1)?.mean_all()?;
+        let rate = *config.actor_learning_rate * cosine_decay(step, context.total_steps);
+        actor.descend(&bc_loss, adam(rate))?;
+        target_actor.weights_mut().ema_update(actor.network.weights(), *config.actor_ema_rate)?;
+
+        // V(s) towards an expectile of the smaller Q̂(s, a), IQL's Eq. 5.
+        let q = smaller(&target_critics.values(&batch.observations, &batch.actions)?)?;
+        let u = (&q - value.network.state_values(&batch.observations)?.squeeze(0)?)?;
+        let value_loss = expectile_loss(&u, *config.expectile)?;
+        value.descend(&value_loss, adam(*config.value_learning_rate))?;
+
+        // Q(s, a) towards r + γ·V(s'), IQL's Eq. 6.
+        let value = value.network.detach();
+        let next = value.state_values(&batch.next_observations)?.squeeze(0)?;
+        let targets = batch.target(*config.gamma, &next)?;
+        let critic_loss = critics.network.squared_error(&batch.observations, &batch.actions, &targets)?;
+        critics.descend(&critic_loss, adam(*config.critic_learning_rate))?;
+        target_critics.weights_mut().ema_update(critics.network.weights(), *config.ema_rate)?;
+
+        let v = value.state_values(&batch.observations)?.squeeze(0)?;
+        let mut measured = measured([
+            ("q_mean", &targets.mean_all()?),
+            ("v_mean", &v.mean_all()?),
+            ("value_loss", &value_loss),
+            ("critic_loss", &critic_loss),
+            ("bc_loss", &bc_loss),
+            ("advantage_mean", &(q - &v)?.mean_all()?),
+        ])?;
+        measured.push(("learning_rate", rate));
+        Ok(measured)
     }
 
-    /// Of the EMA actor's samples the one with the largest −(Q − V)²: the constraint Q = V of the aligned policy, as a penalty.
-    fn policy(&self) -> Result<(PolicyConfig, Tensors)> {
-        let tensors = DiffusionPolicy::tensors(&self.target_actor, &self.target_critics, Some(&self.value.network))?;
-        let choice = Choice { candidates: *self.config.candidates, value: Reduce::Min, rule: Rule::Nearest };
-        Ok((PolicyConfig::Diffusion { shape: self.shape.clone(), choice }, tensors))
+    /// Takes the EMA actor's sample with the largest −(Q − V)²: the constraint Q = V of the aligned policy, as a penalty.
+    fn policy(&self, networks: &Networks) -> Result<(Choice, Tensors)> {
+        let Networks { target_actor, target_critics, .. } = networks;
+        let tensors = DiffusionPolicy::tensors(target_actor, target_critics, Some(&self.value.network))?;
+        Ok((Choice { candidates: *self.config.candidates, value: Reduce::Min, rule: Rule::Nearest }, tensors))
     }
 
-    fn parts(&mut self) -> Parts<'_> {
-        Parts::default()
-            .trained("actor", &mut self.actor)
-            .trained("value", &mut self.value)
-            .trained("critic", &mut self.critics)
-            .weights("target_actor", self.target_actor.weights_mut())
-            .weights("target_critic", self.target_critics.weights_mut())
+    fn parts<'a>(&'a mut self, parts: Parts<'a>, _: &'a Device) -> Parts<'a> {
+        parts.trained("value", &mut self.value)
     }
 }

@@ -1,73 +1,115 @@
-//! What the algorithms that train a diffusion policy share: a noise predictor with its EMA, the random numbers of a reverse
-//! chain, and noisy actions to learn to denoise.
+//! What algorithms share that train a diffusion policy and critics: their networks with the EMAs, and everything that is no
+//! equation. An algorithm of this kind is its [`Update`].
 
-use super::context::Context;
-use super::trained::{Trained, initial};
-use candle_core::{Device, Result, Shape, Tensor};
-use quad_policy::{NoisePredictor, NoiseShape, Schedule};
-use rand::Rng;
-use rand_distr::{Distribution, StandardNormal};
+use super::algorithm::{Algorithm, Measured};
+use super::context::{Context, Minibatch};
+use super::denoising::{Denoising, Noisy, normal};
+use super::parts::Parts;
+use super::random::{Purpose, stream};
+use super::trained::{Trained, ensemble, initial};
+use candle_core::{Device, Result, Tensor};
+use quad_policy::{Choice, DiffusionShape, Ensemble, NoisePredictor, PolicyConfig, Tensors};
+use rand_chacha::ChaCha8Rng;
 
-/// A noise predictor to be trained, at its beginning, whose weights decay so much; and a copy that is to follow it.
-pub(super) fn noise_predictor(
-    shape: NoiseShape,
-    decay: f32,
-    context: &Context,
-    network: u64,
-) -> Result<(Trained<NoisePredictor>, NoisePredictor)> {
-    let weights = initial(&shape.layout(), context, network)?;
-    let target = NoisePredictor::new(shape.clone(), weights.copy()?, context.precision);
-    Ok((Trained::new(NoisePredictor::new(shape, weights, context.precision), decay)?, target))
+/// The networks of such an algorithm, and what they learn from.
+pub(super) struct Networks {
+    pub context: Context,
+    pub shape: DiffusionShape,
+    /// ε_θ and its EMA.
+    pub actor: Trained<NoisePredictor>,
+    pub target_actor: NoisePredictor,
+    /// Q_1..Q_K and their EMA Q̂.
+    pub critics: Trained<Ensemble>,
+    pub target_critics: Ensemble,
 }
 
-/// Standard normal numbers.
-fn normal(shape: impl Into<Shape>, generator: &mut impl Rng, device: &Device) -> Result<Tensor> {
-    let shape = shape.into();
-    let numbers: Vec<f32> = (0..shape.elem_count()).map(|_| StandardNormal.sample(generator)).collect();
-    Tensor::from_vec(numbers, shape, device)
-}
-
-/// The noise of so many sampled actions, `[T, rows, a]`: a^T, then that of the reverse steps from t = T down to 2.
-pub(super) fn chain_noise(
-    shape: &NoiseShape,
-    rows: usize,
-    generator: &mut impl Rng,
-    device: &Device,
-) -> Result<Tensor> {
-    normal((shape.diffusion_steps, rows, shape.action_dim), generator, device)
-}
-
-/// How the actions of a batch are made noisy.
-pub(super) struct Denoising {
-    /// Denoising step of each, in 1..=T, `[B]`.
-    pub t: Vec<u32>,
-    /// The noise ε that is to be predicted, `[B, a]`.
-    pub epsilon: Tensor,
-}
-
-/// Noisy actions.
-pub(super) struct Noisy {
-    /// a^t = √ᾱ_t·a + √(1 − ᾱ_t)·ε, `[B, a]`.
-    pub actions: Tensor,
-    /// √(1 − ᾱ_t), in all columns of a row, `[B, a]`.
-    pub deviation: Tensor,
-    /// t, `[B]`.
-    pub t: Tensor,
-}
-
-impl Denoising {
-    /// For a batch of so many actions; each t is as likely.
-    pub fn draw(shape: &NoiseShape, batch: usize, generator: &mut impl Rng, device: &Device) -> Result<Self> {
-        let epsilon = normal((batch, shape.action_dim), generator, device)?;
-        let t = (0..batch).map(|_| generator.random_range(1..=shape.diffusion_steps as u32)).collect();
-        Ok(Self { t, epsilon })
+impl Networks {
+    /// At step 0; each step takes the share `actor_decay` of its rate off the actor's weights.
+    pub fn new(shape: DiffusionShape, actor_decay: f32, context: Context) -> Result<Self> {
+        let weights = initial(&shape.actor().layout(), &context, 0)?;
+        let target_actor = NoisePredictor::new(shape.actor(), weights.copy()?, context.precision);
+        let actor = NoisePredictor::new(shape.actor(), weights, context.precision);
+        let critics = ensemble(shape.critics(), &context, 1)?;
+        Ok(Self {
+            actor: Trained::new(actor, actor_decay)?,
+            target_actor,
+            target_critics: critics.network.copy()?,
+            critics,
+            shape,
+            context,
+        })
     }
 
-    /// Actions `[B, a]`, made noisy.
-    pub fn noisy(&self, schedule: &Schedule, actions: &Tensor) -> Result<Noisy> {
-        let device = actions.device();
-        let (signal, deviation) = schedule.noising(&self.t, actions.dim(1)?, device)?;
-        let actions = ((actions * signal)? + (&self.epsilon * &deviation)?)?;
-        Ok(Noisy { actions, deviation, t: Tensor::from_slice(&self.t, self.t.len(), device)? })
+    /// The noise of S sampled actions for each state of a batch, `[T, B·S, a]`: a^T, then that of the reverse steps from t = T
+    /// down to 2.
+    pub fn chain_noise(&self, samples: usize, generator: &mut ChaCha8Rng) -> Result<Tensor> {
+        let DiffusionShape { diffusion_steps, action_dim, .. } = self.shape;
+        normal((diffusion_steps, self.context.batch_size * samples, action_dim), generator, &self.context.device)
+    }
+
+    /// t and ε for the actions of a batch.
+    pub fn denoising(&self, generator: &mut ChaCha8Rng) -> Result<Denoising> {
+        Denoising::draw(self.actor.network.shape(), self.context.batch_size, generator, &self.context.device)
+    }
+
+    /// The batch's actions made noisy, and the noise that the actor predicts in them, `[B, a]`.
+    pub fn denoise(&self, batch: &Minibatch, noise: &Denoising) -> Result<(Noisy, Tensor)> {
+        let noisy = noise.noisy(self.actor.network.schedule(), &batch.actions)?;
+        let predicted = self.actor.network.predict(&batch.observations, &noisy.actions, &noisy.t)?;
+        Ok((noisy, predicted))
+    }
+}
+
+/// The equations of one algorithm: its hyper-parameters, with what its updates change beside the networks.
+pub(super) trait Update: Send {
+    /// The random numbers of one update.
+    type Noise;
+
+    fn noise(&self, networks: &Networks, generator: &mut ChaCha8Rng) -> Result<Self::Noise>;
+
+    /// Update number `step`, from 0.
+    fn step(&mut self, networks: &mut Networks, step: u64, batch: &Minibatch, noise: &Self::Noise) -> Result<Measured>;
+
+    /// How the policy chooses among its samples, and its tensors.
+    fn policy(&self, networks: &Networks) -> Result<(Choice, Tensors)>;
+
+    /// Adds what updates change beside the networks.
+    fn parts<'a>(&'a mut self, parts: Parts<'a>, _: &'a Device) -> Parts<'a> {
+        parts
+    }
+}
+
+/// Such an algorithm in the middle of a run.
+pub(super) struct Diffusion<U> {
+    pub update: U,
+    pub networks: Networks,
+}
+
+impl<U: Update> Diffusion<U> {
+    /// The random numbers of update number `step`.
+    pub fn noise(&self, step: u64) -> Result<U::Noise> {
+        self.update.noise(&self.networks, &mut stream(self.networks.context.seed, Purpose::Noise, step))
+    }
+}
+
+impl<U: Update> Algorithm for Diffusion<U> {
+    fn update(&mut self, step: u64, items: &[u32]) -> Result<Measured> {
+        let (batch, noise) = (self.networks.context.batch(items)?, self.noise(step)?);
+        self.update.step(&mut self.networks, step, &batch, &noise)
+    }
+
+    fn policy(&self) -> Result<(PolicyConfig, Tensors)> {
+        let (choice, tensors) = self.update.policy(&self.networks)?;
+        Ok((PolicyConfig::Diffusion { shape: self.networks.shape.clone(), choice }, tensors))
+    }
+
+    fn parts(&mut self) -> Parts<'_> {
+        let Networks { context, actor, target_actor, critics, target_critics, .. } = &mut self.networks;
+        let parts = Parts::default()
+            .trained("actor", actor)
+            .trained("critic", critics)
+            .weights("target_actor", target_actor.weights_mut())
+            .weights("target_critic", target_critics.weights_mut());
+        self.update.parts(parts, &context.device)
     }
 }

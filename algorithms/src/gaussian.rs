@@ -39,10 +39,11 @@ impl Gaussian {
         log_density(actions, &gaussian_mean(&self.mean.network, observations)?, &log_std)
     }
 
-    /// Moves mean and log σ.
-    pub fn descend(&mut self, gradients: &Gradients, step: AdamStep) -> Result<()> {
-        self.mean.descend(gradients, step)?;
-        self.log_std.descend(gradients, step)?;
+    /// Moves mean and log σ down a loss `[]`.
+    pub fn descend(&mut self, loss: &Tensor, step: AdamStep) -> Result<()> {
+        let gradients = Gradients::of(loss)?;
+        self.mean.descend_along(&gradients, step)?;
+        self.log_std.descend_along(&gradients, step)?;
         Ok(())
     }
 

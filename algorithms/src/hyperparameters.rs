@@ -52,7 +52,7 @@ checked!(
 );
 checked!(
     /// A number of things: networks, samples, denoising steps.
-    Count(usize), |x| COUNTS.contains(&x), "a whole number from 1 to 1024"
+    Count(usize), |x| COUNTS.contains(&x), "a whole number from 1 to 1000"
 );
 checked!(
     /// A number of gradient steps.
@@ -64,4 +64,5 @@ checked!(
     Candidates(u32), |x| (1..=Choice::MOST_CANDIDATES).contains(&x), "a whole number from 1 to 1000"
 );
 
-const COUNTS: RangeInclusive<usize> = 1..=1024;
+/// What policies are read with: their denoising steps have the same bound.
+const COUNTS: RangeInclusive<usize> = 1..=1000;

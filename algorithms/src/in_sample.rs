@@ -2,14 +2,15 @@
 //! critics' smaller value, a Gaussian policy is cloned from the data with weights, and twin critics move towards r + γ·V(s').
 //! An algorithm of this kind is its [`Losses`].
 
-use super::algorithm::{Algorithm, Metric, numbers, smaller};
+use super::algorithm::{Algorithm, Measured, measured, smaller};
 use super::context::{Context, Minibatch};
+use super::definition::{Metric, metrics};
 use super::gaussian::Gaussian;
 use super::hyperparameters::{Positive, Rate, Share};
 use super::parts::Parts;
 use super::trained::{Trained, ensemble};
 use candle_core::{DType, Result, Tensor};
-use quad_policy::{AdamStep, Ensemble, EnsembleShape, Gradients, MlpConfig, PolicyConfig, Tensors, cosine_decay};
+use quad_policy::{AdamStep, Ensemble, EnsembleShape, MlpConfig, PolicyConfig, Tensors, cosine_decay};
 use serde::Deserialize;
 
 /// Critics, of whose values the smaller counts.
@@ -23,29 +24,25 @@ pub(super) struct Helps {
     pub value_loss: &'static str,
     pub critic_loss: &'static str,
     pub actor_loss: &'static str,
+    pub learning_rate: &'static str,
 }
 
-/// In the order of the values that an update gives.
-pub(super) const fn metrics(helps: Helps) -> [Metric; 9] {
-    [
-        Metric { name: "q_mean", label: "", help: helps.targets },
-        Metric { name: "v_mean", label: "V", help: "Mean over the batch of the value V(s) after its step." },
-        Metric { name: "value_loss", label: "value loss", help: helps.value_loss },
-        Metric { name: "critic_loss", label: "critic loss", help: helps.critic_loss },
-        Metric { name: "actor_loss", label: "actor loss", help: helps.actor_loss },
-        Metric {
-            name: "advantage_mean",
-            label: "",
-            help: "Mean over the batch of the advantage A = min_k Q̂_k(s, a) − V(s).",
-        },
-        Metric { name: "weight_mean", label: "", help: "Mean over the batch of the weights in the actor's loss." },
-        Metric {
-            name: "clipped_share",
-            label: "",
-            help: "Share of the batch, 0 to 1, whose weight is clipped at 100.",
-        },
-        Metric { name: "learning_rate", label: "", help: "The actor's learning rate; falls to 0 along a cosine." },
-    ]
+/// The learning rate where it always decays.
+pub(super) const COSINE: &str = "The actor's learning rate; falls to 0 along a cosine.";
+
+/// The metrics of one algorithm.
+pub(super) const fn table(helps: Helps) -> [Metric; 9] {
+    metrics! {
+        q_mean: helps.targets;
+        v_mean ["V"]: "Mean over the batch of the value V(s) after its step.";
+        value_loss ["value loss"]: helps.value_loss;
+        critic_loss ["critic loss"]: helps.critic_loss;
+        actor_loss ["actor loss"]: helps.actor_loss;
+        advantage_mean: "Mean over the batch of the advantage A = min_k Q̂_k(s, a) − V(s).";
+        weight_mean: "Mean over the batch of the weights in the actor's loss.";
+        clipped_share: "Share of the batch, 0 to 1, whose weight is clipped at 100.";
+        learning_rate: helps.learning_rate;
+    }
 }
 
 /// The hyper-parameters that all have.
@@ -87,6 +84,11 @@ pub(super) trait Losses: Send {
     fn value_steps(&self) -> u64 {
         1
     }
+
+    /// Whether the actor's learning rate falls to 0 along a cosine, or is constant.
+    fn actor_rate_decays(&self) -> bool {
+        true
+    }
 }
 
 /// Such an algorithm in the middle of a run.
@@ -124,7 +126,7 @@ impl<L: Losses> InSample<L> {
     }
 
     /// Update number `step`; `pairs` are what [`Losses::pairs`] gives.
-    pub fn step(&mut self, step: u64, batch: &Minibatch, pairs: Option<(Tensor, Tensor)>) -> Result<Vec<f32>> {
+    pub fn step(&mut self, step: u64, batch: &Minibatch, pairs: Option<(Tensor, Tensor)>) -> Result<Measured> {
         let (common, count) = (self.losses.common(), step + 1);
         let adam = |rate: f32, count: u64| AdamStep { rate, clip: None, count };
 
@@ -139,7 +141,7 @@ impl<L: Losses> InSample<L> {
         for i in 1..=steps {
             value_loss = self.losses.value_loss(&fitted, &self.value.network.state_values(states)?.squeeze(0)?)?;
             let adam = adam(*common.value_learning_rate, step * steps + i);
-            self.value.descend(&Gradients::of(&value_loss)?, adam)?;
+            self.value.descend(&value_loss, adam)?;
         }
 
         // The policy towards actions of the data, the more so the better they are.
@@ -151,38 +153,35 @@ impl<L: Losses> InSample<L> {
         let weight = weight.clamp(0.0, MOST_WEIGHT)?;
         let log_probability = self.actor.log_probability(&batch.observations, &batch.actions)?;
         let actor_loss = (&weight * log_probability)?.mean_all()?.neg()?;
-        let rate = *common.actor_learning_rate * cosine_decay(step, self.context.total_steps);
-        self.actor.descend(&Gradients::of(&actor_loss)?, adam(rate, count))?;
+        let decay = if self.losses.actor_rate_decays() { cosine_decay(step, self.context.total_steps) } else { 1.0 };
+        let rate = *common.actor_learning_rate * decay;
+        self.actor.descend(&actor_loss, adam(rate, count))?;
 
         // Q(s, a) towards r + γ·V(s').
         let next = value.state_values(&batch.next_observations)?.squeeze(0)?;
         let targets = batch.target(*common.gamma, &next)?;
         let values = self.critics.network.values(&batch.observations, &batch.actions)?;
         let critic_loss = self.losses.critic_loss(&values, &targets)?;
-        self.critics.descend(&Gradients::of(&critic_loss)?, adam(*common.critic_learning_rate, count))?;
+        self.critics.descend(&critic_loss, adam(*common.critic_learning_rate, count))?;
         self.target_critics.weights_mut().ema_update(self.critics.network.weights(), *common.ema_rate)?;
 
-        let mut metrics = numbers(&[
-            &targets.mean_all()?,
-            &v.mean_all()?,
-            &value_loss,
-            &critic_loss,
-            &actor_loss,
-            &advantage.mean_all()?,
-            &weight.mean_all()?,
-            &clipped.mean_all()?,
+        let mut measured = measured([
+            ("q_mean", &targets.mean_all()?),
+            ("v_mean", &v.mean_all()?),
+            ("value_loss", &value_loss),
+            ("critic_loss", &critic_loss),
+            ("actor_loss", &actor_loss),
+            ("advantage_mean", &advantage.mean_all()?),
+            ("weight_mean", &weight.mean_all()?),
+            ("clipped_share", &clipped.mean_all()?),
         ])?;
-        metrics.push(rate);
-        Ok(metrics)
+        measured.push(("learning_rate", rate));
+        Ok(measured)
     }
 }
 
 impl<L: Losses> Algorithm for InSample<L> {
-    fn items(&self) -> usize {
-        self.context.transitions.len()
-    }
-
-    fn update(&mut self, step: u64, items: &[u32]) -> Result<Vec<f32>> {
+    fn update(&mut self, step: u64, items: &[u32]) -> Result<Measured> {
         let batch = self.context.batch(items)?;
         let pairs = self.losses.pairs(&self.context, step, &batch)?;
         self.step(step, &batch, pairs)

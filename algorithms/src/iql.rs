@@ -7,9 +7,9 @@
 #[path = "golden/iql.rs"]
 mod golden;
 
-use super::algorithm::{Definition, Metric, read};
+use super::definition::{Definition, Metric, Reporting, read, readable};
 use super::hyperparameters::{Positive, Quantile};
-use super::in_sample::{Common, Helps, InSample, Losses, metrics};
+use super::in_sample::{COSINE, Common, Helps, InSample, Losses, table};
 use candle_core::{DType, Result, Tensor};
 use serde::Deserialize;
 
@@ -17,17 +17,18 @@ use serde::Deserialize;
 pub(super) const DEFINITION: Definition = Definition {
     name: "iql",
     settings: include_str!("../../presets/iql.toml"),
-    variant: None,
     metrics: METRICS,
-    check: |table| read::<Config>(table).map(drop),
+    report: Reporting::PLAIN,
+    check: readable::<Config>,
     start: |table, context| Ok(Box::new(InSample::new(read::<Config>(table)?, context)?)),
 };
 
-const METRICS: &[Metric] = &metrics(Helps {
+const METRICS: &[Metric] = &table(Helps {
     targets: "Mean over the batch of the critics' target y = r + γ·mask·V(s') (IQL's Eq. 6).",
     value_loss: "Expectile loss of V: mean over the batch of |expectile − 1(u < 0)|·u² with u = min_k Q̂_k(s, a) − V(s) (IQL's Eq. 5).",
     critic_loss: "Mean over the batch of the sum over both critics of (Q_k(s, a) − y)² (IQL's Eq. 6).",
     actor_loss: "Mean over the batch of −weight·log π(a|s) with weight = exp(temperature·A), at most 100 (IQL's Eq. 7).",
+    learning_rate: COSINE,
 });
 
 /// IQL's hyper-parameters: the `[agent]` table of a preset.
@@ -42,7 +43,7 @@ struct Config {
     temperature: Positive,
 }
 
-/// Mean of |expectile − 1(u < 0)|·u² (Eq. 5), `[]`: least where u is, by so much, as often above as below 0.
+/// Mean of |expectile − 1(u < 0)|·u² (Eq. 5), `[]`: minimal where V is Q's expectile.
 pub(super) fn expectile_loss(u: &Tensor, expectile: f32) -> Result<Tensor> {
     let expectile = f64::from(expectile);
     let side = u.lt(0f32)?.to_dtype(DType::F32)?.affine(1.0 - 2.0 * expectile, expectile)?;
@@ -59,7 +60,7 @@ impl Losses for Config {
         expectile_loss(&(q - v)?, *self.expectile)
     }
 
-    /// Of Eq. 7.
+    /// The weights of Eq. 7.
     fn weights(&self, advantages: &Tensor) -> Result<Tensor> {
         (advantages * f64::from(*self.temperature))?.exp()
     }

@@ -8,9 +8,9 @@
 #[path = "golden/ivr.rs"]
 mod golden;
 
-use super::algorithm::{Definition, Metric, read};
+use super::definition::{Definition, Metric, Reporting, Variant, read, readable};
 use super::hyperparameters::Positive;
-use super::in_sample::{Common, Helps, InSample, Losses, metrics, scale_down};
+use super::in_sample::{COSINE, Common, Helps, InSample, Losses, scale_down, table};
 use candle_core::{Result, Tensor};
 use serde::Deserialize;
 
@@ -18,9 +18,12 @@ use serde::Deserialize;
 pub(super) const DEFINITION: Definition = Definition {
     name: "ivr",
     settings: include_str!("../../presets/ivr.toml"),
-    variant: Some("divergence"),
     metrics: METRICS,
-    check: |table| read::<Config>(table).map(drop),
+    report: Reporting {
+        variant: Some(Variant { key: "divergence", called: |divergence| format!("ivr {divergence}") }),
+        ..Reporting::PLAIN
+    },
+    check: readable::<Config>,
     start: |table, context| Ok(Box::new(InSample::new(read::<Config>(table)?, context)?)),
 };
 
@@ -29,11 +32,12 @@ const LARGEST_EXPONENT: f64 = 5.0;
 /// EQL's weights are those of an α that is as many times smaller.
 const SHARPER: f64 = 10.0;
 
-const METRICS: &[Metric] = &metrics(Helps {
+const METRICS: &[Metric] = &table(Helps {
     targets: "Mean over the batch of the critics' target y = r + γ·mask·V(s').",
     value_loss: "Mean over the batch, with δ = min_k Q̂_k(s, a) − V(s), of 1(z > 0)·z² + V(s)/α, z = 1 + δ/2α (divergence sparse), or of exp(z − M) + exp(−M)·V(s)/α, z = min(δ/α, 5) and M = max(largest z, −1) (exponential).",
     critic_loss: "Mean over the batch of the sum over both critics of (Q_k(s, a) − y)².",
     actor_loss: "Mean over the batch of −weight·log π(a|s) with weight = A (divergence sparse) or exp(10·A/α) (exponential), between 0 and 100 (IVR's Eq. 14 and 17, with its code's factors).",
+    learning_rate: COSINE,
 });
 
 /// What the policy's distance from the data is measured by.
@@ -95,7 +99,7 @@ impl Losses for Config {
         }
     }
 
-    /// Of Eq. 14 and 17, with the code's factors: SQL's is z − 1, times 2α.
+    /// The weights of Eq. 14 and 17, with the code's factors: SQL's is z − 1, times 2α.
     fn weights(&self, advantages: &Tensor) -> Result<Tensor> {
         match self.divergence {
             Divergence::Sparse => Ok(advantages.clone()),

@@ -1,7 +1,7 @@
 //! Learning algorithms, one file each, to be read beside its paper.
 //!
-//! `algorithm` is all that the learner sees of an algorithm, `agent` an algorithm at work, saved and loaded, and `values` its
-//! values for each task. A new algorithm is a file here, a line in [`ALGORITHMS`] and its values in `presets/`.
+//! `definition` is what is known of an algorithm before it runs, `algorithm` all that the learner sees of it at work, `agent`
+//! an algorithm at work, saved and loaded, and `values` its values for each task. A new algorithm is a file here, a line in [`ALGORITHMS`] and its values in `presets/`.
 
 #![deny(unsafe_code)]
 
@@ -9,6 +9,8 @@ mod agent;
 mod algorithm;
 mod align_iql;
 mod context;
+mod definition;
+mod denoising;
 mod diffusion;
 mod dql;
 mod gaussian;
@@ -26,8 +28,9 @@ mod values;
 mod xql;
 
 pub use agent::{Agent, StateError};
-pub use algorithm::{AgentError, Algorithm, AlgorithmError, Definition, Metric};
+pub use algorithm::{AgentError, Algorithm, AlgorithmError, Measured};
 pub use context::{Context, Minibatch};
+pub use definition::{Axis, Definition, Metric, MetricsLine, Reporting, Summary, Variant};
 pub use parts::Parts;
 pub use values::{Values, fits, merge};
 

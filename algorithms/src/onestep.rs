@@ -7,8 +7,9 @@
 #[path = "golden/onestep.rs"]
 mod golden;
 
-use super::algorithm::{Algorithm, AlgorithmError, Definition, Metric, check, numbers, read};
+use super::algorithm::{Algorithm, AlgorithmError, Measured, measured};
 use super::context::{Context, Minibatch};
+use super::definition::{Definition, Metric, Reporting, metrics, read, readable};
 use super::gaussian::log_density;
 use super::hyperparameters::{Count, Positive, Rate, Share, Steps};
 use super::parts::Parts;
@@ -16,9 +17,7 @@ use super::random::{Purpose, stream};
 use super::trained::{Trained, ensemble};
 use candle_core::{DType, Result, Tensor};
 use quad_dataset::Batch;
-use quad_policy::{
-    AdamStep, Ensemble, EnsembleShape, GaussianPolicy, GaussianShape, Gradients, MlpConfig, PolicyConfig, Tensors,
-};
+use quad_policy::{AdamStep, Ensemble, EnsembleShape, GaussianPolicy, GaussianShape, MlpConfig, PolicyConfig, Tensors};
 use rand_distr::{Distribution, StandardNormal};
 use serde::Deserialize;
 
@@ -26,9 +25,9 @@ use serde::Deserialize;
 pub(super) const DEFINITION: Definition = Definition {
     name: "onestep",
     settings: include_str!("../../presets/onestep.toml"),
-    variant: None,
     metrics: METRICS,
-    check: |table| read::<Config>(table).map(drop),
+    report: Reporting::PLAIN,
+    check: readable::<Config>,
     start: |table, context| Ok(Box::new(Onestep::new(read(table)?, context)?)),
 };
 
@@ -37,44 +36,15 @@ const MOST_WEIGHT: f64 = 100.0;
 /// Bounds of log σ.
 const LOG_STD: (f64, f64) = (-5.0, 0.0);
 
-/// In the order of the values that an update gives; those of other phases than the update's are 0.
-const METRICS: &[Metric] = &[
-    Metric {
-        name: "behavior_loss",
-        label: "behaviour loss",
-        help: "First phase: mean over the batch of −log β(a|s). 0 in the others.",
-    },
-    Metric {
-        name: "critic_loss",
-        label: "critic loss",
-        help: "Second phase: mean over the batch of (Q(s, a) − y)². 0 in the others.",
-    },
-    Metric {
-        name: "q_mean",
-        label: "",
-        help: "Second phase: mean over the batch of the critic's target y = r + γ·mask·Q̂(s', a') with the data's next action a'. 0 in the others.",
-    },
-    Metric {
-        name: "actor_loss",
-        label: "actor loss",
-        help: "Third phase: mean over the batch of −weight·log π(a|s) with weight = exp(temperature·A), at most 100. 0 in the others.",
-    },
-    Metric {
-        name: "advantage_mean",
-        label: "",
-        help: "Third phase: mean over the batch of the advantage A = Q(s, a) − mean of Q(s, ·) over actions that β draws. 0 in the others.",
-    },
-    Metric {
-        name: "weight_mean",
-        label: "",
-        help: "Third phase: mean over the batch of the weights in the actor's loss. 0 in the others.",
-    },
-    Metric {
-        name: "clipped_share",
-        label: "",
-        help: "Third phase: share of the batch, 0 to 1, whose weight is clipped at 100. 0 in the others.",
-    },
-];
+const METRICS: &[Metric] = &metrics! {
+    behavior_loss ["behaviour loss"]: "First phase: mean over the batch of −log β(a|s). 0 in the others.";
+    critic_loss ["critic loss"]: "Second phase: mean over the batch of (Q(s, a) − y)². 0 in the others.";
+    q_mean: "Second phase: mean over the batch of the critic's target y = r + γ·mask·Q̂(s', a') with the data's next action a'. 0 in the others.";
+    actor_loss ["actor loss"]: "Third phase: mean over the batch of −weight·log π(a|s) with weight = exp(temperature·A), at most 100. 0 in the others.";
+    advantage_mean: "Third phase: mean over the batch of the advantage A = Q(s, a) − mean of Q(s, ·) over actions that β draws. 0 in the others.";
+    weight_mean: "Third phase: mean over the batch of the weights in the actor's loss. 0 in the others.";
+    clipped_share: "Third phase: share of the batch, 0 to 1, whose weight is clipped at 100. 0 in the others.";
+};
 
 /// Onestep-RL's hyper-parameters: the `[agent]` table of a preset.
 #[derive(Deserialize)]
@@ -93,9 +63,25 @@ struct Config {
     /// EMA rate of the target critic, which follows after every so many steps.
     ema_rate: Rate,
     ema_every: Steps,
-    /// Lengths of the first two phases; what remains of the run is the third.
-    behavior_steps: Steps,
-    critic_steps: Steps,
+    phases: Phases,
+}
+
+/// The phases' lengths in proportion.
+#[derive(Deserialize)]
+#[serde(deny_unknown_fields)]
+struct Phases {
+    behavior: Steps,
+    critic: Steps,
+    policy: Steps,
+}
+
+impl Phases {
+    /// The steps at which Q's phase and π's begin, in a run of so many.
+    fn begin(&self, total_steps: u64) -> [u64; 2] {
+        let [behavior, critic, policy] = [self.behavior, self.critic, self.policy].map(|share| u128::from(*share));
+        let before = |share| u128::from(total_steps) * share / (behavior + critic + policy);
+        [behavior, behavior + critic].map(|share| before(share) as u64)
+    }
 }
 
 /// What an update does, and how many of its kind came before it.
@@ -122,17 +108,9 @@ struct Onestep {
 
 impl Onestep {
     fn new(config: Config, context: Context) -> std::result::Result<Self, AlgorithmError> {
-        let before = config.behavior_steps.saturating_add(*config.critic_steps);
-        let value = format!(
-            "{} (and critic_steps {}, of {} steps)",
-            *config.behavior_steps, *config.critic_steps, context.total_steps
-        );
-        let range = "so small that steps are left for the policy: give more --steps, or make both smaller";
-        check("behavior_steps", value, before < context.total_steps, range)?;
         let items = items(&context);
         if items.is_empty() {
-            let what = "no transition of the dataset has a next action, which Onestep-RL learns from";
-            return Err(candle_core::Error::msg(what).into());
+            return Err(AlgorithmError::NoNextAction);
         }
         let (observation_dim, action_dim) = (context.observation_dim(), context.action_dim());
         let shape = |action_dim, layers: &MlpConfig, outputs| EnsembleShape {
@@ -150,11 +128,11 @@ impl Onestep {
     }
 
     fn phase(&self, step: u64) -> Phase {
-        let (behavior, critic) = (*self.config.behavior_steps, *self.config.critic_steps);
+        let [critic, policy] = self.config.phases.begin(self.context.total_steps);
         match step {
-            step if step < behavior => Phase::Behavior(step),
-            step if step < behavior + critic => Phase::Critic(step - behavior),
-            step => Phase::Policy(step - behavior - critic),
+            step if step < critic => Phase::Behavior(step),
+            step if step < policy => Phase::Critic(step - critic),
+            step => Phase::Policy(step - policy),
         }
     }
 
@@ -164,30 +142,28 @@ impl Onestep {
     }
 
     /// First phase: β towards the data's actions, and π with it.
-    fn clone_behavior(&mut self, batch: &Minibatch, steps: u64) -> Result<Vec<f32>> {
+    fn clone_behavior(&mut self, batch: &Minibatch, steps: u64) -> Result<Measured> {
         let (mean, log_std) = distribution(&self.behavior.network, &batch.observations)?;
         let loss = log_density(&batch.actions, &mean, &log_std)?.mean_all()?.neg()?;
-        self.behavior.descend(&Gradients::of(&loss)?, self.adam(steps))?;
+        self.behavior.descend(&loss, self.adam(steps))?;
         self.actor.network.weights_mut().ema_update(self.behavior.network.weights(), 1.0)?; // all the way
-        let zero = loss.zeros_like()?;
-        numbers(&[&loss, &zero, &zero, &zero, &zero, &zero, &zero])
+        measured([("behavior_loss", &loss)])
     }
 
     /// Second phase: Q(s, a) towards r + γ·Q̂(s', a'), with the action a' that the data takes next, `[B, a]`.
-    fn evaluate_behavior(&mut self, batch: &Minibatch, next_actions: &Tensor, steps: u64) -> Result<Vec<f32>> {
+    fn evaluate_behavior(&mut self, batch: &Minibatch, next_actions: &Tensor, steps: u64) -> Result<Measured> {
         let next = self.target_critic.values(&batch.next_observations, next_actions)?.squeeze(0)?;
         let targets = batch.target(*self.config.gamma, &next)?;
         let loss = self.critic.network.squared_error(&batch.observations, &batch.actions, &targets)?;
-        self.critic.descend(&Gradients::of(&loss)?, self.adam(steps))?;
+        self.critic.descend(&loss, self.adam(steps))?;
         if (steps + 1).is_multiple_of(*self.config.ema_every) {
             self.target_critic.weights_mut().ema_update(self.critic.network.weights(), *self.config.ema_rate)?;
         }
-        let zero = loss.zeros_like()?;
-        numbers(&[&zero, &loss, &targets.mean_all()?, &zero, &zero, &zero, &zero])
+        measured([("critic_loss", &loss), ("q_mean", &targets.mean_all()?)])
     }
 
     /// Third phase: π towards actions of the data, the more so the better they are than β's.
-    fn improve(&mut self, batch: &Minibatch, noise: &Tensor, steps: u64) -> Result<Vec<f32>> {
+    fn improve(&mut self, batch: &Minibatch, noise: &Tensor, steps: u64) -> Result<Measured> {
         let q = self.critic.network.detach().values(&batch.observations, &batch.actions)?.squeeze(0)?;
         let advantage = (q - self.value(&batch.observations, noise)?)?;
         let weight = (&advantage * f64::from(*self.config.temperature))?.exp()?;
@@ -195,18 +171,21 @@ impl Onestep {
         let weight = weight.minimum(MOST_WEIGHT)?;
         let (mean, log_std) = distribution(&self.actor.network, &batch.observations)?;
         let loss = (&weight * log_density(&batch.actions, &mean, &log_std)?)?.mean_all()?.neg()?;
-        self.actor.descend(&Gradients::of(&loss)?, self.adam(steps))?;
-        let zero = loss.zeros_like()?;
-        let (advantage, weight, clipped) = (advantage.mean_all()?, weight.mean_all()?, clipped.mean_all()?);
-        numbers(&[&zero, &zero, &zero, &loss, &advantage, &weight, &clipped])
+        self.actor.descend(&loss, self.adam(steps))?;
+        measured([
+            ("actor_loss", &loss),
+            ("advantage_mean", &advantage.mean_all()?),
+            ("weight_mean", &weight.mean_all()?),
+            ("clipped_share", &clipped.mean_all()?),
+        ])
     }
 
-    /// The mean of Q(s, ·) over actions that β draws with this noise, `[B, S, a]`; `[B]`.
+    /// The mean of Q(s, ·) over actions that β draws with this noise, `[B, S, a]`, also beyond ±1; `[B]`.
     fn value(&self, observations: &Tensor, noise: &Tensor) -> Result<Tensor> {
         let (b, samples, a) = noise.dims3()?;
         let (mean, log_std) = distribution(&self.behavior.network.detach(), observations)?;
         let spread = noise.broadcast_mul(&log_std.exp()?.unsqueeze(1)?)?;
-        let actions = spread.broadcast_add(&mean.unsqueeze(1)?)?.clamp(-1.0, 1.0)?.reshape((b * samples, a))?;
+        let actions = spread.broadcast_add(&mean.unsqueeze(1)?)?.reshape((b * samples, a))?;
         self.critic.network.detach().values(observations, &actions)?.reshape((b, samples))?.mean(1)
     }
 
@@ -246,11 +225,16 @@ fn distribution(network: &Ensemble, observations: &Tensor) -> Result<(Tensor, Te
 }
 
 impl Algorithm for Onestep {
-    fn items(&self) -> usize {
+    fn items(&self, _: usize) -> usize {
         self.items.len()
     }
 
-    fn update(&mut self, step: u64, items: &[u32]) -> Result<Vec<f32>> {
+    fn phases(&self) -> Vec<u64> {
+        let [critic, policy] = self.config.phases.begin(self.context.total_steps);
+        vec![0, critic, policy]
+    }
+
+    fn update(&mut self, step: u64, items: &[u32]) -> Result<Measured> {
         let rows: Vec<u32> = items.iter().map(|item| self.items[*item as usize]).collect();
         let batch = self.context.batch(&rows)?;
         match self.phase(step) {
@@ -260,7 +244,7 @@ impl Algorithm for Onestep {
         }
     }
 
-    /// Acts by the mean: of the last layer the half that it comes from.
+    /// Acts by the mean, which comes from the first half of the last layer.
     fn policy(&self) -> Result<(PolicyConfig, Tensors)> {
         let (observation_dim, action_dim) = (self.context.observation_dim(), self.context.action_dim());
         let shape = GaussianShape { observation_dim, action_dim, actor: self.config.behavior.clone() };

@@ -1,8 +1,8 @@
 //! Tests of what every algorithm must do, and of the tables that derive from it.
 
-use super::golden::{MAKE, devices, run};
+use super::golden::{MAKE, devices, goldens, run, table};
 use super::*;
-use std::mem;
+use std::collections::{BTreeMap, BTreeSet};
 use std::sync::Arc;
 
 use candle_core::Device;
@@ -10,10 +10,12 @@ use quad_dataset::{Arrays, Transitions};
 use quad_policy::Precision;
 use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
-use toml::{Value, toml};
 
 const DIMS: (usize, usize) = (11, 3);
-const STEPS: u64 = 50;
+/// A whole run, with each phase of those that have some.
+const STEPS: u64 = 10;
+/// A step from which on all networks of every golden folder move.
+const FIRST: u64 = 1000;
 /// More than a tile of rows, and no multiple of it.
 const BATCH: usize = 150;
 
@@ -48,35 +50,10 @@ fn context(seed: u64, device: &Device) -> Context {
     }
 }
 
-/// Every algorithm as the demonstration has it, and variants of some, with small networks.
+/// Every algorithm with the hyper-parameters of each of its golden folders, whose networks are small.
 fn variants() -> Vec<(Definition, toml::Table)> {
-    let mut variants = Vec::new();
-    let guided = |guidance: &str| ("quad", toml! { agent.guidance = guidance });
-    let of_quad = ["quad", "dac", "none", "mean", "shuffled"].map(guided);
-    let constant = ("quad", toml! { agent.guidance = "constant" agent.lambda = 0.5 });
-    let others = ALGORITHMS.iter().filter(|known| known.name != "quad").map(|known| (known.name, toml::Table::new()));
-    let of_ivr = [("ivr", toml! { agent.divergence = "exponential" })];
-    for (algorithm, changes) in of_quad.into_iter().chain([constant]).chain(others).chain(of_ivr) {
-        let definition = ALGORITHMS.into_iter().find(|known| known.name == algorithm).unwrap();
-        let mut experiment = Values::of(&definition).unwrap().for_task(Some("hopper-demo"));
-        merge(&mut experiment, changes);
-        let agent = experiment["agent"].as_table_mut().unwrap();
-        for (key, value) in &mut *agent {
-            match (&**key, value) {
-                ("actor" | "critic" | "value" | "behavior", Value::Table(layers)) => {
-                    layers["hidden"] = vec![24, 24].into();
-                }
-                ("actor_ema_start", value) => *value = 0.into(),
-                ("samples", value) => *value = 3.into(),
-                // η moves in each update, and so has to be restored.
-                ("eta", Value::Table(eta)) => drop(eta.insert("threshold".to_owned(), 0.5.into())),
-                ("behavior_steps" | "critic_steps", value) => *value = 3.into(),
-                _ => {}
-            }
-        }
-        variants.push((definition, mem::take(agent)));
-    }
-    variants
+    let of = |known: Definition| goldens(known.name).into_iter().map(move |golden| (known, table(&golden)));
+    ALGORITHMS.into_iter().flat_map(of).collect()
 }
 
 fn agent(definition: Definition, table: &toml::Table, context: &Context) -> Agent {
@@ -98,15 +75,17 @@ fn a_saved_state_goes_on_bit_for_bit() {
     for (device, (definition, table)) in
         devices().iter().flat_map(|device| variants().into_iter().map(move |v| (device, v)))
     {
-        let context = context(3, device);
+        let context = Context { total_steps: 2000, ..context(3, device) };
         let mut straight = agent(definition, &table, &context);
+        // From here on, all networks move.
+        straight.skip_to(FIRST);
         train(&mut straight, 7);
         let saved = straight.save().unwrap();
         assert_eq!(saved, straight.save().unwrap(), "saving is repeatable");
         let expected = train(&mut straight, 6);
         let mut resumed = agent(definition, &table, &context);
         resumed.load(&saved).unwrap();
-        assert_eq!((resumed.step(), resumed.save().unwrap() == saved), (7, true));
+        assert_eq!((resumed.step(), resumed.save().unwrap() == saved), (FIRST + 7, true));
         assert_eq!(train(&mut resumed, 6), expected, "{}", definition.name);
         assert!(resumed.save().unwrap() == straight.save().unwrap(), "{}: another state", definition.name);
     }
@@ -114,23 +93,26 @@ fn a_saved_state_goes_on_bit_for_bit() {
 
 #[test]
 fn a_state_that_does_not_fit_is_refused() {
-    let (quad, iql) = (variants()[0].clone(), variants()[6].clone());
+    let mut variants = variants().into_iter();
+    let one = variants.next().unwrap();
+    let other = variants.find(|(known, _)| known.name != one.0.name).unwrap();
     let context = context(3, &Device::Cpu);
-    let saved = agent(quad.0, &quad.1, &context).save().unwrap();
+    let saved = agent(one.0, &one.1, &context).save().unwrap();
     let refused = |definition, table: &toml::Table, bytes: &[u8]| {
         agent(definition, table, &context).load(bytes).unwrap_err().to_string()
     };
-    let other = refused(iql.0, &iql.1, &saved);
-    assert!(other.contains("quad") && other.contains("iql"), "{other}");
-    let mut wider = quad.1.clone();
-    wider["actor"].as_table_mut().unwrap().insert("hidden".to_owned(), vec![25].into());
-    let shape = refused(quad.0, &wider, &saved);
+    let foreign = refused(other.0, &other.1, &saved);
+    assert!(foreign.contains(one.0.name) && foreign.contains(other.0.name), "{foreign}");
+    let mut wider = one.1.clone();
+    let mut networks = wider.iter_mut().filter_map(|(_, value)| value.get_mut("hidden"));
+    *networks.next().unwrap() = vec![25].into();
+    let shape = refused(one.0, &wider, &saved);
     assert!(shape.contains("shape"), "{shape}");
     for bytes in [&b""[..], b"nonsense", &saved[..saved.len() - 1]] {
-        assert!(!refused(quad.0, &quad.1, bytes).is_empty());
+        assert!(!refused(one.0, &one.1, bytes).is_empty());
     }
-    let policy = agent(quad.0, &quad.1, &context).policy("here").unwrap();
-    assert!(refused(quad.0, &quad.1, &policy).contains("`state`"));
+    let policy = agent(one.0, &one.1, &context).policy("here").unwrap();
+    assert!(refused(one.0, &one.1, &policy).contains("`state`"));
 }
 
 #[test]
@@ -150,13 +132,29 @@ fn the_seed_alone_decides_the_weights() {
     }
 }
 
+/// What updates measure is in the algorithm's table, once each, and nothing else is there.
 #[test]
-fn every_value_has_a_name_and_every_weight_that_is_trained_a_gradient() {
+fn a_metric_has_the_same_name_where_it_is_computed_and_in_the_table() {
+    let mut found: BTreeMap<&str, BTreeSet<&str>> = BTreeMap::new();
+    for (definition, table) in variants() {
+        let mut algorithm = (definition.start)(&table, context(0, &Device::Cpu)).unwrap();
+        for step in 0..STEPS {
+            let measured = algorithm.update(step, &Vec::from_iter(0..BATCH as u32)).unwrap();
+            let names = BTreeSet::from_iter(measured.iter().map(|(name, _)| *name));
+            assert_eq!(names.len(), measured.len(), "{}: {measured:?}", definition.name);
+            found.entry(definition.name).or_default().extend(names);
+        }
+    }
+    for Definition { name, metrics, .. } in ALGORITHMS {
+        assert_eq!(found[name], metrics.iter().map(|metric| metric.name).collect(), "{name}");
+    }
+}
+
+#[test]
+fn every_value_is_finite_and_every_weight_that_is_trained_has_a_gradient() {
     for (definition, table) in variants() {
         let mut agent = agent(definition, &table, &context(0, &Device::Cpu));
-        // Long enough for each phase of those that have some.
-        for values in train(&mut agent, 10) {
-            assert_eq!(values.len(), definition.metrics.len(), "{}", definition.name);
+        for values in train(&mut agent, STEPS) {
             assert!(values.iter().all(|value| value.is_finite()), "{values:?}");
         }
         for (name, moment) in agent.parts().save().unwrap().iter().filter(|(name, _)| name.starts_with("adam_m")) {
@@ -172,17 +170,14 @@ fn every_value_has_a_name_and_every_weight_that_is_trained_a_gradient() {
 /// through; and neither such a state nor such a policy is handed over.
 #[test]
 fn a_nan_is_never_dropped() {
-    for (definition, mut table) in variants() {
-        if definition.name == "quad" {
-            table.insert("target_reduce".to_owned(), "max".into());
-        }
+    for (definition, table) in variants() {
         let count = agent(definition, &table, &context(0, &Device::Cpu)).parts().networks().len();
         assert!(count > 1, "{}", definition.name);
         for network in 0..count {
             let mut agent = agent(definition, &table, &context(0, &Device::Cpu));
             let (name, weights) = agent.parts().networks().swap_remove(network);
             weights.change(|values| values.slice_set(&(values * f64::NAN)?, 0, 0)).unwrap();
-            let values = train(&mut agent, 8);
+            let values = train(&mut agent, STEPS);
             // AlignIQL acts by its target actor, but learns nothing from it: it is an average of an actor that is watched.
             let unread = (definition.name, name) == ("align-iql", "target_actor");
             assert!(
@@ -206,31 +201,6 @@ fn metric_names_are_prometheus_names_and_distinct() {
         names.sort_unstable();
         names.dedup();
         assert_eq!(names.len(), definition.metrics.len(), "{}", definition.name);
-    }
-}
-
-/// docs/metrics.md holds a table made of each algorithm's own. `UPDATE_DOCS=1 cargo test -p quad-algorithms documented`
-/// writes it anew.
-#[test]
-fn metrics_are_documented() {
-    let path = std::path::Path::new(env!("CARGO_MANIFEST_DIR")).join("../docs/metrics.md");
-    let mut text = std::fs::read_to_string(&path).unwrap();
-    for Definition { name, metrics, .. } in ALGORITHMS {
-        let rows = metrics.iter().map(|Metric { name, help, .. }| {
-            format!("| `quad_learner_{name}` | {} | `{name}` |\n", help.replace('|', "\\|"))
-        });
-        let table = format!("| gauge | what | metrics.jsonl |\n|---|---|---|\n{}", rows.collect::<String>());
-        let (begin, end) = (format!("<!-- {name}: made of its table -->\n"), "<!-- end -->\n");
-        let from = text.find(&begin).unwrap_or_else(|| panic!("docs/metrics.md lacks {begin}")) + begin.len();
-        let to = from + text[from..].find(end).unwrap();
-        if std::env::var_os("UPDATE_DOCS").is_some() {
-            text.replace_range(from..to, &table);
-        }
-        let to = from + text[from..].find(end).unwrap();
-        assert_eq!(&text[from..to], table, "docs/metrics.md is not what UPDATE_DOCS=1 makes of it");
-    }
-    if std::env::var_os("UPDATE_DOCS").is_some() {
-        std::fs::write(&path, text).unwrap();
     }
 }
 

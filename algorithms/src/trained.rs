@@ -50,8 +50,13 @@ impl<N: Network> Trained<N> {
         Ok(Self { adam: Adam::new(network.weights(), decay)?, network })
     }
 
-    /// Moves the network down the loss that `gradients` are of. Gives the gradient's norm before clipping, `[]`.
-    pub fn descend(&mut self, gradients: &Gradients, step: AdamStep) -> Result<Tensor> {
+    /// Moves the network down a loss `[]`. Gives the gradient's norm before clipping, `[]`.
+    pub fn descend(&mut self, loss: &Tensor, step: AdamStep) -> Result<Tensor> {
+        self.descend_along(&Gradients::of(loss)?, step)
+    }
+
+    /// As [`Self::descend`], down the loss that `gradients` are of.
+    pub fn descend_along(&mut self, gradients: &Gradients, step: AdamStep) -> Result<Tensor> {
         let gradient = gradients.with_respect_to(self.network.weights())?;
         self.adam.descend(self.network.weights_mut(), &gradient, step)
     }

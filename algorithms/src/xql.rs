@@ -7,10 +7,10 @@
 #[path = "golden/xql.rs"]
 mod golden;
 
-use super::algorithm::{Definition, Metric, read};
 use super::context::{Context, Minibatch};
+use super::definition::{Definition, Metric, Reporting, read, readable};
 use super::hyperparameters::{Count, NotNegative, Positive};
-use super::in_sample::{Common, Helps, InSample, Losses, metrics, scale_down};
+use super::in_sample::{Common, Helps, InSample, Losses, scale_down, table};
 use super::random::{Purpose, stream};
 use candle_core::{Result, Tensor};
 use rand::Rng;
@@ -21,20 +21,21 @@ use serde::Deserialize;
 pub(super) const DEFINITION: Definition = Definition {
     name: "xql",
     settings: include_str!("../../presets/xql.toml"),
-    variant: None,
     metrics: METRICS,
-    check: |table| read::<Config>(table).map(drop),
+    report: Reporting::PLAIN,
+    check: readable::<Config>,
     start: |table, context| Ok(Box::new(InSample::new(read::<Config>(table)?, context)?)),
 };
 
 /// Bound of the noise on the actions that V sees.
 const LARGEST_NOISE: f64 = 0.5;
 
-const METRICS: &[Metric] = &metrics(Helps {
+const METRICS: &[Metric] = &table(Helps {
     targets: "Mean over the batch of the critics' target y = r + γ·mask·V(s').",
     value_loss: "Gumbel regression of V, mean over the batch of exp(z − M) − z·exp(−M) − exp(−M) with z = (min_k Q̂_k(s, a) − V(s))/beta, at most largest_exponent, and M = max(largest z, −1); before V's last step.",
     critic_loss: "Mean over the batch of the sum over both critics of Huber's loss of y − Q_k(s, a), linear from huber on.",
     actor_loss: "Mean over the batch of −weight·log π(a|s) with weight = exp(temperature·A), at most 100.",
+    learning_rate: "The actor's learning rate; falls to 0 along a cosine unless actor_rate_decays is false.",
 });
 
 /// XQL's hyper-parameters: the `[agent]` table of a preset.
@@ -51,6 +52,8 @@ struct Config {
     temperature: Positive,
     /// Error of the critics from which their loss is linear.
     huber: Positive,
+    /// Whether the actor's learning rate falls to 0 along a cosine.
+    actor_rate_decays: bool,
     /// Uniform actions per transition that V sees beside the data's.
     random_actions: u8,
     /// Standard deviation of the noise on the data's actions that V sees.
@@ -130,5 +133,9 @@ impl Losses for Config {
 
     fn value_steps(&self) -> u64 {
         *self.value_steps as u64
+    }
+
+    fn actor_rate_decays(&self) -> bool {
+        self.actor_rate_decays
     }
 }

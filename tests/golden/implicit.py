@@ -137,7 +137,10 @@ def update(config, state, inputs, update_value, weigh, gradient=critic_gradient)
     unclipped = weigh(q - v)
     weights = np.clip(unclipped, 0, LARGEST_WEIGHT)
     loss, gradients = actor_gradient(state["actor"], s, a, weights, agent["actor"]["activation"])
-    out |= adam_step(state, "actor", gradients, decayed(agent["actor_learning_rate"], config), config["step"])
+    rate = agent["actor_learning_rate"]
+    if agent.get("actor_rate_decays", True):
+        rate = decayed(rate, config)
+    out |= adam_step(state, "actor", gradients, rate, config["step"])
     out |= {"actor_loss": loss, "v_mean": v.mean(), "advantage_mean": (q - v).mean(), "weight_mean": weights.mean()}
     out["clipped_share"] = np.mean(unclipped > LARGEST_WEIGHT)
     return out | update_critics(config, state, inputs, out["value"], gradient), q, unclipped

@@ -16,10 +16,9 @@ AGENT = {
     "learning_rate": 0.02,
     "ema_rate": 0.05,
     "ema_every": 2,
-    "behavior_steps": 500,
-    "critic_steps": 1000,
+    "phases": {"behavior": 1, "critic": 2, "policy": 1},
 }
-# The step: the second of the critic's phase is the first at which its target moves.
+# The step, of 2,000: the second of the critic's phase is the first at which its target moves.
 VARIANTS = {"onestep-behavior": 300, "onestep-critic": 501, "onestep-policy": 1700}
 
 
@@ -31,11 +30,12 @@ def make_config(variant, size):
 
 def phase_of(config):
     """The network that learns, and the steps done since it began to."""
-    agent, step = config["agent"], config["step"]
-    if step < agent["behavior_steps"]:
+    shares, step, total = config["agent"]["phases"], config["step"], config["total_steps"]
+    critic = total * shares["behavior"] // sum(shares.values())
+    actor = total * (shares["behavior"] + shares["critic"]) // sum(shares.values())
+    if step < critic:
         return "behavior", step
-    step -= agent["behavior_steps"]
-    return ("critic", step) if step < agent["critic_steps"] else ("actor", step - agent["critic_steps"])
+    return ("critic", step - critic) if step < actor else ("actor", step - actor)
 
 
 # Networks: all are ensembles of one; the actor has the behaviour's shape.
@@ -82,7 +82,7 @@ def advantages_of(config, state, inputs):
     """Q(s, a) less the mean Q of actions that β draws."""
     s, agent = inputs["observations"], config["agent"]
     mean, log_std = fast_gaussian(state["behavior"], s, agent["behavior"]["activation"])
-    actions = np.clip(mean + np.exp(log_std) * inputs["behavior_noise"], -1, 1)
+    actions = mean + np.exp(log_std) * inputs["behavior_noise"]  # as they are drawn, also beyond ±1
     baseline = q_values(state["critic"], np.broadcast_to(s, actions.shape[:1] + s.shape), actions, config).mean(0)
     return q_values(state["critic"], s, inputs["actions"], config) - baseline
 

@@ -1,24 +1,29 @@
 //! Tests: the update against an independent implementation (tests/golden/README.md).
 
 use super::*;
+use crate::algorithm::Algorithm;
 use crate::golden::{
     Golden, batch, check_candidates, check_update, context, denoising, devices, fresh, goldens, load, table,
 };
 use candle_core::Device;
 
+fn start(golden: &Golden, device: &Device) -> Diffusion<AlignIql> {
+    read::<Config>(&table(golden)).unwrap().start(context(golden, device)).unwrap()
+}
+
 fn check(golden: &Golden, device: &Device) {
-    let mut align_iql = AlignIql::new(read(&table(golden)).unwrap(), context(golden, device)).unwrap();
+    let mut align_iql = start(golden, device);
     load(golden, align_iql.parts());
     check_choice(golden, &align_iql);
-    let (batch, noise) = (batch(golden, &align_iql.context), denoising(golden, device));
-    let noisy = noise.noisy(align_iql.actor.network.schedule(), &batch.actions).unwrap();
-    golden.close("noisy_actions", &noisy.actions);
-    let values = align_iql.step(golden.count("/step") as u64, &batch, &noise).unwrap();
-    check_update(golden, METRICS, &values, align_iql.parts().save().unwrap());
+    let Diffusion { update, networks } = &mut align_iql;
+    let (batch, noise) = (batch(golden, &networks.context), denoising(golden, device));
+    golden.close("noisy_actions", &networks.denoise(&batch, &noise).unwrap().0.actions);
+    let measured = update.step(networks, golden.count("/step") as u64, &batch, &noise).unwrap();
+    check_update(golden, METRICS, &measured, align_iql.parts().save().unwrap());
 }
 
 /// What the published networks say of the candidates, and that the one whose Q is nearest to V is to be taken.
-fn check_choice(golden: &Golden, align_iql: &AlignIql) {
+fn check_choice(golden: &Golden, align_iql: &Diffusion<AlignIql>) {
     let drawn = check_candidates(golden, align_iql);
     let candidates = golden.count("/agent/candidates") as u32;
     assert_eq!(drawn.choice, Choice { candidates, value: Reduce::Min, rule: Rule::Nearest });
@@ -48,7 +53,7 @@ fn golden_update_of_a_fresh_seed() {
 #[test]
 fn the_noise_of_a_step_is_repeatable_and_no_other_steps() {
     let golden = goldens("align-iql").remove(0);
-    let align_iql = AlignIql::new(read(&table(&golden)).unwrap(), context(&golden, &Device::Cpu)).unwrap();
+    let align_iql = start(&golden, &Device::Cpu);
     let numbers = |step: u64| {
         let Denoising { t, epsilon } = align_iql.noise(step).unwrap();
         (t, epsilon.flatten_all().unwrap().to_vec1::<f32>().unwrap())

@@ -1,14 +1,15 @@
 //! Tests: the update against an independent implementation (tests/golden/README.md).
 
 use super::*;
+use crate::algorithm::Algorithm;
 use crate::golden::{
     Golden, batch, chain_noise, check_candidates, check_update, context, denoising, devices, fresh, goldens, load,
     table,
 };
 use candle_core::Device;
 
-fn start(golden: &Golden, device: &Device) -> Dql {
-    let mut dql = Dql::new(read(&table(golden)).unwrap(), context(golden, device)).unwrap();
+fn start(golden: &Golden, device: &Device) -> Diffusion<Config> {
+    let mut dql = read::<Config>(&table(golden)).unwrap().start(context(golden, device)).unwrap();
     load(golden, dql.parts());
     dql
 }
@@ -25,16 +26,16 @@ fn noise(golden: &Golden, device: &Device) -> Noise {
 fn check(golden: &Golden, device: &Device) {
     let mut dql = start(golden, device);
     let choice = check_candidates(golden, &dql).choice;
-    let (batch, noise) = (batch(golden, &dql.context), noise(golden, device));
-    let next = dql.target_actor.sample(&batch.next_observations, &noise.next).unwrap();
+    let Diffusion { update, networks } = &mut dql;
+    let (batch, noise) = (batch(golden, &networks.context), noise(golden, device));
+    let next = networks.target_actor.sample(&batch.next_observations, &noise.next).unwrap();
     golden.close("next_actions", &next);
-    golden.close("targets", &dql.targets(&batch, &noise.next).unwrap());
-    let noisy = noise.denoising.noisy(dql.actor.network.schedule(), &batch.actions).unwrap();
-    golden.close("noisy_actions", &noisy.actions);
-    let sampled = dql.actor.network.sample(&batch.observations, &noise.policy).unwrap();
+    golden.close("targets", &update.targets(networks, &batch, &noise.next).unwrap());
+    golden.close("noisy_actions", &networks.denoise(&batch, &noise.denoising).unwrap().0.actions);
+    let sampled = networks.actor.network.sample(&batch.observations, &noise.policy).unwrap();
     golden.close("policy_actions", &sampled);
-    let values = dql.step(golden.count("/step") as u64, &batch, &noise).unwrap();
-    check_update(golden, METRICS, &values, dql.parts().save().unwrap());
+    let measured = update.step(networks, golden.count("/step") as u64, &batch, &noise).unwrap();
+    check_update(golden, METRICS, &measured, dql.parts().save().unwrap());
 
     let temperature = golden.config["agent"]["temperature"].as_f64().unwrap() as f32;
     let candidates = golden.count("/agent/candidates") as u32;

@@ -17,7 +17,7 @@ fn check_golden(golden: &Golden, device: &Device) {
     let (mut onestep, step) = (start(golden, device), golden.count("/step") as u64);
     check_actions(golden, &onestep);
     let batch = batch(golden, &onestep.context);
-    let values = match onestep.phase(step) {
+    let measured = match onestep.phase(step) {
         Phase::Behavior(steps) => onestep.clone_behavior(&batch, steps),
         Phase::Critic(steps) => onestep.evaluate_behavior(&batch, &golden.input("next_actions", device), steps),
         Phase::Policy(steps) => {
@@ -25,7 +25,7 @@ fn check_golden(golden: &Golden, device: &Device) {
             onestep.improve(&batch, &noise, steps)
         }
     };
-    check_update(golden, METRICS, &values.unwrap(), onestep.parts().save().unwrap());
+    check_update(golden, METRICS, &measured.unwrap(), onestep.parts().save().unwrap());
 }
 
 #[test]
@@ -61,15 +61,15 @@ fn small_context(golden: &Golden) -> Context {
 fn it_learns_from_transitions_with_a_next_action_and_from_terminals() {
     let golden = goldens("onestep").remove(0);
     let onestep = Onestep::new(read(&table(&golden)).unwrap(), small_context(&golden)).unwrap();
-    assert_eq!((onestep.items(), &onestep.items[..]), (4, &[0, 1, 2, 4][..]));
+    assert_eq!((onestep.items(6), &onestep.items[..]), (4, &[0, 1, 2, 4][..]));
     let next: Vec<Vec<f32>> = onestep.next_actions(&onestep.items).unwrap().to_vec2().unwrap();
     assert_eq!(next, [[0.1], [0.0], [0.3], [0.5]]);
 }
 
-/// Two steps for β, one for Q, and what remains of five for π.
+/// Five steps: two for β, one for Q, and two for π.
 fn short(golden: &Golden) -> Onestep {
     let mut config: Config = read(&table(golden)).unwrap();
-    (config.behavior_steps, config.critic_steps) = (Steps(2), Steps(1));
+    config.phases = Phases { behavior: Steps(4), critic: Steps(2), policy: Steps(4) };
     Onestep::new(config, Context { total_steps: 5, ..small_context(golden) }).unwrap()
 }
 
@@ -104,13 +104,41 @@ fn a_run_that_is_cut_in_any_phase_ends_as_one_that_is_not() {
 }
 
 #[test]
-fn each_phase_has_its_steps_and_the_policy_is_left_some() {
+fn a_dataset_of_single_transitions_is_refused_with_a_hint() {
     let golden = goldens("onestep").remove(0);
-    let context = Context { total_steps: 1500, ..small_context(&golden) };
-    let refused = Onestep::new(read(&table(&golden)).unwrap(), context).err().unwrap().to_string();
-    assert!(refused.contains("behavior_steps is 500") && refused.contains("critic_steps"), "{refused}");
+    // Its rows are at random, and none terminates.
+    let mut context = context(&golden, &Device::Cpu);
+    let arrays = Arrays {
+        observation_dim: 1,
+        action_dim: 1,
+        observations: vec![0.0, 1.0],
+        actions: vec![0.0, 0.1],
+        rewards: vec![0.0; 2],
+        next_observations: vec![1.0, 2.0],
+        terminals: vec![false; 2],
+        timeouts: vec![true; 2],
+    };
+    context.transitions = Arc::new(Transitions::of(arrays).unwrap());
+    let refused = Onestep::new(read(&table(&golden)).unwrap(), context).err().unwrap();
+    assert!(
+        refused.to_string().contains("has a next action") && refused.hint().contains("datasets inspect"),
+        "{refused}"
+    );
+}
 
+#[test]
+fn a_run_of_any_length_is_divided_as_its_phases_are() {
+    let of_the_paper = Phases { behavior: Steps(500_000), critic: Steps(2_000_000), policy: Steps(100_000) };
+    for (total_steps, expected) in [(2_600_000, [500_000, 2_500_000]), (600, [115, 576]), (1, [0, 0])] {
+        assert_eq!(of_the_paper.begin(total_steps), expected);
+    }
+}
+
+#[test]
+fn each_phase_trains_its_network_alone() {
+    let golden = goldens("onestep").remove(0);
     let mut onestep = short(&golden);
+    assert_eq!(onestep.phases(), [0, 2, 3]);
     let mut before = state(&mut onestep);
     for (step, moved) in ["behavior", "behavior", "critic", "actor", "actor"].into_iter().enumerate() {
         onestep.update(step as u64, &[0, 1]).unwrap();

@@ -1,17 +1,19 @@
 //! Tests: the update against an independent implementation (tests/golden/README.md).
 
 use super::*;
+use crate::algorithm::Algorithm;
 use crate::golden::{
-    Golden, batch, chain_noise, check_update, context, denoising, devices, fresh, goldens, load, run, table,
+    Golden, batch, chain_noise, check_update, context, denoising, devices, fresh, goldens, load, run, table, value,
 };
 use crate::hyperparameters::{NotNegative, Positive};
 use candle_core::{DType, Device};
 
-fn start(golden: &Golden, device: &Device) -> Quad {
-    let mut quad = Quad::new(Config::read(&table(golden)).unwrap(), context(golden, device)).unwrap();
+fn start(golden: &Golden, device: &Device) -> Diffusion<Quad> {
+    let mut quad = Config::read(&table(golden)).unwrap().start(context(golden, device)).unwrap();
     load(golden, quad.parts());
     // Below 0: not set yet.
-    quad.nu_squared = quad.nu_squared.filter(|nu_squared| nu_squared.to_scalar::<f32>().unwrap() >= 0.0);
+    let is_set = |nu_squared: &Tensor| nu_squared.to_scalar::<f32>().unwrap() >= 0.0;
+    quad.update.nu_squared = quad.update.nu_squared.filter(is_set);
     quad
 }
 
@@ -23,11 +25,12 @@ fn noise(golden: &Golden, device: &Device) -> Noise {
 
 fn check(golden: &Golden, device: &Device) {
     let mut quad = start(golden, device);
-    let (batch, noise) = (batch(golden, &quad.context), noise(golden, device));
-    let eta: f32 = quad.eta.to_scalar().unwrap();
-    let values = quad.step(golden.count("/step") as u64, &batch, &noise).unwrap();
-    check_update(golden, METRICS, &values, quad.parts().save().unwrap());
-    let value = |name: &str| values[METRICS.iter().position(|metric| metric.name == name).unwrap()];
+    let Diffusion { update, networks } = &mut quad;
+    let (batch, noise) = (batch(golden, &networks.context), noise(golden, device));
+    let eta: f32 = update.eta.to_scalar().unwrap();
+    let measured = update.step(networks, golden.count("/step") as u64, &batch, &noise).unwrap();
+    check_update(golden, METRICS, &measured, quad.parts().save().unwrap());
+    let value = |name| value(&measured, name);
     let guidance_loss = value("actor_loss") - eta * value("bc_loss");
     // A difference of two larger numbers, so relative to these.
     let expected = golden.expected["guidance_loss"].to_vec1::<f32>().unwrap()[0];
@@ -65,17 +68,17 @@ fn eta_moves_by_at_most_its_rate_and_stays_within_its_bounds() {
     let moved = |threshold: f32, minimum: f32, maximum: f32| {
         let (batch, mut noise) = (batch(&golden, &context(&golden, &Device::Cpu)), noise(&golden, &Device::Cpu));
         noise.denoising.epsilon = (noise.denoising.epsilon * 10.0).unwrap();
-        let mut quad = start(&golden, &Device::Cpu);
-        quad.config.eta = Eta {
+        let Diffusion { mut update, mut networks } = start(&golden, &Device::Cpu);
+        update.config.eta = Eta {
             initial: NotNegative(1.0),
             threshold: Some(Positive(threshold)),
             rate: NotNegative(0.25),
             minimum: NotNegative(minimum),
             maximum: NotNegative(maximum),
         };
-        quad.eta = Tensor::new(1f32, &Device::Cpu).unwrap();
-        quad.step(0, &batch, &noise).unwrap();
-        quad.eta.to_scalar::<f32>().unwrap()
+        update.eta = Tensor::new(1f32, &Device::Cpu).unwrap();
+        update.step(&mut networks, 0, &batch, &noise).unwrap();
+        update.eta.to_scalar::<f32>().unwrap()
     };
     assert_eq!((moved(0.1, 0.0, 9.0), moved(1e4, 0.0, 9.0)), (1.25, 0.75));
     assert_eq!((moved(0.1, 0.0, 1.125), moved(1e4, 0.875, 9.0)), (1.125, 0.875));
@@ -100,9 +103,9 @@ fn the_noise_of_a_step_is_repeatable_and_no_other_steps() {
 fn every_denoising_step_is_drawn_equally_often() {
     let golden = goldens("quad").remove(0);
     let quad = start(&golden, &Device::Cpu);
-    let mut counts = vec![0; *quad.config.diffusion_steps];
+    let mut counts = vec![0; quad.networks.shape.diffusion_steps];
     (0..1000).for_each(|step| quad.noise(step).unwrap().denoising.t.iter().for_each(|t| counts[*t as usize - 1] += 1));
-    let expected = 1000 * quad.context.batch_size / counts.len();
+    let expected = 1000 * quad.networks.context.batch_size / counts.len();
     // Six standard deviations of a binomial count.
     let room = 6.0 * (expected as f64).sqrt();
     assert!(counts.iter().all(|count| (f64::from(*count) - expected as f64).abs() < room), "{counts:?}");
@@ -120,22 +123,22 @@ fn golden_update_of_a_fresh_seed() {
 fn golden_parts() {
     for golden in goldens("quad") {
         let device = Device::Cpu;
-        let mut quad = start(&golden, &device);
-        let (batch, noise) = (batch(&golden, &quad.context), noise(&golden, &device));
-        let next = quad.target_actor.sample(&batch.next_observations, &noise.next).unwrap();
+        let Diffusion { update, mut networks } = start(&golden, &device);
+        let (batch, noise) = (batch(&golden, &networks.context), noise(&golden, &device));
+        let next = networks.target_actor.sample(&batch.next_observations, &noise.next).unwrap();
         golden.close("next_actions", &next);
-        golden.close("targets", &quad.targets(&batch, &noise).unwrap());
-        if quad.config.guidance == Guidance::None {
+        golden.close("targets", &update.targets(&networks, &batch, &noise.next).unwrap());
+        if update.config.guidance == Guidance::None {
             continue;
         }
         // Guidance comes from the target critics as the update has just moved them.
-        quad.target_critics.weights_mut().load(&mut golden.expected.clone(), "target_critic.").unwrap();
-        let noisy = noise.denoising.noisy(quad.actor.network.schedule(), &batch.actions).unwrap();
+        networks.target_critics.weights_mut().load(&mut golden.expected.clone(), "target_critic.").unwrap();
+        let (noisy, predicted) = networks.denoise(&batch, &noise.denoising).unwrap();
         golden.close("noisy_actions", &noisy.actions);
-        let gradients = quad.target_critics.action_gradients(&batch.observations, &noisy.actions).unwrap();
+        let gradients = networks.target_critics.action_gradients(&batch.observations, &noisy.actions).unwrap();
         golden.close("critic_action_gradients", &gradients);
-        let predicted = quad.actor.network.predict(&batch.observations, &noisy.actions, &noisy.t).unwrap().detach();
-        let guide = quad.guide(&batch, &noisy, &predicted, noise.permutation.as_ref()).unwrap();
+        let predicted = predicted.detach();
+        let guide = update.guide(&networks, &batch, &noisy, &predicted, noise.permutation.as_ref()).unwrap();
         let mean = gradients.mean(0).unwrap().broadcast_div(&golden.expected["q_scale"]).unwrap();
         let difference =
             (&guide.gradient - &mean).unwrap().abs().unwrap().max_all().unwrap().to_scalar::<f32>().unwrap();
@@ -150,7 +153,7 @@ fn golden_parts() {
 fn a_shuffle_moves_samples_among_those_of_their_denoising_step() {
     let golden = goldens("quad").into_iter().find(|golden| golden.config["agent"]["guidance"] == "shuffled").unwrap();
     let mut quad = start(&golden, &Device::Cpu);
-    quad.context.batch_size = 500;
+    quad.networks.context.batch_size = 500;
     let Noise { denoising: Denoising { t, .. }, permutation, .. } = quad.noise(0).unwrap();
     let mut rows: Vec<u32> = permutation.unwrap().to_vec1().unwrap();
     assert!(rows.iter().zip(&t).all(|(row, step)| t[*row as usize] == *step));
@@ -164,10 +167,10 @@ fn a_shuffle_moves_samples_among_those_of_their_denoising_step() {
 fn an_infinite_temperature_is_dac() {
     let golden = goldens("quad").into_iter().find(|golden| golden.config["agent"]["guidance"] == "quad").unwrap();
     let [quad, dac] = [Guidance::Quad, Guidance::Dac].map(|guidance| {
-        let mut quad = start(&golden, &Device::Cpu);
-        (quad.config.guidance, quad.config.tau, quad.config.delta) = (guidance, f32::INFINITY, Positive(1e-30));
+        let Diffusion { mut update, mut networks } = start(&golden, &Device::Cpu);
+        (update.config.guidance, update.config.tau, update.config.delta) = (guidance, f32::INFINITY, Positive(1e-30));
         let (batch, noise) = (batch(&golden, &context(&golden, &Device::Cpu)), noise(&golden, &Device::Cpu));
-        quad.step(0, &batch, &noise).unwrap()
+        update.step(&mut networks, 0, &batch, &noise).unwrap()
     });
     assert_eq!(quad, dac);
 }

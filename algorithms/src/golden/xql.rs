@@ -14,8 +14,8 @@ fn check(golden: &Golden, device: &Device) {
     let noise = Noise { actions: input("random_actions"), normal: input("value_noise") };
     let batch = batch(golden, &xql.context);
     let pairs = xql.losses.pairs_with(&batch, &noise).unwrap();
-    let values = xql.step(golden.count("/step") as u64, &batch, Some(pairs)).unwrap();
-    check_update(golden, METRICS, &values, xql.parts().save().unwrap());
+    let measured = xql.step(golden.count("/step") as u64, &batch, Some(pairs)).unwrap();
+    check_update(golden, METRICS, &measured, xql.parts().save().unwrap());
 }
 
 #[test]

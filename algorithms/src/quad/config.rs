@@ -1,6 +1,7 @@
 //! QUAD's hyper-parameters: the `[agent]` table of a preset.
 
-use crate::algorithm::{AgentError, check, read};
+use crate::algorithm::{AgentError, check};
+use crate::definition::read;
 use crate::hyperparameters::{Candidates, Count, NotNegative, Positive, Rate, Share, Steps};
 use quad_policy::MlpConfig;
 use serde::Deserialize;

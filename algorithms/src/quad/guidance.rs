@@ -3,7 +3,8 @@
 use super::Quad;
 use super::config::Guidance;
 use crate::context::Minibatch;
-use crate::diffusion::Noisy;
+use crate::denoising::Noisy;
+use crate::diffusion::Networks;
 use candle_core::{DType, Result, Tensor};
 use quad_policy::mean_and_variance;
 
@@ -28,14 +29,15 @@ impl Quad {
     /// guidance `shuffled`, `[B]`.
     pub(super) fn guide(
         &self,
+        networks: &Networks,
         batch: &Minibatch,
         noisy: &Noisy,
         predicted: &Tensor,
         permutation: Option<&Tensor>,
     ) -> Result<Guide> {
-        let scale = (self.target_critics.values(&batch.observations, &batch.actions)?.abs()?.mean_all()? + 1e-6)?;
-        let gradients =
-            self.target_critics.action_gradients(&batch.observations, &noisy.actions)?.broadcast_div(&scale)?;
+        let critics = &networks.target_critics;
+        let scale = (critics.values(&batch.observations, &batch.actions)?.abs()?.mean_all()? + 1e-6)?;
+        let gradients = critics.action_gradients(&batch.observations, &noisy.actions)?.broadcast_div(&scale)?;
 
         let size = (predicted.sqr()?.sum_keepdim(1)?.sqrt()? + 1e-8)?;
         let direction = predicted.broadcast_div(&size)?; // u, Eq. 21

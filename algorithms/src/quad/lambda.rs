@@ -1,23 +1,21 @@
 //! What λ does in a batch, and how guidance stands to behaviour cloning, in one pass on the CPU.
 
 use super::guidance::Guide;
+use crate::algorithm::Measured;
 use candle_core::Tensor;
 
 /// Parts of the chain t = 1…T that have a mean of their own.
 const FIFTHS: usize = 5;
-
-/// How many numbers [`measure`] gives.
-const COUNT: usize = 13;
 
 /// What [`measure`] has to know of a batch: ν̂² and δ's share, `[]`; λ and σ², `[B]`; ḡ and the error ε_θ − ε, `[B, a]`.
 pub(super) fn needed<'a>(guide: &'a Guide, error: &'a Tensor) -> [&'a Tensor; 6] {
     [&guide.nu_squared, &guide.delta_share, &guide.lambda, &guide.sigma_squared, &guide.gradient, error]
 }
 
-/// The metrics from `delta_share` on, of the numbers of [`needed`], one tensor after the other; without guidance there are none,
-/// and the metrics are 0. `t` is each sample's, of `steps` T.
-pub(super) fn measure(numbers: &[f32], t: &[u32], steps: usize, delta: f32) -> [f32; COUNT] {
-    let [nu_squared, delta_share, rows @ ..] = numbers else { return [0.0; COUNT] };
+/// The metrics of guidance, of the numbers of [`needed`], one tensor after the other; none without guidance. `t` is each sample's, of
+/// `steps` T.
+pub(super) fn measure(numbers: &[f32], t: &[u32], steps: usize, delta: f32) -> Measured {
+    let [nu_squared, delta_share, rows @ ..] = numbers else { return Measured::new() };
     let (lambda, rows) = rows.split_at(t.len());
     let (sigma_squared, rows) = rows.split_at(t.len());
     let (gradient, error) = rows.split_at(rows.len() / 2);
@@ -26,20 +24,20 @@ pub(super) fn measure(numbers: &[f32], t: &[u32], steps: usize, delta: f32) -> [
     let [first, second, third, fourth, fifth] = by_fifth(lambda, t, steps, lambda_mean);
     let width = gradient.len() / t.len();
     let cosines = gradient.chunks(width).zip(error.chunks(width)).map(|(one, other)| cosine(one, other));
-    [
-        *delta_share,
-        lambda_mean,
-        low,
-        median,
-        high,
-        first,
-        second,
-        third,
-        fourth,
-        fifth,
-        mean(lambda.iter().map(|lambda| f32::from(*lambda > 0.99))),
-        mean(sigma_squared.iter().copied()) / (nu_squared + delta),
-        mean(cosines),
+    vec![
+        ("delta_share", *delta_share),
+        ("lambda_mean", lambda_mean),
+        ("lambda_quantile_10", low),
+        ("lambda_quantile_50", median),
+        ("lambda_quantile_90", high),
+        ("lambda_fifth_1", first),
+        ("lambda_fifth_2", second),
+        ("lambda_fifth_3", third),
+        ("lambda_fifth_4", fourth),
+        ("lambda_fifth_5", fifth),
+        ("lambda_above_99_share", mean(lambda.iter().map(|lambda| f32::from(*lambda > 0.99)))),
+        ("variance_ratio", mean(sigma_squared.iter().copied()) / (nu_squared + delta)),
+        ("guidance_cosine", mean(cosines)),
     ]
 }
 
@@ -70,7 +68,7 @@ fn by_fifth(lambda: &[f32], t: &[u32], steps: usize, otherwise: f32) -> [f32; FI
     sums.map(|(sum, count)| if count == 0 { otherwise } else { (sum / f64::from(count)) as f32 })
 }
 
-/// Of two vectors; 0 where one is 0.
+/// The cosine between two vectors; 0 where one is 0.
 fn cosine(one: &[f32], other: &[f32]) -> f32 {
     let dot = |x: &[f32], y: &[f32]| x.iter().zip(y).map(|(x, y)| x * y).sum::<f32>();
     let size = (dot(one, one) * dot(other, other)).sqrt();

@@ -69,10 +69,13 @@ pub enum Command {
 #[derive(Debug, Args)]
 pub struct PresetsArgs {
     /// Print every value for this task, or for a preset file of your own, as a complete preset file
-    #[arg(value_name = "TASK|FILE", value_parser = parse_preset)]
+    #[arg(value_name = "TASK|FILE", value_parser = parse_preset, group = "what")]
     pub preset: Option<String>,
-    /// Algorithm [default: quad, or the one in the file]
-    #[arg(long, value_name = "NAME", value_parser = parse_algorithm, requires = "preset")]
+    /// Print what each algorithm measures, in metrics.jsonl and, with quad_learner_ before the name, in Prometheus
+    #[arg(long, group = "what")]
+    pub metrics: bool,
+    /// Algorithm [default: quad, or the one in the file; with --metrics all]
+    #[arg(long, value_name = "NAME", value_parser = parse_algorithm, requires = "what")]
     pub algorithm: Option<String>,
 }
 

@@ -14,7 +14,7 @@ use crate::train::Price;
 ///
 /// # Errors
 /// The run cannot start with these transitions.
-pub fn foretell(path: &Path, config: &RunConfig, transitions: Transitions) -> anyhow::Result<()> {
+pub fn estimate(path: &Path, config: &RunConfig, transitions: Transitions) -> anyhow::Result<()> {
     let (experiment, steps) = (&config.experiment, config.experiment.steps);
     let price = Price::measure(experiment, config.run.device, transitions)?;
     let (milliseconds, hours) = (price.step * 1e3, price.step * steps as f64 / 3600.0);

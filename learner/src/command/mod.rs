@@ -11,7 +11,7 @@ use std::fmt::Alignment::{Left, Right};
 
 use clap::CommandFactory;
 use clap_complete::Shell;
-use quad_algorithms::{ALGORITHMS, Values};
+use quad_algorithms::{ALGORITHMS, Definition, Values};
 use quad_dataset::{DatasetError, environment};
 use quad_run::config::hyperparameters;
 use quad_run::config::{Preset, tasks};
@@ -54,6 +54,9 @@ fn list_presets(args: &PresetsArgs) -> anyhow::Result<()> {
     if let Some(preset) = &args.preset {
         return print_preset(&Preset::read(preset)?, args.algorithm.as_deref());
     }
+    if args.metrics {
+        return print_metrics(args.algorithm.as_deref());
+    }
     let header = ["task", "environment", "dataset", "what it is"];
     let mut of_tasks = Table::new(&header.map(|name| (name, Left)));
     for task in tasks::all() {
@@ -67,6 +70,17 @@ fn list_presets(args: &PresetsArgs) -> anyhow::Result<()> {
         of_algorithms.push([definition.name.to_owned(), values.about, values.given.join(", ")]);
     }
     print(&format!("{}\n{}", of_tasks.render(Style::Text), of_algorithms.render(Style::Text)))
+}
+
+/// What algorithms measure, or the one of that name.
+fn print_metrics(algorithm: Option<&str>) -> anyhow::Result<()> {
+    let asked = |known: &&Definition| algorithm.is_none_or(|name| known.name == name);
+    let tables = ALGORITHMS.iter().filter(asked).map(|Definition { name, metrics, .. }| {
+        let mut table = Table::new(&[(*name, Left), ("what it is", Left)]);
+        metrics.iter().for_each(|metric| table.push([metric.name, metric.help].map(str::to_owned)));
+        table.render(Style::Text)
+    });
+    print(&Vec::from_iter(tables).join("\n"))
 }
 
 fn print_preset(preset: &Preset, algorithm: Option<&str>) -> anyhow::Result<()> {

@@ -6,7 +6,7 @@ use std::sync::Arc;
 use std::time::{Duration, SystemTime, UNIX_EPOCH};
 
 use anyhow::{Context, anyhow};
-use quad_dataset::{Transitions, environment};
+use quad_dataset::{Task, Transitions, environment};
 use quad_policy::Precision;
 use quad_protocol::Name;
 use quad_run::config::{DatasetInfo, Experiment, Preset, RunConfig, RunInfo, hyperparameters};
@@ -23,7 +23,7 @@ use crate::data::{LocalDataset, Source, load};
 use crate::live::{Display, Ending, Incarnation, Live, MainLoop, Metrics, Run, STUCK, Threads};
 use crate::page;
 use crate::report::of_run;
-use crate::train::device;
+use crate::train::{begin, device};
 
 /// Default limit of training threads: a gradient step of the paper is cut into tiles (twenty with one next action per state),
 /// and threads that wait for a tile keep their cores busy.
@@ -73,7 +73,7 @@ pub fn train(args: &TrainArgs) -> anyhow::Result<()> {
     }
     debug!("{config:?}");
     if args.dry_run {
-        return dry_run::foretell(&path, &config, transitions);
+        return dry_run::estimate(&path, &config, transitions);
     }
 
     // Zenoh and training have threads of their own; this runtime serves the metrics and the main loop.
@@ -123,6 +123,9 @@ async fn run_to_its_end(
     let server = quad_runtime::serve_metrics(args.metrics, registry, health.clone(), page).await;
     let server = server.hint_of(BindError::hint)?;
     info!("page: http://{}/", server.address);
+    let Experiment { environment, .. } = &config.experiment;
+    let task = Task::new(environment, transitions.observation_dim(), transitions.action_dim());
+    let agent = begin(&config.experiment, config.run.device, transitions)?;
     let opening = outside.open().await?;
     // All checks are done, so a start that is refused leaves no folder behind.
     let (run_dir, scores, past) = take_up(path, begun, args.fresh, config)?;
@@ -131,7 +134,7 @@ async fn run_to_its_end(
     let incarnation = Incarnation { run: name, number: now()? << 16 | u64::from(rand::random::<u16>()) };
     let checkpoint_every = Duration::from_secs(args.checkpoint_seconds);
     let run = Run { incarnation: incarnation.clone(), config, dir: &run_dir, scores, past, checkpoint_every };
-    let threads = Threads::start(run, transitions, &metrics, &health, &tell)?;
+    let threads = Threads::start(run, task, agent, &metrics, &health, &tell)?;
     threads.show_on(&live);
     let main_loop = MainLoop {
         incarnation,

@@ -6,7 +6,8 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use std::thread::JoinHandle;
 use std::time::Duration;
 
-use quad_dataset::{Task, Transitions};
+use quad_algorithms::Agent;
+use quad_dataset::Task;
 use quad_run::config::{Experiment, RunConfig};
 use quad_run::run::{Earlier, Log, Past, RunDir};
 use quad_runtime::Health;
@@ -63,7 +64,8 @@ impl Threads {
     /// Starts all threads.
     pub fn start(
         run: Run<'_>,
-        transitions: Transitions,
+        task: Task,
+        agent: Agent,
         metrics: &Metrics,
         health: &Health,
         events: &Events,
@@ -71,7 +73,6 @@ impl Threads {
         let Run { incarnation, config, dir, scores, past, checkpoint_every } = run;
         let Past { checkpoint, snapshots: known, scores: earlier } = past;
         let experiment = &config.experiment;
-        let task = Task::new(&experiment.environment, transitions.observation_dim(), transitions.action_dim());
         let coordinator = coordinator(&incarnation, experiment, task, earlier, metrics, events);
         for (&step, &hash) in &known {
             coordinator.open(step, hash)?;
@@ -105,8 +106,7 @@ impl Threads {
         let stop = Arc::new(AtomicBool::new(false));
         let training = Training {
             experiment: experiment.clone(),
-            device: config.run.device,
-            transitions: Arc::new(transitions),
+            agent,
             checkpoint,
             checkpoint_every,
             seconds_before,

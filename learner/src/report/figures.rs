@@ -1,9 +1,10 @@
-//! The pictures of runs: learning curves, performance profiles, scores over τ.
+//! The pictures of runs: learning curves, performance profiles, scores over a hyper-parameter.
 
 use std::collections::BTreeMap;
 use std::path::Path;
 
 use anyhow::Context;
+use quad_algorithms::{ALGORITHMS, Axis, Definition};
 use quad_run::config::settings::{self, Settings};
 use quad_run::results::RunReport;
 use quad_run::results::statistics::{self, Estimate, Runs};
@@ -15,7 +16,6 @@ use super::study::MethodReport;
 use super::summary::Report;
 
 const FOLDER: &str = "--figures names a folder that you may write in";
-const TAU: &str = "agent.tau";
 const BAND: &str = "mean over seeds, with its 95 % interval";
 
 /// Draws all pictures of a report into a folder, each as SVG and as PNG. The folder is made if it is not there.
@@ -28,8 +28,8 @@ pub fn draw_all(folder: &Path, report: &Report) -> anyhow::Result<()> {
     Ok(())
 }
 
-/// All pictures of a report, each with a name for its file: of each task the learning curves, and the scores over τ where runs
-/// differ in it; of all tasks the performance profiles.
+/// All pictures of a report, each with a name for its file: the learning curves of each task, and its scores over the
+/// hyper-parameter that an algorithm names, such as τ, where runs differ in it; the performance profiles of all tasks.
 pub fn all(report: &Report) -> Vec<(String, Picture)> {
     if let [run] = &report.runs[..] {
         return vec![(format!("curve-{}", run.task), of_run(run))];
@@ -41,7 +41,12 @@ pub fn all(report: &Report) -> Vec<(String, Picture)> {
     let mut pictures = vec![("profile".to_owned(), profiles(report))];
     for (task, groups) in of_task {
         pictures.push((format!("curve-{task}"), curves(task, &groups)));
-        pictures.push((format!("tau-{task}"), over_tau(task, &groups)));
+        for Definition { name, report, .. } in ALGORITHMS {
+            if let Some(axis) = report.axis {
+                let of_algorithm = Vec::from_iter(groups.iter().copied().filter(|group| group.algorithm == name));
+                pictures.push((format!("{}-{task}", axis.key), over(axis, task, &of_algorithm)));
+            }
+        }
     }
     pictures.retain(|(_, picture)| picture.lines.iter().any(|line| !line.points.is_empty()));
     pictures
@@ -118,32 +123,34 @@ fn profiles(report: &Report) -> Picture {
     }
 }
 
-/// Scores of complete runs over τ, a line for each set of other settings that has several of it (Figures 3 and 4 of the paper).
-fn over_tau(task: &str, groups: &[&GroupReport]) -> Picture {
+/// Scores of complete runs over a hyper-parameter, a line for each set of other settings that has several values of it. Over τ it
+/// is what Figures 3 and 4 of the paper show.
+fn over(axis: Axis, task: &str, groups: &[&GroupReport]) -> Picture {
+    let key = format!("agent.{}", axis.key);
     let mut lines: BTreeMap<Settings, Vec<(f64, &GroupReport)>> = BTreeMap::new();
     for group in groups.iter().filter(|group| !group.scores.is_empty()) {
         let mut others = settings::of_run(&group.runs[0].config);
         others.remove("seed");
-        if let Some(tau) = others.remove(TAU).and_then(|tau| tau.parse().ok()) {
-            lines.entry(others).or_default().push((tau, group));
+        if let Some(value) = others.remove(&key).and_then(|value| value.parse().ok()) {
+            lines.entry(others).or_default().push((value, group));
         }
     }
-    let line = |mut of_tau: Vec<(f64, &GroupReport)>| {
-        of_tau.sort_by(|(one, _), (other, _)| one.total_cmp(other));
+    let line = |mut points: Vec<(f64, &GroupReport)>| {
+        points.sort_by(|(one, _), (other, _)| one.total_cmp(other));
         let mean = |drawn: &[Runs]| vec![statistics::mean_of_means(&drawn[0])];
         let score = |group: &GroupReport| statistics::estimates(&[&vec![group.scores.clone()]], mean)[0];
-        let name = of_tau[0].1.method.split(", ").filter(|part| !part.starts_with(TAU));
+        let name = points[0].1.method.split(", ").filter(|part| !part.starts_with(&key));
         Line {
             label: Vec::from_iter(name).join(", "),
-            points: of_tau.iter().map(|(tau, group)| (tau.log10(), score(group))).collect(),
+            points: points.iter().map(|(value, group)| (value.log10(), score(group))).collect(),
         }
     };
     Picture {
-        title: format!("{task} over τ: {BAND}"),
-        x: "τ",
+        title: format!("{task} over {}: {BAND}", axis.symbol),
+        x: axis.symbol,
         is_power: true,
-        y: groups[0].measure().to_owned(),
-        lines: lines.into_values().filter(|of_tau| of_tau.len() > 1).map(line).collect(),
+        y: groups.first().map_or("", |group| group.measure()).to_owned(),
+        lines: lines.into_values().filter(|points| points.len() > 1).map(line).collect(),
         ..Picture::default()
     }
 }

@@ -8,7 +8,6 @@ use base64::prelude::{BASE64_STANDARD, Engine};
 use minijinja::Environment;
 use minijinja::value::Serde;
 use quad_run::results::RunReport;
-use quad_run::results::lambda::LambdaReport;
 use quad_run::table::Part;
 use serde::Serialize;
 
@@ -114,7 +113,8 @@ fn of_group(group: &GroupReport, runs: &[RunReport]) -> anyhow::Result<Group> {
         let values: BTreeSet<String> = runs.iter().filter_map(|run| value(run)).collect();
         Vec::from_iter(values).join("\n")
     };
-    let lambda = |run: &RunReport, lambda: &LambdaReport| format!("{}: {}", run.run, lambda.text(&run.variant).trim());
+    let summary = |run: &RunReport| Some(format!("{}: {}", run.run, run.summary.as_ref()?.text.trim()));
+    let title = runs.iter().find_map(|run| run.summary.as_ref()).map_or("", |summary| summary.title);
     let dataset = |run: &RunReport| {
         let data = &run.config.dataset;
         let name = run.config.experiment.dataset.as_deref().unwrap_or_default();
@@ -129,7 +129,7 @@ fn of_group(group: &GroupReport, runs: &[RunReport]) -> anyhow::Result<Group> {
         ("learner", once_each(&|run| Some(format!("version {}", run.config.run.version)))),
         ("trained on", once_each(&|run| run.config.run.machine.clone())),
         ("departures", group.departures.join("\n")),
-        ("λ", once_each(&|run| Some(lambda(run, run.lambda.as_ref()?)))),
+        (title, once_each(&summary)),
     ];
     let facts = facts.into_iter().filter(|(_, value)| !value.is_empty()).map(|(name, value)| Fact { name, value });
     let mut settings = toml::Table::try_from(&runs.first().context("a group has runs")?.config.experiment)?;

@@ -2,7 +2,7 @@
 
 use std::fmt::Alignment::{Left, Right};
 
-use quad_run::results::published::{Published, Remark};
+use quad_run::results::published::{self, Published, Remark};
 use quad_run::results::{Select, Spread};
 use quad_run::table::{Part, Table};
 
@@ -14,10 +14,9 @@ type Figure<'a> = (&'a str, &'a Published);
 /// A table of the paper, in its rows the tasks that some of these runs have learnt, with what stands behind each figure below
 /// it; nothing without such runs.
 pub fn table(number: u8, groups: &[GroupReport], select: Select) -> Vec<Part> {
-    // Table 2 is about the guidance of QUAD.
     let is_in = |group: &&GroupReport| {
         let is_of_table = group.published.iter().any(|published| published.tables == [number]);
-        is_of_table && (number == 1 || group.algorithm == "quad")
+        is_of_table && published::is_in(number, &group.algorithm)
     };
     let groups: Vec<&GroupReport> = groups.iter().filter(is_in).collect();
     if groups.is_empty() {

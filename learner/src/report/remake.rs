@@ -13,9 +13,7 @@ pub fn command(run: &RunReport) -> Option<String> {
     let (ours, theirs) = (settings::of_experiment(experiment), settings::of_experiment(&given));
     let mut words = vec!["learner train --task".to_owned(), quoted(&run.task)];
     let mut say = |flag: &str, value: &str| words.extend([flag.to_owned(), quoted(value)]);
-    if run.algorithm != "quad" {
-        say("--algorithm", &run.algorithm);
-    }
+    say("--algorithm", &run.algorithm);
     if let Some(dataset) = &experiment.dataset {
         say("--dataset", dataset);
     }

@@ -1,4 +1,4 @@
-//! Runs that are alike but for their seed, and what becomes of those that are not.
+//! Groups runs that differ only in their seed.
 
 use std::collections::BTreeSet;
 use std::path::PathBuf;
@@ -124,21 +124,16 @@ pub fn groups(runs: &[RunReport], select: Select) -> Vec<GroupReport> {
     };
     let all = groups.iter().enumerate().map(|(index, (own, runs))| {
         let value = |key: &String| own.get(key).map_or_else(|| format!("no {key}"), |value| format!("{key} = {value}"));
-        let RunReport { algorithm, variant, .. } = runs[0];
+        let RunReport { algorithm, variant, called, .. } = runs[0];
         let of_variant = differs(index, &|other| (&other.algorithm, &other.variant) == (algorithm, variant));
-        // The task's own values need no name: of several τ, that of the paper is just QUAD on each task.
+        // Values that the task prescribes are not part of the name.
         let given = as_given(runs[0], true).map(|given| settings::of_experiment(&given)).unwrap_or_default();
         let changed = of_variant.into_iter().filter(|key| given.get(*key) != own.get(*key)).map(value);
-        let method = Vec::from_iter(std::iter::once(named(algorithm, variant)).chain(changed)).join(", ");
+        let method = Vec::from_iter(std::iter::once(called.clone()).chain(changed)).join(", ");
         let differs = differs(index, &|other| other.algorithm == *algorithm).into_iter().map(value).collect();
         group(runs, method, differs, select)
     });
     all.collect()
-}
-
-/// QUAD's variants have names of their own: DAC, and none for behaviour cloning.
-fn named(algorithm: &str, variant: &str) -> String {
-    if algorithm == "quad" || algorithm == variant { variant.to_owned() } else { format!("{algorithm} {variant}") }
 }
 
 fn group(runs: &[&RunReport], method: String, differs: Vec<String>, select: Select) -> GroupReport {

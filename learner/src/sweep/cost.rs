@@ -1,4 +1,4 @@
-//! What a study will cost, foretold by a second's measurement of each of its configurations.
+//! Estimates a study's cost from one second of training of each of its configurations.
 
 use std::collections::BTreeMap;
 use std::path::Path;

@@ -21,4 +21,4 @@ pub(crate) use metrics::{Registrar, TrainingMetrics};
 pub(crate) use outbox::{Outbox, Work};
 pub(crate) use price::Price;
 pub(crate) use results::{Outcome, TrainedPolicy};
-pub(crate) use training::Training;
+pub(crate) use training::{Training, begin};

@@ -1,17 +1,15 @@
-//! What a run costs, foretold by a second's measurement.
+//! Estimates a run's cost from one second of training.
 
-use std::sync::Arc;
 use std::time::{Duration, Instant};
 
-use quad_algorithms::{Agent, Context};
+use quad_algorithms::{Agent, AlgorithmError};
 use quad_dataset::{BatchSampler, Transitions};
-use quad_protocol::Origin;
 use quad_run::config::{Device, Experiment};
 use quad_run::run::Checkpoint;
 
-use super::device;
+use super::training::{begin, origin};
 
-/// How long steps are measured.
+/// How long steps are measured, in all phases together.
 const MEASURED: Duration = Duration::from_secs(1);
 
 /// What a run takes.
@@ -26,38 +24,16 @@ pub(crate) struct Price {
 }
 
 impl Price {
-    /// Measures the first steps of a run, on the threads of the pool that calls.
+    /// Measures the first steps of each phase of a run, on the threads of the pool that calls.
     ///
     /// # Errors
     /// The run could not begin with these transitions, or a step fails.
     pub fn measure(experiment: &Experiment, device: Device, transitions: Transitions) -> anyhow::Result<Self> {
-        let batch_size = experiment.batch_size as usize;
-        let context = Context {
-            transitions: Arc::new(transitions),
-            batch_size,
-            total_steps: experiment.steps,
-            seed: experiment.seed,
-            precision: experiment.precision,
-            device: device::open(device)?,
-        };
-        let mut agent = Agent::new(experiment.definition()?, &experiment.agent, context)?;
-        let mut sampler = BatchSampler::new(agent.items(), batch_size, experiment.seed, 0);
-        let origin = Origin {
-            environment: experiment.environment.clone(),
-            seed: experiment.seed,
-            step: 0,
-            episodes: experiment.episodes,
-        };
-        // The first step makes what later ones use again.
-        agent.update(sampler.next_items())?;
-        let (begin, mut steps) = (Instant::now(), 0);
-        while begin.elapsed() < MEASURED {
-            agent.update(sampler.next_items())?;
-            steps += 1;
-        }
+        let mut agent = begin(experiment, device, transitions)?;
+        let mut sampler = BatchSampler::new(agent.items(), experiment.batch_size as usize, experiment.seed, 0);
         Ok(Self {
-            step: begin.elapsed().as_secs_f64() / f64::from(steps),
-            snapshot: agent.policy(&origin)?.len() as u64,
+            step: mean_step(&mut agent, &mut sampler, experiment.steps)?,
+            snapshot: agent.policy(origin(experiment))?.len() as u64,
             checkpoint: agent.save()?.len() as u64,
         })
     }
@@ -67,4 +43,27 @@ impl Price {
         let snapshots = experiment.schedule().evaluated_steps().count().max(1) as u64;
         snapshots * self.snapshot + Checkpoint::KEPT as u64 * self.checkpoint
     }
+}
+
+/// Seconds of a step, in the mean over a run of so many: each phase counts by its share of them.
+pub(super) fn mean_step(agent: &mut Agent, sampler: &mut BatchSampler, steps: u64) -> Result<f64, AlgorithmError> {
+    let mut begins = agent.phases();
+    begins.push(steps);
+    let phases = Vec::from_iter(begins.windows(2).map(|phase| (phase[0], phase[1])).filter(|(begin, end)| begin < end));
+    let mut seconds = 0.0;
+    for (begin, end) in &phases {
+        let mut step = || {
+            agent.skip_to(*begin);
+            agent.update(sampler.next_items())
+        };
+        // The first step makes what later ones use again.
+        step()?;
+        let (start, mut done) = (Instant::now(), 0);
+        while done == 0 || start.elapsed() < MEASURED / phases.len() as u32 {
+            step()?;
+            done += 1;
+        }
+        seconds += start.elapsed().as_secs_f64() / f64::from(done) * (end - begin) as f64;
+    }
+    Ok(seconds / steps as f64)
 }

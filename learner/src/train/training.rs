@@ -1,25 +1,25 @@
-//! The work of the thread `training`: makes the agent, goes on from a checkpoint, trains.
+//! The work of the thread `training`: goes on from a checkpoint, trains. The agent is made before the run's folder.
 
 use std::sync::Arc;
 use std::sync::atomic::AtomicBool;
 use std::time::Duration;
 
 use anyhow::{Context, anyhow};
-use quad_algorithms::{Agent, Context as Learning};
+use quad_algorithms::{Agent, AlgorithmError, Context as Learning};
 use quad_dataset::{BatchSampler, Transitions};
 use quad_protocol::{Origin, Snapshot};
 use quad_run::config::{Device, Experiment};
 use quad_run::run::Checkpoint;
-use quad_runtime::{Beat, hinted};
+use quad_runtime::{Beat, Hint, hinted};
 
 use super::device;
 use super::metrics::TrainingMetrics;
 use super::outbox::Outbox;
 use super::steps::{Outlets, Plan, TrainError, train};
 
-const DIVERGED: &str = "the same configuration would diverge again: try a smaller agent.critic_learning_rate or \
-                        agent.actor_learning_rate, a smaller agent.gradient_clip, or look for outliers with \
-                        `learner datasets inspect`; begin anew with --fresh";
+const DIVERGED: &str = "the same configuration would diverge again: try smaller learning rates (`learner presets TASK` prints the \
+                        names of all hyper-parameters), or look for outliers with `learner datasets inspect`; begin anew with \
+                        --fresh";
 
 const TOO_LARGE: &str = "take smaller networks or fewer critics; or train without evaluations (--eval-interval 0) and score the \
                          last snapshot by `evaluator score`";
@@ -27,8 +27,8 @@ const TOO_LARGE: &str = "take smaller networks or fewer critics; or train withou
 /// Everything that the thread takes along.
 pub(crate) struct Training {
     pub experiment: Experiment,
-    pub device: Device,
-    pub transitions: Arc<Transitions>,
+    /// At step 0.
+    pub agent: Agent,
     /// Where an earlier incarnation of the run has left off.
     pub checkpoint: Option<Checkpoint>,
     /// Least time between two checkpoints.
@@ -41,21 +41,42 @@ pub(crate) struct Training {
     pub stop: Arc<AtomicBool>,
 }
 
+/// The algorithm of an experiment at step 0. What it cannot learn with, or from, is refused here, before the run has a folder.
+///
+/// # Errors
+/// The algorithm cannot start with its hyper-parameters or these transitions, or evaluators cannot be sent its policy.
+pub(crate) fn begin(experiment: &Experiment, device: Device, transitions: Transitions) -> anyhow::Result<Agent> {
+    let context = Learning {
+        transitions: Arc::new(transitions),
+        batch_size: experiment.batch_size as usize,
+        total_steps: experiment.steps,
+        seed: experiment.seed,
+        precision: experiment.precision,
+        device: device::open(device)?,
+    };
+    let agent = Agent::new(experiment.definition()?, &experiment.agent, context).hint_of(AlgorithmError::hint)?;
+    if experiment.eval_interval > 0 {
+        check_size(agent.policy(origin(experiment))?.len())?;
+    }
+    Ok(agent)
+}
+
+/// Where the snapshots of a run are from; the step is set for each.
+pub(super) fn origin(experiment: &Experiment) -> Origin {
+    let Experiment { environment, seed, episodes, .. } = experiment;
+    Origin { environment: environment.clone(), seed: *seed, step: 0, episodes: *episodes }
+}
+
 impl Training {
     /// The thread's work. How training ended comes last in the outbox, unless it failed.
     pub fn run(self, beat: &Beat) -> anyhow::Result<()> {
-        let mut agent = self.agent()?;
-        let experiment = &self.experiment;
-        let origin = Origin {
-            environment: experiment.environment.clone(),
-            seed: experiment.seed,
-            step: agent.step(),
-            episodes: experiment.episodes,
-        };
-        if experiment.eval_interval > 0 {
-            check_size(agent.policy(&origin)?.len())?;
+        let Self { experiment, mut agent, .. } = self;
+        if let Some(Checkpoint { step, state }) = &self.checkpoint {
+            let advice = "begin anew with --fresh, or go on with the version of the learner that wrote it";
+            let loaded = agent.load(state).hint(advice);
+            loaded.with_context(|| format!("cannot go on from the checkpoint of step {step}"))?;
         }
-        let batch_size = experiment.batch_size as usize;
+        let (batch_size, origin) = (experiment.batch_size as usize, origin(&experiment));
         let mut sampler = BatchSampler::new(agent.items(), batch_size, experiment.seed, agent.step());
         let outlets = Outlets { metrics: &self.metrics, outbox: &self.outbox, origin: &origin, stop: &self.stop, beat };
         let plan = Plan {
@@ -71,31 +92,9 @@ impl Training {
         self.outbox.ended(outcome);
         Ok(())
     }
-
-    /// At the step of the checkpoint, or at step 0.
-    fn agent(&self) -> anyhow::Result<Agent> {
-        let experiment = &self.experiment;
-        let context = Learning {
-            transitions: self.transitions.clone(),
-            batch_size: experiment.batch_size as usize,
-            total_steps: experiment.steps,
-            seed: experiment.seed,
-            precision: experiment.precision,
-            device: device::open(self.device)?,
-        };
-        let mut agent = Agent::new(experiment.definition()?, &experiment.agent, context)?;
-        if let Some(Checkpoint { step, state }) = &self.checkpoint {
-            let advice = "begin anew with --fresh, or go on with the version of the learner that wrote it";
-            agent
-                .load(state)
-                .map_err(|error| hinted(error, advice))
-                .with_context(|| format!("cannot go on from the checkpoint of step {step}"))?;
-        }
-        Ok(agent)
-    }
 }
 
-/// That evaluators can be sent a policy's file of so many bytes: they could not at the first evaluation, hours later, either.
+/// Checks that evaluators can be sent a policy's file of so many bytes: fails now rather than at the first evaluation.
 fn check_size(bytes: usize) -> anyhow::Result<()> {
     let most = Snapshot::MOST_FILE;
     if bytes <= most {

@@ -2,7 +2,7 @@
 
 use toml::Table;
 
-use crate::{printed, write_dataset};
+use crate::{learner, printed, write_dataset};
 
 #[test]
 fn a_dry_run_prints_the_run_and_its_cost_and_leaves_nothing() {
@@ -22,4 +22,38 @@ fn a_dry_run_prints_the_run_and_its_cost_and_leaves_nothing() {
     assert_eq!(printed, text.parse().unwrap());
     assert_eq!((printed["seed"].as_integer(), printed["batch_size"].as_integer()), (Some(7), Some(8)));
     assert!(!std::path::Path::new(&run).exists());
+}
+
+/// However short a run of Onestep-RL is, it has its three phases.
+#[test]
+fn phases_are_shares_of_a_run() {
+    let folder = tempfile::tempdir().unwrap();
+    let data = folder.path().join("data.hdf5").display().to_string();
+    write_dataset(data.as_ref());
+    let asked =
+        ["train", "--algorithm", "onestep", "--dataset", &data, "--dry-run", "--steps", "600", "--set", "batch_size=8"];
+    for task in ["hopper-demo", "hopper-medium-v2"] {
+        let text = printed(&[&asked[..], &["--task", task, "--set", "agent.critic.hidden=[8]"]].concat());
+        assert!(text.contains("hours for all 600"), "{text}");
+    }
+}
+
+/// Whatever an algorithm cannot learn with is refused while there is no folder to clear away.
+#[test]
+fn a_start_that_is_refused_leaves_no_folder() {
+    let folder = tempfile::tempdir().unwrap();
+    let [data, run] = ["data.hdf5", "run"].map(|name| folder.path().join(name).display().to_string());
+    write_dataset(data.as_ref());
+    let asked = ["train", "--task", "hopper-demo", "--dataset", &data, "--run-dir", &run, "--set", "batch_size=8"];
+    let too_large = ["--agent", "critics=1", "--agent", "actor.hidden=[4096,4096]"];
+    for (changes, said) in [
+        (&["--algorithm", "onestep", "--agent", "phases.policy=0"][..], "0 is not at least 1"),
+        (&["--agent", "diffusion_steps=1001"], "1001 is not a whole number from 1 to 1000"),
+        (&too_large, "evaluators can be sent at most"),
+    ] {
+        let output = learner(&[&asked[..], changes].concat());
+        let error = String::from_utf8_lossy(&output.stderr);
+        assert!(!output.status.success() && error.contains(said) && error.contains("hint: "), "{error}");
+        assert!(!std::path::Path::new(&run).exists(), "{changes:?}");
+    }
 }

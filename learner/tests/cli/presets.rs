@@ -186,3 +186,13 @@ fn a_file_changes_its_task_and_takes_its_environments_reward_rule() {
         assert!(error().contains(words) && error().contains("hint: "), "{}", error());
     }
 }
+
+#[test]
+fn what_algorithms_measure_is_listed() {
+    let all = printed(&["presets", "--metrics"]);
+    let one = printed(&["presets", "--metrics", "--algorithm", "dql"]);
+    assert!(all.contains(&one) && all.len() > 2 * one.len(), "{all}");
+    let row = one.lines().find(|line| line.starts_with("q_loss ")).unwrap();
+    assert!(row.contains("(Diffusion-QL's Eq. 3)"), "{row}");
+    assert!(!learner(&["presets", "hopper-demo", "--metrics"]).status.success(), "one of the two");
+}

@@ -1,7 +1,7 @@
 //! One experiment, every value of which is checked.
 
 use anyhow::{Context, ensure};
-use quad_algorithms::Definition;
+use quad_algorithms::{Definition, Reporting, Variant};
 use quad_dataset::{RewardRule, Scale};
 use quad_policy::Precision;
 use quad_runtime::Hint;
@@ -69,22 +69,35 @@ impl Experiment {
     /// # Errors
     /// As [`Self::definition`].
     pub fn variant(&self) -> anyhow::Result<&str> {
-        let key = self.definition()?.variant;
-        let value = key.and_then(|key| self.agent.get(key)).and_then(Value::as_str);
+        let variant = self.definition()?.report.variant;
+        let value = variant.and_then(|variant| self.agent.get(variant.key)).and_then(Value::as_str);
         Ok(value.unwrap_or(&self.algorithm))
     }
 
-    /// The algorithm as people read it: its name, its variant where there are several, and candidates where its policy draws some.
+    /// What tables and figures call the variant.
+    ///
+    /// # Errors
+    /// As [`Self::definition`].
+    pub fn called(&self) -> anyhow::Result<String> {
+        let (known, variant) = (self.definition()?.report.variant, self.variant()?);
+        Ok(known.map_or_else(|| variant.to_owned(), |known| (known.called)(variant)))
+    }
+
+    /// The algorithm as people read it: its name, its variant where there are several, and counts, such as candidates, where it
+    /// has some.
     ///
     /// # Errors
     /// As [`Self::definition`].
     pub fn method(&self) -> anyhow::Result<String> {
-        let key = self.definition()?.variant;
-        let named =
-            |key: &str| self.agent.get(key).map(|value| format!(", {key} {}", value.to_string().trim_matches('"')));
-        let variant = key.and_then(named).unwrap_or_default();
-        let candidates = self.agent.get("candidates").map(|count| format!(", {count} candidates")).unwrap_or_default();
-        Ok(format!("{}{variant}{candidates}", self.algorithm))
+        let Reporting { variant, counts, .. } = self.definition()?.report;
+        let mut method = self.algorithm.clone();
+        if let Some(Variant { key, .. }) = variant {
+            method += &format!(", {key} {}", self.variant()?);
+        }
+        for (count, key) in counts.iter().filter_map(|key| Some((self.agent.get(*key)?, key))) {
+            method += &format!(", {count} {key}");
+        }
+        Ok(method)
     }
 
     /// How many gradient steps there are, and which are evaluated.

@@ -19,8 +19,7 @@ fn lacks(values: &Values, task: &Task) -> bool {
 pub fn not_given(definition: &Definition, task: &Task) -> anyhow::Result<Option<String>> {
     let lacking = lacks(&Values::of(definition)?, task);
     let (algorithm, task) = (definition.name, &task.name);
-    Ok(lacking
-        .then(|| format!("not given by the authors of {algorithm}: values for {task}; those of other tasks hold")))
+    Ok(lacking.then(|| format!("{algorithm}'s authors give no values for {task}; its general values are used")))
 }
 
 /// The algorithm of that name.

@@ -1,7 +1,8 @@
-//! In which ways runs of one of the paper's tasks are not what the authors of their algorithm ran.
+//! Where runs of one of the paper's tasks differ from what the authors of their algorithm ran.
 
 use std::collections::BTreeSet;
 
+use quad_algorithms::Variant;
 use quad_dataset::catalogue::{self, Checksum};
 
 use super::published::{self, SEEDS};
@@ -51,8 +52,8 @@ fn as_published(run: &RunReport) -> anyhow::Result<Experiment> {
 /// The values of the task for the algorithm, and for the variant of it if that is not to be a departure.
 pub fn as_given(run: &RunReport, of_variant: bool) -> anyhow::Result<Experiment> {
     let mut asked = toml::Table::from_iter([("algorithm".to_owned(), run.algorithm.as_str().into())]);
-    let variant = run.config.experiment.definition()?.variant;
-    if let Some(key) = variant.filter(|_| of_variant) {
+    let variant = run.config.experiment.definition()?.report.variant;
+    if let Some(Variant { key, .. }) = variant.filter(|_| of_variant) {
         let agent = toml::Table::from_iter([(key.to_owned(), run.variant.as_str().into())]);
         asked.insert("agent".to_owned(), agent.into());
     }

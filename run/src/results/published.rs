@@ -111,6 +111,12 @@ pub fn scores(task: &str) -> Vec<Published> {
     TABLES.method.iter().filter_map(published).collect()
 }
 
+/// Whether a table of the paper has a row or column of an algorithm of ours, in any of its variants.
+pub fn is_in(table: u8, algorithm: &str) -> bool {
+    let is_it = |method: &Method| method.tables.contains(&table) && method.algorithm.as_deref() == Some(algorithm);
+    TABLES.method.iter().any(is_it)
+}
+
 /// What the paper calls a variant of an algorithm: several names where it has several rows, none where it has none.
 pub fn methods(algorithm: &str, variant: &str) -> Vec<&'static str> {
     let is_it = |method: &&Method| {

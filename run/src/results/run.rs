@@ -3,13 +3,15 @@
 use std::collections::{BTreeMap, BTreeSet};
 use std::fmt::Alignment::Right;
 use std::fmt::Write;
+use std::fs;
+use std::io::ErrorKind;
 use std::path::{Path, PathBuf};
 
 use anyhow::Context;
+use quad_algorithms::{MetricsLine, Summary};
 use quad_dataset::environment;
 use serde::Serialize;
 
-use super::lambda::LambdaReport;
 use super::spread::Spread;
 use crate::config::RunConfig;
 use crate::run::{RunDir, ScoreLine};
@@ -79,10 +81,13 @@ pub struct RunReport {
     pub mean_last_5: Option<f64>,
     /// The same of those in the last 50,000 steps of the run; absent if it has no more steps than that.
     pub mean_last_50000_steps: Option<f64>,
-    /// What λ was; absent where the algorithm has none.
-    #[serde(skip_serializing_if = "Option::is_none")]
-    pub lambda: Option<LambdaReport>,
-    /// Whether the evaluators' user decides what counts as a score, such as success, and it is not the return.
+    /// What its algorithm says of its metrics, such as QUAD of λ, under a name of the algorithm's; absent if nothing.
+    #[serde(flatten)]
+    pub summary: Option<Summary>,
+    /// What tables and figures call the variant.
+    #[serde(skip)]
+    pub called: String,
+    /// True if the evaluator defines the score itself, such as success.
     #[serde(skip)]
     own_score: bool,
     /// Each precision that its policies were scored in.
@@ -100,10 +105,14 @@ impl RunReport {
     /// There is no run in it, or a file is not what a learner writes.
     pub fn read(path: &Path) -> anyhow::Result<Self> {
         let scored = Self::scored(path)?;
-        Ok(Self { lambda: LambdaReport::read(path, &scored.variant)?, ..scored })
+        let summary = match scored.config.experiment.definition()?.report.summary {
+            Some(summary) => summary(&metrics(path)?, &scored.variant),
+            None => None,
+        };
+        Ok(Self { summary, ..scored })
     }
 
-    /// The same without what λ was, for which all of `metrics.jsonl` is read.
+    /// Reads a run folder, but not `metrics.jsonl`, so that the report has no summary.
     ///
     /// # Errors
     /// Those of [`read`](Self::read).
@@ -111,7 +120,7 @@ impl RunReport {
         Ok(Self::with_scores(path)?.0)
     }
 
-    /// The same, and the episodes' scores that it is made of.
+    /// Reads what [`scored`](Self::scored) reads, and gives the episodes' scores, too.
     ///
     /// # Errors
     /// Those of [`read`](Self::read).
@@ -119,12 +128,13 @@ impl RunReport {
         let (dir, config) = RunDir::open(path)?;
         let agent = config.experiment.method();
         let agent = agent.with_context(|| format!("config.toml in {} cannot be used", path.display()))?;
-        let variant = config.experiment.variant()?.to_owned();
+        let names = [agent, config.experiment.variant()?.to_owned(), config.experiment.called()?];
         let scores = dir.read_scores()?;
-        Ok((Self::new(path, config, agent, variant, &scores), scores))
+        Ok((Self::new(path, config, names, &scores), scores))
     }
 
-    fn new(path: &Path, config: RunConfig, agent: String, variant: String, lines: &[ScoreLine]) -> Self {
+    fn new(path: &Path, config: RunConfig, names: [String; 3], lines: &[ScoreLine]) -> Self {
+        let [agent, variant, called] = names;
         let experiment = &config.experiment;
         let mut by_step: BTreeMap<u64, BTreeMap<u64, &ScoreLine>> = BTreeMap::new();
         for line in lines {
@@ -168,7 +178,8 @@ impl RunReport {
             mean_last_50000_steps: final_steps.and_then(in_final_steps),
             evaluations,
             missing,
-            lambda: None,
+            summary: None,
+            called,
             precisions,
             config,
         }
@@ -265,7 +276,17 @@ impl RunReport {
                 writeln!(text, "mean {} of the {name:19} {mean:.2}", self.measure()).ok();
             }
         }
-        text + &self.lambda.as_ref().map(|lambda| lambda.text(&self.variant)).unwrap_or_default()
+        text + &self.summary.as_ref().map(|summary| format!("\n{}", summary.text)).unwrap_or_default()
+    }
+}
+
+/// The lines of `metrics.jsonl` in a run folder; none if there is no such file. The last one may not be complete.
+fn metrics(folder: &Path) -> anyhow::Result<Vec<MetricsLine>> {
+    let path = folder.join("metrics.jsonl");
+    match fs::read_to_string(&path) {
+        Ok(text) => Ok(text.lines().filter_map(|line| serde_json::from_str(line).ok()).collect()),
+        Err(error) if error.kind() == ErrorKind::NotFound => Ok(Vec::new()),
+        Err(error) => Err(error).with_context(|| format!("cannot read {}", path.display())),
     }
 }
 

@@ -1,0 +1,59 @@
+//! What λ was in a run of QUAD, from its metrics: whether the critics' uncertainty changed the guidance.
+
+use std::collections::BTreeMap;
+
+use serde_json::json;
+
+use crate::definition::{MetricsLine, Summary};
+
+/// The first of so many parts of a run does not count: critics that have learnt little agree by chance.
+const PARTS: u64 = 10;
+/// A weight above this is taken for no weight.
+const ONE: f64 = 0.99;
+
+/// What λ was after the first tenth of the steps that a run has made so far. `variant` is the run's guidance. Without guidance
+/// there is nothing to say, nor where the lines hold nothing of λ.
+pub(super) fn of(lines: &[MetricsLine], variant: &str) -> Option<Summary> {
+    let mut lines =
+        Vec::from_iter(lines.iter().filter(|line| line.contains_key("variance_ratio") && variant != "none"));
+    let step = |line: &MetricsLine| line.get("step").map_or(0, |step| *step as u64);
+    let to_step = step(lines.last()?);
+    let from_step = to_step / PARTS + 1;
+    lines.retain(|line| step(line) >= from_step);
+    let mut means: BTreeMap<&str, f64> = BTreeMap::new();
+    for (name, value) in lines.iter().flat_map(|line| line.iter()).filter(|(name, _)| is_told(name)) {
+        *means.entry(name).or_default() += value / lines.len() as f64;
+    }
+    let is_dac = lines.iter().all(|line| line.get("lambda_mean").is_some_and(|mean| *mean > ONE));
+    let mut text = text(&means, from_step, to_step);
+    if is_dac && variant != "dac" {
+        text.push_str("λ stayed above 0.99: this run is DAC to within 1 %\n");
+    }
+    let mut json = json!({ "from_step": from_step, "to_step": to_step, "is_dac": is_dac });
+    means.into_iter().for_each(|(name, mean)| json[name] = mean.into());
+    Some(Summary { key: "lambda", title: "λ", json, text })
+}
+
+fn text(means: &BTreeMap<&str, f64>, from_step: u64, to_step: u64) -> String {
+    let mean = |name: &str| means.get(name).copied().unwrap_or_default();
+    let [low, median, high] = [10, 50, 90].map(|percent| mean(&format!("lambda_quantile_{percent}")));
+    let fifths = [1, 2, 3, 4, 5].map(|fifth| format!("{:.3}", mean(&format!("lambda_fifth_{fifth}"))));
+    format!(
+        "λ in steps {from_step} to {to_step}: mean {:.3}, of a batch 10 % below {low:.3}, 50 % below {median:.3}, 90 % below \
+         {high:.3}; {:.1} % above {ONE}\n\
+         λ from the first to the last fifth of the denoising steps t = 1…T: {}\n\
+         σ²/ν̂² {:.3}, cosine of guidance and behaviour cloning {:.3}\n",
+        mean("lambda_mean"),
+        100.0 * mean("lambda_above_99_share"),
+        fifths.join(" "),
+        mean("variance_ratio"),
+        mean("guidance_cosine"),
+    )
+}
+
+fn is_told(name: &str) -> bool {
+    name.starts_with("lambda_") || ["variance_ratio", "guidance_cosine"].contains(&name)
+}
+
+#[cfg(test)]
+mod tests;
