@@ -9,6 +9,8 @@ use std::os::unix::fs::MetadataExt;
 use std::path::{Path, PathBuf};
 use std::time::UNIX_EPOCH;
 
+use crate::process::preload;
+
 /// The variables that tell the preloaded library of the two folders.
 const FOLDER: &str = "QUAD_TESTS_DISK";
 const KEPT: &str = "QUAD_TESTS_DISK_KEPT";
@@ -37,13 +39,8 @@ impl Disk {
 
     /// The words that start a program whose synchronising is watched.
     pub fn launcher(&self) -> Vec<String> {
-        let test = std::env::current_exe().expect("a test knows its own executable");
-        // target/release/deps/test-123 → target/release/examples/libpower_cut.so
-        let release = test.parent().and_then(Path::parent).expect("a test lies two folders below target/");
-        let library = release.join("examples/libpower_cut.so");
-        assert!(library.exists(), "{} is missing; cargo build --release --examples makes it", library.display());
         let set = |variable: &str, path: &Path| format!("{variable}={}", path.display());
-        vec!["env".to_owned(), set("LD_PRELOAD", &library), set(FOLDER, &self.folder), set(KEPT, &self.kept)]
+        [preload("power_cut"), vec![set(FOLDER, &self.folder), set(KEPT, &self.kept)]].concat()
     }
 
     /// Keeps a file or folder as it is now, if it is on this disk. Whole or not at all, whenever the program dies.

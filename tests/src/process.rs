@@ -17,6 +17,16 @@ pub fn binary(name: &str) -> PathBuf {
     path
 }
 
+/// The words that start a program with a library that is an example of this crate, as `cargo test` builds it.
+pub fn preload(example: &str) -> Vec<String> {
+    let test = std::env::current_exe().expect("a test knows its own executable");
+    // target/release/deps/test-123 → target/release/examples/libNAME.so
+    let release = test.parent().and_then(Path::parent).expect("a test lies two folders below target/");
+    let library = release.join(format!("examples/lib{example}.so"));
+    assert!(library.exists(), "{} is missing; cargo build --release --examples makes it", library.display());
+    vec!["env".to_owned(), format!("LD_PRELOAD={}", library.display())]
+}
+
 /// That a program ended with exit code 1, an error that has this sentence, and a hint that has that.
 pub fn assert_refused(output: &Output, sentence: &str, hint: &str) {
     let text = String::from_utf8_lossy(&output.stderr);

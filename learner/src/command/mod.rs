@@ -18,7 +18,7 @@ use quad_run::config::{Preset, tasks};
 use quad_run::run::{RunDirError, runs_in, verify};
 use quad_run::status::list;
 use quad_run::table::{Style, Table};
-use quad_runtime::{Hint, hinted, print};
+use quad_runtime::{Hint, hinted, json, print, unfinished};
 use tracing::{info, warn};
 
 use crate::cli::{
@@ -38,14 +38,22 @@ pub fn run(cli: &Cli) -> anyhow::Result<()> {
         Command::Presets(args) => list_presets(args),
         Command::Datasets(command) => datasets(command),
         Command::Report(args) => report(args),
-        Command::Verify(args) => check_run(args),
+        Command::Verify(args) => check_runs(args),
         Command::List(args) => list_runs(args),
         Command::Page(args) => page::show(args),
         Command::Doctor(args) => examine(args),
         Command::Completions { shell } => completions(*shell),
     };
-    done.map_err(|error| match error.downcast_ref().map(RunDirError::hint) {
-        Some(hint) => hinted(error, hint),
+    done.map_err(|error| match error.downcast_ref() {
+        // The learner that is at work there may complete the run, or leave it to this command.
+        Some(in_use @ RunDirError::InUse(_)) => {
+            let hint = in_use.hint();
+            unfinished(error, hint)
+        }
+        Some(other) => {
+            let hint = other.hint();
+            hinted(error, hint)
+        }
         None => error,
     })
 }
@@ -111,24 +119,32 @@ fn report(args: &ReportArgs) -> anyhow::Result<()> {
         (.., true) => Style::Csv,
         _ => Style::Text,
     };
-    print(&if args.json { serde_json::to_string_pretty(&report)? } else { report.render(style) })
+    print(&if args.json { json(&report)? } else { report.render(style) })
 }
 
-fn check_run(args: &VerifyArgs) -> anyhow::Result<()> {
-    let mut findings = vec![(String::new(), verify::verify(&args.dir)?)];
-    if let Some(other) = &args.same_as {
-        findings.push((format!("with {}: ", other.display()), verify::compare(&args.dir, other)?));
+fn check_runs(args: &VerifyArgs) -> anyhow::Result<()> {
+    let mut all_held = true;
+    for dir in &args.dirs {
+        let about = if args.dirs.len() > 1 { format!("{}: ", dir.display()) } else { String::new() };
+        let mut findings = vec![(about, verify::verify(dir)?)];
+        if let Some(other) = &args.same_as {
+            findings.push((format!("with {}: ", other.display()), verify::compare(dir, other)?));
+        }
+        for (about, found) in &findings {
+            print(&format!("{about}{found}"))?;
+            all_held &= found.all_held();
+        }
     }
-    for (about, found) in &findings {
-        print(&format!("{about}{found}"))?;
-    }
-    anyhow::ensure!(findings.iter().all(|(_, found)| found.all_held()), "not everything held");
+    anyhow::ensure!(all_held, "not everything held");
     Ok(())
 }
 
 fn list_runs(args: &ListArgs) -> anyhow::Result<()> {
     let entries = list::list(&args.dirs);
-    print(&if args.json { serde_json::to_string_pretty(&entries)? } else { list::table(&entries) })
+    print(&if args.json { json(&entries)? } else { list::table(&entries) })?;
+    let unreadable: Vec<_> = entries.iter().filter_map(list::Entry::unreadable).collect();
+    anyhow::ensure!(unreadable.is_empty(), "some runs cannot be read:\n  {}", unreadable.join("\n  "));
+    Ok(())
 }
 
 fn completions(shell: Shell) -> anyhow::Result<()> {
@@ -139,7 +155,7 @@ fn completions(shell: Shell) -> anyhow::Result<()> {
 
 fn examine(args: &DoctorArgs) -> anyhow::Result<()> {
     let findings = doctor::examine(args)?;
-    print(&if args.json { findings.json()? } else { findings.to_string() })?;
+    print(&if args.json { json(&findings)? } else { findings.to_string() })?;
     findings.verdict()
 }
 
@@ -157,7 +173,7 @@ fn datasets(command: &DatasetsCommand) -> anyhow::Result<()> {
     }
 }
 
-/// Problems are part of the result; only an unreadable dataset is an error.
+/// Prints what a dataset contains; one with problems is an error.
 fn inspect(args: &InspectArgs) -> anyhow::Result<()> {
     let source = Source::parse(&args.dataset)?;
     let environment = args.env.or_else(|| environment::find(&source.entry()?.environment).ok());
@@ -166,5 +182,8 @@ fn inspect(args: &InspectArgs) -> anyhow::Result<()> {
         source => source.obtain()?.path,
     };
     let inspection = quad_dataset::inspect(&path, environment).hint_of(DatasetError::hint)?;
-    print(&if args.json { serde_json::to_string_pretty(&inspection)? } else { inspection.to_string() })
+    print(&if args.json { json(&inspection)? } else { inspection.to_string() })?;
+    let problems = inspection.problems.len();
+    anyhow::ensure!(problems == 0, "{problems} problems in {}", inspection.path.display());
+    Ok(())
 }

@@ -3,6 +3,9 @@
 use std::io::{self, ErrorKind};
 use std::path::{Path, PathBuf};
 
+/// What failed where a folder cannot be made, which has a hint of its own.
+pub(super) const CREATE: &str = "create";
+
 /// A run folder that cannot be used.
 #[derive(Debug, thiserror::Error)]
 pub enum RunDirError {
@@ -12,6 +15,9 @@ pub enum RunDirError {
     /// Another learner works in it.
     #[error("another learner is at work in {0}")]
     InUse(PathBuf),
+    /// Files have no locks there, and a learner on another host has claimed the folder by this file.
+    #[error("files have no locks there, and {0} names another host, on which a learner is or was at work")]
+    Claimed(PathBuf),
     /// The folder of a run at work is not there any more.
     #[error("the run's folder {0} was removed or renamed")]
     Gone(PathBuf),
@@ -43,12 +49,13 @@ impl RunDirError {
         match self {
             Self::Occupied(_) => "give the command again to go on with that run, or choose another folder by --run-dir",
             Self::Gone(_) => "put it back, and give the command again to go on; or begin anew",
+            Self::Claimed(_) => "wait for the end of that learner; if it is gone, as with its host, remove that file",
             Self::InUse(_) => "wait for its end, or choose another folder by --run-dir",
             Self::Content { .. } => {
                 "put a copy of the file in its place; --fresh renames the folder and begins anew. A line of scores.jsonl may \
                  also be taken out: its episode is scored again"
             }
-            Self::Io { action: "create", .. } => "choose a folder that you may write to with --run-dir DIR",
+            Self::Io { action: CREATE, .. } => "choose a folder that you may write to with --run-dir DIR",
             Self::Io { source, .. } => match source.kind() {
                 ErrorKind::NotFound | ErrorKind::NotADirectory => "is it a folder that `learner train` has written?",
                 ErrorKind::PermissionDenied | ErrorKind::ReadOnlyFilesystem => {

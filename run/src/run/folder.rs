@@ -10,7 +10,7 @@
 //! report.json, learning_curve.svg    written at the end
 //! ```
 
-use std::fs::{self, File, TryLockError};
+use std::fs;
 use std::io;
 use std::path::{Path, PathBuf};
 
@@ -18,13 +18,15 @@ use serde::{Deserialize, Serialize};
 
 use super::checkpoints::{Checkpoint, Checkpoints};
 use super::durable::{self, replace};
-use super::error::{RunDirError, content, io_error};
+use super::error::{CREATE, RunDirError, content, io_error};
 use super::lines::{RunEndpoints, ScoreLine};
+use super::lock::Lock;
 use super::log::Log;
 use crate::config::RunConfig;
 
 /// The file by which a sweep remembers that a run has failed.
 const FAILED: &str = "failed";
+const SCORES: &str = "scores.jsonl";
 
 /// The folder of one run.
 #[derive(Clone, Debug)]
@@ -49,7 +51,7 @@ impl RunDir {
         }
         let run = Self::at(path);
         let snapshots = path.join("snapshots");
-        durable::create_folder(&snapshots).map_err(io_error("create", &snapshots))?;
+        durable::create_folder(&snapshots).map_err(io_error(CREATE, &snapshots))?;
         // Of two that begin at once, only one gets past this; and scores of unknown origin are not those of a new run.
         let scores = run.score_log()?;
         if Self::is_occupied(path) || !scores.is_empty() {
@@ -67,10 +69,9 @@ impl RunDir {
         Self { path: path.to_owned() }
     }
 
-    /// Whether a learner is at work in it, by its lock on `scores.jsonl`. Where files have no locks, none is.
+    /// Whether a learner is at work in it, by its lock on `scores.jsonl`.
     pub fn is_in_use(&self) -> bool {
-        let log = File::open(self.path.join("scores.jsonl"));
-        log.is_ok_and(|log| matches!(log.try_lock_shared(), Err(TryLockError::WouldBlock)))
+        Lock::is_taken(&self.path.join(SCORES))
     }
 
     /// Remembers that a run of a sweep has failed, or forgets it.
@@ -235,7 +236,9 @@ impl RunDir {
     /// # Errors
     /// [`RunDirError::InUse`] if another learner works in this folder.
     pub fn score_log(&self) -> Result<Log, RunDirError> {
-        Log::open(self.path.join("scores.jsonl"), true)
+        let path = self.path.join(SCORES);
+        let lock = Lock::take(&path)?;
+        Log::open(path, Some(lock))
     }
 
     /// `metrics.jsonl`, opened for appending, without the lines after `step`: a learner that goes on from there writes them
@@ -246,7 +249,7 @@ impl RunDir {
             step: u64,
             seconds: f64,
         }
-        let mut log = Log::open(self.path.join("metrics.jsonl"), false)?;
+        let mut log = Log::open(self.path.join("metrics.jsonl"), None)?;
         let mut seconds = 0.0;
         log.keep_while(|line| match serde_json::from_str::<Line>(line) {
             Ok(line) if line.step <= step => {
@@ -260,7 +263,7 @@ impl RunDir {
 
     /// The lines of `scores.jsonl`; none if nothing was scored yet. A last line that is not complete yet is left out.
     pub fn read_scores(&self) -> Result<Vec<ScoreLine>, RunDirError> {
-        let path = self.path.join("scores.jsonl");
+        let path = self.path.join(SCORES);
         let text = match fs::read_to_string(&path) {
             Err(error) if error.kind() == io::ErrorKind::NotFound => return Ok(Vec::new()),
             other => other.map_err(io_error("read", &path))?,
@@ -274,6 +277,6 @@ impl RunDir {
 
     /// The error for `scores.jsonl` whose lines do not go together.
     pub fn broken_scores(&self, reason: String) -> RunDirError {
-        content(&self.path.join("scores.jsonl"), None, &reason)
+        content(&self.path.join(SCORES), None, &reason)
     }
 }

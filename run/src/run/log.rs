@@ -1,21 +1,16 @@
 //! Files of JSON lines that only grow.
 
-use std::fs::{File, OpenOptions, TryLockError};
+use std::fs::{File, OpenOptions};
 use std::io::{self, Read, Seek, SeekFrom, Write};
 use std::path::{Path, PathBuf};
-use std::thread::sleep;
-use std::time::Duration;
 
 use serde::Serialize;
-use tracing::warn;
 
 use super::durable::synchronise_folder;
 use super::error::{RunDirError, content, io_error};
+use super::lock::Lock;
 
-/// A lock that another process has is tried again after this time.
-const GLANCE: Duration = Duration::from_millis(10);
-
-/// A file of JSON lines, opened for appending. No other process has it open for that.
+/// A file of JSON lines, opened for appending.
 #[derive(Debug)]
 pub struct Log {
     path: PathBuf,
@@ -24,32 +19,21 @@ pub struct Log {
     length: u64,
     /// Whether half a line may follow them.
     torn: bool,
-    synchronise: bool,
+    /// Of a file that is synchronised after each write; the other file of a run is its writer's alone, too.
+    lock: Option<Lock>,
 }
 
 impl Log {
-    /// Opens or makes the file and locks it. Half a line at its end, which a crash left, is cut off.
+    /// Opens or makes the file. With its lock, it is synchronised after each write. Half a line at its end, which a crash left,
+    /// is cut off.
     ///
     /// # Errors
-    /// [`RunDirError::InUse`] if another process has it open.
-    pub(super) fn open(path: PathBuf, synchronise: bool) -> Result<Self, RunDirError> {
+    /// The file cannot be opened or changed.
+    pub(super) fn open(path: PathBuf, lock: Option<Lock>) -> Result<Self, RunDirError> {
         let opened = OpenOptions::new().create(true).read(true).append(true).open(&path);
         let mut file = opened.map_err(io_error("open", &path))?;
-        // `learner list` takes the lock for microseconds, to see whether a learner has it.
-        let again = |_| {
-            sleep(GLANCE);
-            file.try_lock()
-        };
-        match file.try_lock().or_else(again) {
-            Ok(()) => {}
-            Err(TryLockError::WouldBlock) => {
-                return Err(RunDirError::InUse(path.parent().unwrap_or(&path).to_owned()));
-            }
-            // Some network file systems have no locks.
-            Err(TryLockError::Error(error)) => warn!(path = %path.display(), %error, "the file cannot be locked"),
-        }
         let whole = whole_lines(&mut file).map_err(io_error("read", &path))?;
-        let mut log = Self { path, file, length: whole, torn: true, synchronise };
+        let mut log = Self { path, file, length: whole, torn: true, lock };
         // Lines that a killed process did not synchronise count from now on.
         let durable = log.mend().and_then(|()| log.synchronise()).and_then(|()| synchronise_folder(&log.path));
         durable.map_err(io_error("open", &log.path))?;
@@ -60,7 +44,7 @@ impl Log {
     #[doc(hidden)]
     pub fn unchecked(path: PathBuf) -> io::Result<Self> {
         let file = OpenOptions::new().append(true).open(&path)?;
-        Ok(Self { path, file, length: 0, torn: false, synchronise: false })
+        Ok(Self { path, file, length: 0, torn: false, lock: None })
     }
 
     /// Whether there is no whole line in it.
@@ -94,10 +78,7 @@ impl Log {
     }
 
     fn synchronise(&self) -> io::Result<()> {
-        match self.synchronise {
-            true => self.file.sync_data(),
-            false => Ok(()),
-        }
+        if self.lock.is_some() { self.file.sync_data() } else { Ok(()) }
     }
 
     /// Cuts off what a failed write left: half a line would make the next one unreadable.

@@ -4,7 +4,7 @@
 //! `scores.jsonl`, the main thread everything else. Commands that only read may run at any time. A learner at work holds a
 //! lock on `scores.jsonl`.
 //!
-//! In reading order: `folder`, `find` (looks for such folders), `lines` (of its files), `log` (files that only grow), `checkpoints`, `durable` (files that are
+//! In reading order: `folder`, `find` (looks for such folders), `lines` (of its files), `lock` (keeps a second learner out), `log` (files that only grow), `checkpoints`, `durable` (files that are
 //! written whole or not at all), `error`, `resume` (continues a run), `verify` (checks a run).
 
 mod checkpoints;
@@ -13,6 +13,7 @@ mod error;
 mod find;
 mod folder;
 mod lines;
+mod lock;
 mod log;
 mod resume;
 #[cfg(test)]
@@ -24,5 +25,6 @@ pub use error::RunDirError;
 pub use find::{runs_in, walk};
 pub use folder::RunDir;
 pub use lines::{RunEndpoints, ScoreLine};
+pub use lock::Lock;
 pub use log::{Log, new_lines};
 pub use resume::{Begun, Earlier, Past, open};

@@ -7,6 +7,7 @@ mod chaos;
 mod disk;
 mod hanging_disk;
 mod kills;
+mod locks;
 mod power;
 mod resume;
 mod system;

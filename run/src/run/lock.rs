@@ -1,0 +1,121 @@
+//! Keeps other processes out of a folder.
+
+use std::fs::{self, File, TryLockError};
+use std::io::{ErrorKind, Write};
+use std::os::linux::net::SocketAddrExt;
+use std::os::unix::fs::MetadataExt;
+use std::os::unix::net::{SocketAddr, UnixListener};
+use std::path::{Path, PathBuf};
+use std::thread::sleep;
+use std::time::Duration;
+
+use super::error::{RunDirError, io_error};
+
+/// A lock that another process has is tried again after this time: `learner list` takes one for microseconds.
+const GLANCE: Duration = Duration::from_millis(10);
+/// Has the name of this host.
+const HOST: &str = "/proc/sys/kernel/hostname";
+
+/// A lock on a file, as long as this lives.
+#[derive(Debug)]
+pub struct Lock {
+    _file: File,
+    _claim: Option<Claim>,
+}
+
+/// Stands for a lock where files have none, as on Lustre without `flock`: a file that names the host, so that no other host
+/// takes it; and a socket, which the system gives to one process of this host, and takes back at that process's end.
+#[derive(Debug)]
+struct Claim {
+    path: PathBuf,
+    _socket: UnixListener,
+}
+
+impl Lock {
+    /// Locks the file at `path`, which is made if it is missing.
+    ///
+    /// # Errors
+    /// [`RunDirError::InUse`] if another process has it, [`RunDirError::Claimed`] if another host had it.
+    pub fn take(path: &Path) -> Result<Self, RunDirError> {
+        let file = open(path)?;
+        let again = |_| {
+            sleep(GLANCE);
+            file.try_lock()
+        };
+        let claim = match file.try_lock().or_else(again) {
+            Ok(()) => None,
+            Err(TryLockError::WouldBlock) => return Err(in_use(path)),
+            Err(TryLockError::Error(error)) if error.kind() == ErrorKind::Unsupported => {
+                Some(Claim::make(&file, path)?)
+            }
+            Err(TryLockError::Error(error)) => return Err(io_error("lock", path)(error)),
+        };
+        Ok(Self { _file: file, _claim: claim })
+    }
+
+    /// Locks the file together with others who share it, against whoever wants it alone. Where files have no locks, it does
+    /// nothing.
+    ///
+    /// # Errors
+    /// [`RunDirError::InUse`] if another process has it alone.
+    pub fn share(path: &Path) -> Result<Self, RunDirError> {
+        let file = open(path)?;
+        match file.try_lock_shared() {
+            Err(TryLockError::WouldBlock) => Err(in_use(path)),
+            _ => Ok(Self { _file: file, _claim: None }),
+        }
+    }
+
+    /// Whether another process has the lock of the file alone. Where files have no locks, one that was killed may still seem
+    /// to have it.
+    pub fn is_taken(path: &Path) -> bool {
+        let Ok(file) = File::open(path) else { return false };
+        match file.try_lock_shared() {
+            Ok(()) => false,
+            Err(TryLockError::WouldBlock) => true,
+            Err(TryLockError::Error(_)) => claim_of(path).exists(),
+        }
+    }
+}
+
+impl Claim {
+    fn make(file: &File, path: &Path) -> Result<Self, RunDirError> {
+        let host = fs::read_to_string(HOST).map_err(io_error("read", Path::new(HOST)))?;
+        let socket = || {
+            let metadata = file.metadata()?;
+            let name = format!("quad lock {} {}", metadata.dev(), metadata.ino());
+            UnixListener::bind_addr(&SocketAddr::from_abstract_name(name)?)
+        };
+        let socket = socket().map_err(|error| match error.kind() {
+            ErrorKind::AddrInUse => in_use(path),
+            _ => io_error("lock", path)(error),
+        })?;
+        let path = claim_of(path);
+        match File::create_new(&path).and_then(|mut file| file.write_all(host.as_bytes())) {
+            Ok(()) => {}
+            // By a process of this host that was killed: the socket was free.
+            Err(_) if fs::read_to_string(&path).is_ok_and(|other| other == host) => {}
+            Err(error) if error.kind() == ErrorKind::AlreadyExists => return Err(RunDirError::Claimed(path)),
+            Err(error) => return Err(io_error("write", &path)(error)),
+        }
+        Ok(Self { path, _socket: socket })
+    }
+}
+
+impl Drop for Claim {
+    fn drop(&mut self) {
+        fs::remove_file(&self.path).ok();
+    }
+}
+
+fn open(path: &Path) -> Result<File, RunDirError> {
+    File::options().create(true).read(true).append(true).open(path).map_err(io_error("open", path))
+}
+
+fn in_use(path: &Path) -> RunDirError {
+    RunDirError::InUse(path.parent().unwrap_or(path).to_owned())
+}
+
+fn claim_of(path: &Path) -> PathBuf {
+    path.with_extension("host")
+}

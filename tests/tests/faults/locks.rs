@@ -1,0 +1,40 @@
+//! A run's folder where files have no locks.
+
+use std::fs;
+
+use quad_tests::PATIENCE;
+use quad_tests::process::preload;
+use quad_tests::setting::ENDLESS;
+use quad_tests::system::Scratch;
+
+use crate::disk::LISTEN;
+
+#[test]
+fn where_files_have_no_locks_a_folder_is_still_one_learners() {
+    let [scratch, beside] = [Scratch::new(), Scratch::new()];
+    let launcher = preload("no_locks");
+    let folder = scratch.path().join("run");
+    let start = |from: &Scratch| from.learner_through(&launcher, folder.to_str().unwrap(), ENDLESS, &LISTEN);
+    let mut first = start(&scratch);
+    let _evaluator = scratch.evaluator("one", &first.endpoint());
+    first.wait_for_scores(0);
+    let mut second = start(&beside);
+    assert_eq!(second.process.wait(PATIENCE).code(), Some(75), "{}", second.process.log());
+    assert!(second.process.log().contains("another learner is at work in"), "{}", second.process.log());
+
+    // One that was killed on this host keeps nobody out.
+    first.process.kill();
+    let mut next = start(&scratch);
+    next.process.wait_for_log("goes on after step", PATIENCE);
+    next.assert_scores_are_distinct();
+    assert_eq!(next.process.terminate(PATIENCE).1.code(), Some(75), "{}", next.process.log());
+
+    // Of another host nobody knows.
+    let claim = folder.join("scores.host");
+    assert!(!claim.exists(), "one that ends takes its claim back");
+    fs::write(&claim, "elsewhere\n").unwrap();
+    let mut third = start(&scratch);
+    assert_eq!(third.process.wait(PATIENCE).code(), Some(1), "{}", third.process.log());
+    let log = third.process.log();
+    assert!(log.contains("scores.host") && log.contains("hint: wait for the end of that learner"), "{log}");
+}
