@@ -8,7 +8,8 @@ use std::process::{Child, Command, Stdio};
 use std::time::{Duration, Instant};
 
 use anyhow::{Context, anyhow};
-use quad_runtime::Hint;
+use quad_protocol::Name;
+use quad_runtime::{Hint, threads_asked};
 use rustix::process::{Pid, Signal, kill_process, set_parent_process_death_signal};
 
 /// The program.
@@ -16,16 +17,20 @@ const EVALUATOR: &str = "evaluator";
 /// An evaluator delivers its scores and leaves within two seconds; the learner kills it after this time.
 const LEAVE: Duration = Duration::from_secs(4);
 const GLANCE: Duration = Duration::from_millis(20);
+/// First and longest pause before an evaluator that has ended is started again.
+const PAUSE: [Duration; 2] = [Duration::from_secs(1), Duration::from_secs(300)];
 
-/// Sets up a command so that its process ends with the thread that starts it. The process does not get a terminal's Ctrl-C; its
-/// parent tells it to leave.
-fn end_with_parent(command: &mut Command) {
-    command.stdin(Stdio::null()).process_group(0);
+/// Sets up a command so that its process ends with the thread that starts it, and appends all its output to a file. The
+/// process does not get a terminal's Ctrl-C; its parent tells it to leave.
+pub(crate) fn run_beside(command: &mut Command, log: &Path) -> io::Result<()> {
+    let file = File::options().create(true).append(true).open(log)?;
+    command.stdin(Stdio::null()).stdout(file.try_clone()?).stderr(file).process_group(0);
     // SAFETY: the new process makes one system call, which may be made between fork and exec.
     #[allow(unsafe_code)]
     unsafe {
         command.pre_exec(|| Ok(set_parent_process_death_signal(Some(Signal::TERM))?));
     }
+    Ok(())
 }
 
 /// Hides the user's certificates from a program that connects to an endpoint without encryption, which would refuse them.
@@ -35,13 +40,6 @@ pub(crate) fn not_encrypted(command: &mut Command, endpoint: &str) {
     }
 }
 
-/// Starts a process that ends with this thread, and appends all its output to a file.
-pub(crate) fn spawn_logged(command: &mut Command, log: &Path) -> io::Result<Child> {
-    end_with_parent(command);
-    let file = File::options().create(true).append(true).open(log)?;
-    command.stdout(file.try_clone()?).stderr(file).spawn()
-}
-
 /// The evaluators to start, and those that run.
 #[derive(Default)]
 pub(crate) struct LocalEvaluators {
@@ -49,14 +47,18 @@ pub(crate) struct LocalEvaluators {
     /// Cores for all evaluators together.
     cores: usize,
     program: PathBuf,
-    started: Vec<Started>,
+    places: Vec<Place>,
 }
 
-struct Started {
-    process: Child,
+/// An evaluator, or the one that is to be started next in its place.
+struct Place {
+    command: Command,
     log: PathBuf,
-    /// Whether the learner knows that it has ended.
-    ended: bool,
+    process: Option<Child>,
+    /// When the process was started, or when it has ended.
+    since: Instant,
+    /// Time from the end of a process to the start of the next one.
+    pause: Duration,
 }
 
 impl LocalEvaluators {
@@ -79,70 +81,129 @@ impl LocalEvaluators {
                     .hint("if it lacks libmujoco: deploy/setup.sh installs that");
             }
             Err(error) => {
-                let hint = "build it with `cargo build --release --package quad-evaluator`, or leave --evaluators out and start \
-                            some by hand";
+                let hint = "build it with `cargo build --release --package quad-evaluator`, or start some by hand and give \
+                            --evaluators 0";
                 return Err(error)
                     .context("there is no program `evaluator` beside the learner or on the PATH")
                     .hint(hint);
             }
         }
-        Ok(Self { count, cores, program, started: Vec::new() })
+        Ok(Self { count, cores, program, places: Vec::new() })
     }
 
-    /// Starts the evaluators. They connect to the first of these endpoints, and write their logs into a folder.
+    /// Starts the evaluators. They connect to the first of these endpoints, write their logs into a folder, and are called
+    /// after `owner`, the run or study: several learners may meet at one router.
     ///
-    /// Call it on a thread that lives as long as the learner: the system ends the evaluators with that thread.
+    /// Call this and [`news`](Self::news) on a thread that lives as long as the learner: the system ends the evaluators with
+    /// that thread.
     ///
     /// # Errors
     /// A process or its log file cannot be made.
-    pub fn start(&mut self, reachable_at: &[String], folder: &Path) -> anyhow::Result<()> {
+    pub fn start(&mut self, reachable_at: &[String], folder: &Path, owner: &str) -> anyhow::Result<()> {
         for number in 1..=self.count {
-            let log = folder.join(format!("evaluator-{number}.log"));
-            let started = spawn_logged(&mut self.command(reachable_at, number), &log);
+            let log = folder.join(format!("{EVALUATOR}-{number}.log"));
+            let mut command = self.command(reachable_at, Name::new(format!("{owner}-{EVALUATOR}-{number}")).ok());
+            let started = run_beside(&mut command, &log).and_then(|()| command.spawn());
             let process =
                 started.with_context(|| format!("cannot start an evaluator that logs to {}", log.display()))?;
-            self.started.push(Started { process, log, ended: false });
+            let (process, since) = (Some(process), Instant::now());
+            self.places.push(Place { command, log, process, since, pause: Duration::ZERO });
         }
         Ok(())
     }
 
-    fn command(&self, reachable_at: &[String], number: usize) -> Command {
+    /// The command of an evaluator. Without a name, as where that would be too long, it chooses one that no other has.
+    fn command(&self, reachable_at: &[String], name: Option<Name>) -> Command {
         let mut command = Command::new(&self.program);
-        command.args(["serve", "--name", &format!("{EVALUATOR}-{number}"), "--connect"]).args(reachable_at.first());
+        command.arg("serve");
+        if let Some(name) = name {
+            command.args(["--name", name.as_str()]);
+        }
         if let Some(endpoint) = reachable_at.first() {
+            command.args(["--connect", endpoint]);
             not_encrypted(&mut command, endpoint);
         }
-        if std::env::var_os("RAYON_NUM_THREADS").is_none() {
+        if threads_asked().is_none() {
             command.env("RAYON_NUM_THREADS", self.cores.div_ceil(self.count).to_string());
         }
         command
     }
 
-    /// Log lines about evaluators that have ended by themselves.
+    /// Starts others in place of evaluators that have ended by themselves, and returns log lines about them.
     pub fn news(&mut self) -> Vec<String> {
-        let ended = |started: &mut Started| {
-            let status = started.process.try_wait().ok().flatten().filter(|_| !started.ended)?;
-            started.ended = true;
-            Some(format!("an evaluator has ended ({status}); its log is {}", started.log.display()))
-        };
-        self.started.iter_mut().filter_map(ended).collect()
+        self.places.iter_mut().filter_map(|place| place.look(Instant::now())).collect()
     }
 
     /// Tells the evaluators to leave, and waits until they have.
     pub async fn end(&mut self) {
         let until = Instant::now() + LEAVE;
-        for started in self.started.iter_mut().filter(|started| !started.ended) {
-            kill_process(Pid::from_child(&started.process), Signal::TERM).ok();
+        let mut processes: Vec<Child> = self.places.drain(..).filter_map(|place| place.process).collect();
+        for process in &processes {
+            kill_process(Pid::from_child(process), Signal::TERM).ok();
         }
-        for Started { process, .. } in &mut self.started {
+        for process in &mut processes {
             while let Ok(None) = process.try_wait() {
                 if Instant::now() >= until {
                     process.kill().ok();
-                    process.wait().ok();
                     break;
                 }
                 tokio::time::sleep(GLANCE).await;
             }
         }
+    }
+}
+
+impl Place {
+    /// Starts the next evaluator when it is time. One that ends again and again is started less and less often. Returns what
+    /// there is to say.
+    fn look(&mut self, now: Instant) -> Option<String> {
+        let lasted = now.saturating_duration_since(self.since);
+        let end = match &mut self.process {
+            Some(process) => match process.try_wait() {
+                Ok(None) => return None,
+                Ok(Some(status)) => format!("has ended ({status})"),
+                Err(error) => format!("is lost ({error})"),
+            },
+            None if lasted < self.pause => return None,
+            None => match self.command.spawn() {
+                Ok(process) => {
+                    (self.process, self.since) = (Some(process), now);
+                    return None;
+                }
+                Err(error) => format!("cannot be started ({error})"),
+            },
+        };
+        let has_worked = self.process.take().is_some() && lasted >= PAUSE[1];
+        self.pause = if has_worked { PAUSE[0] } else { (2 * self.pause).clamp(PAUSE[0], PAUSE[1]) };
+        self.since = now;
+        let (seconds, log) = (self.pause.as_secs(), self.log.display());
+        Some(format!("an evaluator {end}; another takes its place in {seconds} s; their log is {log}"))
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn one_that_ends_again_and_again_is_started_less_and_less_often() {
+        let (mut now, log) = (Instant::now(), PathBuf::from("log"));
+        let mut place = Place { command: Command::new("false"), log, process: None, since: now, pause: Duration::ZERO };
+        let mut pauses = Vec::new();
+        for _ in 0..10 {
+            assert_eq!(place.look(now), None, "it is started");
+            while place.look(now).is_none() {
+                std::thread::sleep(GLANCE);
+            }
+            pauses.push(place.pause.as_secs());
+            assert!(place.look(now + place.pause - GLANCE).is_none() && place.process.is_none(), "that is too soon");
+            now += place.pause;
+        }
+        assert_eq!(pauses, [1, 2, 4, 8, 16, 32, 64, 128, 256, 300]);
+        place.look(now);
+        while place.look(now + PAUSE[1]).is_none() {
+            std::thread::sleep(GLANCE);
+        }
+        assert_eq!(place.pause, PAUSE[0], "one that has worked for long is started at once");
     }
 }

@@ -5,6 +5,7 @@ use std::io::{self, Write};
 use std::process::ExitCode;
 
 use rustix::event::{PollFd, PollFlags, Timespec, poll};
+use serde::Serialize;
 
 use crate::logging::Logging;
 
@@ -75,6 +76,10 @@ impl std::error::Error for Hinted {
 /// The exit code of a program that has not finished and continues when the same command is given again: EX_TEMPFAIL of
 /// `sysexits.h`, which a scheduler can tell from a failure.
 pub const UNFINISHED: u8 = 75;
+/// The exit code of a program that a second signal has ended, as shells report it for a process that SIGINT ended.
+pub const ENDED_AT_ONCE: u8 = 130;
+/// What the line of an error begins with.
+const ERROR: &str = "error: ";
 /// How long the program waits for a reader of stderr before it ends.
 const LAST_WORDS: Timespec = Timespec { tv_sec: 1, tv_nsec: 0 };
 /// Bytes that a pipe with free space takes without waiting.
@@ -91,11 +96,20 @@ pub fn print(text: &str) -> anyhow::Result<()> {
     }
 }
 
+/// A command's result as JSON, which is indented: people read it, too.
+///
+/// # Errors
+/// Serialisation fails, which it does for no result.
+pub fn json(result: &impl Serialize) -> anyhow::Result<String> {
+    Ok(serde_json::to_string_pretty(result)?)
+}
+
 /// Runs `main`, and ends the logging. Prints an error to stderr with its causes and hints. The exit code is 0, or 1 after an
 /// error, or 75 if the error is [`unfinished`].
 ///
 /// (clap ends the program with 2 if the command line is wrong.)
 pub fn run_main(logging: Logging, main: impl FnOnce() -> anyhow::Result<()>) -> ExitCode {
+    wait_for_children();
     let result = main();
     drop(logging);
     let Err(error) = result else { return ExitCode::SUCCESS };
@@ -104,6 +118,21 @@ pub fn run_main(logging: Logging, main: impl FnOnce() -> anyhow::Result<()>) -> 
     // If stderr is closed, only the exit code can say something.
     show(&error, &mut text).and_then(|()| say(&text)).ok();
     if unfinished { UNFINISHED.into() } else { ExitCode::FAILURE }
+}
+
+/// Makes ended children wait until this process asks how they have ended. A parent that ignores SIGCHLD, as some init scripts
+/// do, hands that down; then the system forgets each child at its end.
+fn wait_for_children() {
+    // SAFETY: no other part of this program handles the signal, whose default action is to do nothing.
+    #[allow(unsafe_code)]
+    unsafe {
+        libc::signal(libc::SIGCHLD, libc::SIG_DFL);
+    }
+}
+
+/// The error that a program which [`run_main`] ran has printed last, from its log.
+pub fn error_in(log: &str) -> Option<&str> {
+    log.lines().rev().find_map(|line| line.strip_prefix(ERROR))
 }
 
 /// Writes to stderr, and waits for a reader only for a limited time. It does not use [`io::Stderr`], which a blocked log line
@@ -122,7 +151,7 @@ fn show(error: &anyhow::Error, to: &mut impl Write) -> io::Result<()> {
         let text = cause.to_string().trim_end().to_owned();
         // Some errors already contain the text of their cause.
         if depth == 0 {
-            writeln!(to, "error: {text}")?;
+            writeln!(to, "{ERROR}{text}")?;
         } else if !last.contains(&text) {
             writeln!(to, "  because: {text}")?;
         }
@@ -153,7 +182,10 @@ mod tests {
         let result = cause.context("cannot read a.hdf5").hint("record it first").hint("try again");
         let text =
             "error: cannot learn\n  because: cannot read a.hdf5\n  because: no such file\nhint: record it first\n";
-        assert_eq!(printed(result.context("cannot learn")), text);
+        let printed = printed(result.context("cannot learn"));
+        assert_eq!(printed, text);
+        assert_eq!(error_in(&format!("error: an older one\n{printed}")), Some("cannot learn"));
+        assert_eq!(error_in("all is well\n"), None);
     }
 
     #[test]

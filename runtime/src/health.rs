@@ -32,6 +32,12 @@ impl Health {
         self.problems_at(Instant::now())
     }
 
+    /// Whether the part of this name should have reported that it is alive, and has not.
+    pub fn is_silent(&self, name: &str) -> bool {
+        let (parts, now) = (self.parts.lock().unwrap_or_else(PoisonError::into_inner), Instant::now());
+        parts.iter().any(|part| part.name == name && part.silence(now).is_some())
+    }
+
     fn problems_at(&self, now: Instant) -> Vec<String> {
         let parts = self.parts.lock().unwrap_or_else(PoisonError::into_inner);
         parts.iter().flat_map(|part| part.problems(now)).collect()
@@ -109,14 +115,21 @@ impl Part {
         self.state.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
-    fn problems(&self, now: Instant) -> Vec<String> {
-        let State { ending, trouble } = &*self.state();
+    /// How long a part that runs has given no sign of life, if that is too long.
+    fn silence(&self, now: Instant) -> Option<Duration> {
         let silent = (now - self.start).saturating_sub(Duration::from_millis(self.last.load(Relaxed)));
+        (self.state().ending == Ending::Running && silent > self.limit).then_some(silent)
+    }
+
+    fn problems(&self, now: Instant) -> Vec<String> {
+        let silent = self
+            .silence(now)
+            .map(|silent| format!("{}: no sign of life for {:.0?}, {:?} are allowed", self.name, silent, self.limit));
+        let State { ending, trouble } = &*self.state();
         let stopped = match ending {
             Ending::Finished => return Vec::new(),
             Ending::Broken => Some(format!("{}: it ended before its work was done", self.name)),
-            Ending::Running => (silent > self.limit)
-                .then(|| format!("{}: no sign of life for {:.0?}, {:?} are allowed", self.name, silent, self.limit)),
+            Ending::Running => silent,
         };
         stopped.into_iter().chain(trouble.iter().map(|trouble| format!("{}: {trouble}", self.name))).collect()
     }

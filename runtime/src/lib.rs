@@ -31,14 +31,14 @@ mod shutdown;
 mod threads;
 
 pub use background::stay_in_background;
-pub use certificates::{Certificates, CertificatesError, Role};
+pub use certificates::{Certificates, CertificatesError, Role, certificates_folder};
 pub use endpoints::{DEFAULT_PORT, Endpoints, SessionError, default_endpoint, parse_endpoint};
-pub use exit::{Hint, UNFINISHED, hinted, hints, print, run_main, unfinished};
+pub use exit::{ENDED_AT_ONCE, Hint, UNFINISHED, error_in, hinted, hints, json, print, run_main, unfinished};
 pub use health::{Beat, Health};
 pub use logging::{Logging, init_logging};
 pub use metrics_server::{BindError, MetricsServer, serve_metrics};
 pub use progress_bar::ProgressBar;
 pub use router::open_router;
 pub use session::{open_session, reachable_at};
-pub use shutdown::shutdown_signal;
-pub use threads::choose_threads;
+pub use shutdown::{LEAVE_WITHIN, shutdown_signal};
+pub use threads::{choose_threads, threads_asked};

@@ -7,22 +7,23 @@ use tokio::signal::unix::{Signal, SignalKind, signal};
 use tokio::sync::oneshot;
 use tracing::{info, warn};
 
+use crate::exit::{ENDED_AT_ONCE, UNFINISHED};
+
 /// A process that was told to end has this long for it: less than the 10 s after which Docker kills it.
-const LEAVE_WITHIN: Duration = Duration::from_secs(9);
+pub const LEAVE_WITHIN: Duration = Duration::from_secs(9);
 /// A second signal within this time counts as the first: a terminal's Ctrl-C reaches a script and its children, and the script
 /// may then send them a signal, too.
 const SAME: Duration = Duration::from_millis(500);
 /// How long the thread that writes the log has for its last line.
 const LAST_WORDS: Duration = Duration::from_millis(100);
-/// The exit code that shells report for a process that SIGINT ended.
-const ENDED_AT_ONCE: i32 = 130;
 
 /// Becomes ready at the first SIGINT (Ctrl-C) or SIGTERM after this call, even before a task awaits it.
 ///
 /// From this call on, the first of the two signals does not end the process. A further signal, half a second later or more,
-/// ends it at once with exit code 130. The process also ends 9 s after the first signal, whatever it waits for. Needs a tokio
-/// runtime, and lasts as long as that runtime.
-pub fn shutdown_signal() -> impl Future<Output = ()> + Send {
+/// ends it at once with exit code 130. All that the process does to end shares one budget: this long after the first signal it
+/// ends, whatever it waits for, with exit code 75, because the same command continues its work. Needs a tokio runtime, and
+/// lasts as long as that runtime.
+pub fn shutdown_signal(within: Duration) -> impl Future<Output = ()> + Send {
     let (mut interrupt, mut terminate) = (listen(SignalKind::interrupt()), listen(SignalKind::terminate()));
     let (tell, told) = oneshot::channel();
     tokio::spawn(async move {
@@ -38,12 +39,18 @@ pub fn shutdown_signal() -> impl Future<Output = ()> + Send {
                 }
             }
         };
-        match tokio::time::timeout(LEAVE_WITHIN, another).await {
-            Ok(again) => warn!("received {again} after {name}: ending at once"),
-            Err(_) => warn!("{} s after {name} something still hangs: ending at once", LEAVE_WITHIN.as_secs()),
-        }
+        let code = match tokio::time::timeout(within, another).await {
+            Ok(again) => {
+                warn!("received {again} after {name}: ending at once");
+                ENDED_AT_ONCE
+            }
+            Err(_) => {
+                warn!("{} s after {name} something still hangs: ending without it", within.as_secs());
+                UNFINISHED
+            }
+        };
         tokio::time::sleep(LAST_WORDS).await;
-        std::process::exit(ENDED_AT_ONCE);
+        std::process::exit(code.into());
     });
     async move {
         if told.await.is_err() {

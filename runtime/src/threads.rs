@@ -1,6 +1,7 @@
-//! How many threads Zenoh and candle use. Both read the number from the environment when they are first used.
+//! How many threads Zenoh, candle and rayon use. They read the number from the environment when they are first used.
 
 use std::env;
+use std::num::NonZero;
 
 /// Zenoh's threads that receive (`rx`) also do the work of its threads for connections and timers: waking another thread costs
 /// more than handling a small message. Two threads send (`tx`): while Zenoh closes the connection of a peer that does not
@@ -24,4 +25,10 @@ pub fn choose_threads() {
             }
         }
     }
+}
+
+/// How many threads the user wants rayon to have, by RAYON_NUM_THREADS. It counts as not set if it is 0 or no number: rayon
+/// then chooses, and so may the program.
+pub fn threads_asked() -> Option<NonZero<usize>> {
+    env::var("RAYON_NUM_THREADS").ok()?.parse().ok()
 }

@@ -4,7 +4,7 @@
 use std::process::Command;
 use std::time::Duration;
 
-use quad_runtime::shutdown_signal;
+use quad_runtime::{LEAVE_WITHIN, shutdown_signal};
 use tokio::runtime::{Builder, Runtime};
 use tokio::time::timeout;
 
@@ -17,7 +17,7 @@ fn either_signal_is_noticed_even_before_it_is_awaited() {
     for [signal, other] in [["INT", "TERM"], ["TERM", "INT"]] {
         // A runtime each: the end of it ends the watch, to which another signal would be a further one.
         runtime().block_on(async {
-            let shutdown = shutdown_signal();
+            let shutdown = shutdown_signal(LEAVE_WITHIN);
             send(signal);
             timeout(Duration::from_secs(60), shutdown).await.unwrap_or_else(|_| panic!("SIG{signal} was not noticed"));
             // Ctrl-C reaches a script, too, which hands it on: that would end this very process.
@@ -25,7 +25,7 @@ fn either_signal_is_noticed_even_before_it_is_awaited() {
             tokio::time::sleep(Duration::from_secs(1)).await;
         });
     }
-    let quiet = runtime().block_on(async { timeout(Duration::from_millis(100), shutdown_signal()).await });
+    let quiet = runtime().block_on(async { timeout(Duration::from_millis(100), shutdown_signal(LEAVE_WITHIN)).await });
     assert!(quiet.is_err(), "a signal of the past is no reason to leave");
 }
 

@@ -1,22 +1,22 @@
 //! `learner sweep`, from the parsed command line to the summary of all runs.
 
 use std::collections::{BTreeMap, VecDeque};
-use std::env;
 use std::fmt::Alignment::{Left, Right};
 use std::fs;
 use std::path::{Path, PathBuf};
 use std::thread::available_parallelism;
 
 use anyhow::{Context, anyhow};
+use quad_run::run::{Lock, RunDirError};
 use quad_run::status::State;
 use quad_run::table::{Style, Table};
-use quad_runtime::{Hint, SessionError, hinted, open_router, print, stay_in_background, unfinished};
+use quad_runtime::{Hint, SessionError, hinted, open_router, print, stay_in_background, threads_asked, unfinished};
 use tracing::info;
 
 use super::train::record_hint;
 use crate::cli::SweepArgs;
 use crate::local_evaluators::LocalEvaluators;
-use crate::sweep::{Cost, Ended, PlannedRun, Study, Sweep};
+use crate::sweep::{Cost, Ended, Learners, PlannedRun, Study, Sweep};
 
 /// Runs and their states.
 type Runs = Vec<(PlannedRun, State)>;
@@ -34,8 +34,22 @@ pub fn sweep(args: &SweepArgs) -> anyhow::Result<()> {
     let left: Runs = runs.into_iter().filter(|(_, state)| *state != State::Complete).collect();
     let begun = left.iter().filter(|(_, state)| *state != State::NotBegun).count();
     info!("{count} runs: {} complete, {} to do, of which {begun} have begun", count - left.len(), left.len());
-    let ended = if left.is_empty() { Ended::default() } else { work(args, &folder, left)? };
+    let ended = if left.is_empty() { Ended::default() } else { work(args, &study.name, &folder, left)? };
     conclude(&folder, count, ended)
+}
+
+/// Keeps others from the study's folder, or from the whole study if this is a part of it: two sweeps of the same runs would
+/// start them twice.
+fn lock(args: &SweepArgs, folder: &Path) -> anyhow::Result<Lock> {
+    fs::create_dir_all(folder).with_context(|| format!("cannot make the folder {}", folder.display()))?;
+    let path = folder.join("sweep.lock");
+    let is_part = args.index.is_some() || args.shard.is_some();
+    let lock = if is_part { Lock::share(&path) } else { Lock::take(&path) };
+    let hint = "wait for its end; --list prints how far it is, --shard shares a study among machines";
+    lock.map_err(|error| match error {
+        in_use @ RunDirError::InUse(_) => unfinished(in_use, hint),
+        other => other.into(),
+    })
 }
 
 /// The runs that the command line selects, and their states.
@@ -74,16 +88,20 @@ impl Machine {
     /// The shares for `runs` runs. What the command line does not say follows from the cores that this process may use.
     fn share(args: &SweepArgs, runs: usize) -> anyhow::Result<Self> {
         let cores = available_parallelism()?.get();
-        let threads = env::var("RAYON_NUM_THREADS").ok().and_then(|threads| threads.parse().ok()).unwrap_or(1);
-        let at_most = args.jobs.map_or(cores * 3 / 4 / threads, usize::from);
-        let jobs = at_most.clamp(1, runs);
-        let left = cores.saturating_sub(jobs * threads).max(1);
+        let threads = threads_asked().map_or(1, usize::from);
+        let (jobs, left) = shares(cores, threads, args.jobs, runs);
         let count = if args.connect.is_some() { 0 } else { args.evaluators.unwrap_or(left) };
         Ok(Self { jobs, threads, evaluators: LocalEvaluators::new(count, left)? })
     }
 }
 
-fn work(args: &SweepArgs, folder: &Path, left: Runs) -> anyhow::Result<Ended> {
+/// How many learners of so many threads run at a time, and how many cores that leaves for evaluators.
+fn shares(cores: usize, threads: usize, jobs: Option<u16>, runs: usize) -> (usize, usize) {
+    let jobs = jobs.map_or(cores * 3 / 4 / threads, usize::from).clamp(1, runs);
+    (jobs, cores.saturating_sub(jobs.saturating_mul(threads)).max(1))
+}
+
+fn work(args: &SweepArgs, study: &str, folder: &Path, left: Runs) -> anyhow::Result<Ended> {
     let Machine { jobs, threads, mut evaluators } = Machine::share(args, left.len())?;
     // Here once, not in each learner.
     let mut datasets = BTreeMap::<Option<String>, PathBuf>::new();
@@ -100,6 +118,7 @@ fn work(args: &SweepArgs, folder: &Path, left: Runs) -> anyhow::Result<Ended> {
         info!("{}", cost.text(jobs));
         step_seconds = cost.step_seconds;
     }
+    let _lock = lock(args, folder)?;
     // Tasks of an array job must not write into each other's logs.
     let logs = args.index.map_or(folder.to_owned(), |_| folder.join(&left[0].0.name));
     fs::create_dir_all(&logs).with_context(|| format!("cannot make the folder {}", logs.display()))?;
@@ -113,13 +132,14 @@ fn work(args: &SweepArgs, folder: &Path, left: Runs) -> anyhow::Result<Ended> {
                 open_router().await.map(|(router, endpoint)| (Some(router), endpoint)).hint_of(SessionError::hint)?
             }
         };
-        evaluators.start(std::slice::from_ref(&endpoint), &logs)?;
+        evaluators.start(std::slice::from_ref(&endpoint), &logs, study)?;
         info!(
             "{jobs} at a time; learners and evaluators meet at {endpoint}; logs are {}/RUN/learner.log",
             folder.display()
         );
         let (folder, waiting) = (folder.to_owned(), VecDeque::from(left));
-        anyhow::Ok(Sweep { folder, waiting, jobs, threads, endpoint, evaluators, step_seconds }.run().await)
+        let learners = Learners { threads, endpoint, http: args.http };
+        anyhow::Ok(Sweep { folder, waiting, jobs, learners, evaluators, step_seconds }.run().await)
     });
     runtime.shutdown_background();
     ended
@@ -137,4 +157,18 @@ fn conclude(folder: &Path, count: usize, ended: Ended) -> anyhow::Result<()> {
         return Err(unfinished(anyhow!("{stopped} of {count} runs are not complete"), kept));
     }
     print(&format!("all {count} runs are complete: learner report {}", folder.display()))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn learners_and_evaluators_share_the_cores_however_many_threads_are_asked_for() {
+        assert_eq!(shares(16, 1, None, 20), (12, 4));
+        assert_eq!(shares(16, 2, None, 20), (6, 4));
+        assert_eq!(shares(1, 1, None, 20), (1, 1));
+        assert_eq!(shares(16, 1, Some(40), 20), (20, 1));
+        assert_eq!(shares(16, usize::MAX, Some(2), 20), (2, 1));
+    }
 }

@@ -17,7 +17,7 @@ use tokio::sync::mpsc;
 use tracing::{debug, info, warn};
 
 use super::dry_run;
-use super::outside::Outside;
+use super::outside::{Outside, training_threads};
 use crate::cli::TrainArgs;
 use crate::data::{LocalDataset, Source, load};
 use crate::live::{Display, Ending, Incarnation, Live, MainLoop, Metrics, Run, STUCK, Threads};
@@ -25,10 +25,7 @@ use crate::page;
 use crate::report::of_run;
 use crate::train::{begin, device};
 
-/// Default limit of training threads: a gradient step of the paper is cut into tiles (twenty with one next action per state),
-/// and threads that wait for a tile keep their cores busy.
-const MOST_THREADS: usize = 16;
-/// How long a failed run may take to write its report.
+/// How long a run that is not complete may take to write its report.
 const REPORT_PATIENCE: Duration = Duration::from_secs(5);
 
 /// Trains; a run that does not complete is an error.
@@ -44,7 +41,7 @@ pub fn train(args: &TrainArgs) -> anyhow::Result<()> {
     };
     let name = run_name(&path)?;
     let begun = run::open(&path, args.fresh)?;
-    let outside = Outside::new(args, experiment.eval_interval)?;
+    let outside = Outside::new(args, &experiment)?;
 
     device::check(args.device, experiment.precision)?;
     let dataset = source.obtain().hint(record_hint(&experiment))?;
@@ -88,11 +85,12 @@ pub fn train(args: &TrainArgs) -> anyhow::Result<()> {
 
 /// Starts rayon's threads for training.
 fn start_pool(asked: Option<NonZero<usize>>) -> anyhow::Result<()> {
-    let cores = std::thread::available_parallelism().map_or(1, NonZero::get);
-    // With 0, rayon reads RAYON_NUM_THREADS.
-    let usual = if std::env::var_os("RAYON_NUM_THREADS").is_some() { 0 } else { cores.min(MOST_THREADS) };
+    let threads = training_threads(asked);
     let pool = rayon::ThreadPoolBuilder::new().thread_name(|_| "training".to_owned());
-    Ok(pool.num_threads(asked.map_or(usual, NonZero::get)).build_global()?)
+    pool.num_threads(threads)
+        .build_global()
+        .with_context(|| format!("cannot start {threads} threads for training"))
+        .hint("choose fewer by --threads or RAYON_NUM_THREADS")
 }
 
 /// A hint for a run without a dataset.
@@ -120,7 +118,7 @@ async fn run_to_its_end(
     let live = Live::new(name.clone(), steps, metrics.clone(), health.clone());
     let telling = live.clone();
     let page = page::routes(path.to_owned(), Some(Arc::new(move || telling.tell())))?;
-    let server = quad_runtime::serve_metrics(args.metrics, registry, health.clone(), page).await;
+    let server = quad_runtime::serve_metrics(args.http, registry, health.clone(), page).await;
     let server = server.hint_of(BindError::hint)?;
     info!("page: http://{}/", server.address);
     let Experiment { environment, .. } = &config.experiment;
@@ -172,12 +170,12 @@ fn now() -> anyhow::Result<u64> {
 fn conclude(run_dir: &RunDir, config: &RunConfig, ending: Ending) -> anyhow::Result<()> {
     let folder = run_dir.path().display();
     let reported = match &ending {
-        // The run may have failed because its disk hangs.
-        Ending::Failed(_) => {
+        Ending::Complete => summarise(run_dir),
+        // The run may have failed because its disk hangs, and one that was told to stop has little time.
+        _ => {
             let run_dir = run_dir.clone();
             within(REPORT_PATIENCE, move || summarise(&run_dir))
         }
-        _ => summarise(run_dir),
     };
     let kept =
         format!("everything up to the newest checkpoint is kept in {folder}; the same command goes on from there");

@@ -85,7 +85,8 @@ impl MainLoop {
         let mut reached = Reached::default();
         let mut ending = self.watch(online, &mut reached).await;
         self.display.finish();
-        end(self.threads, &ending).await;
+        // All that the ending takes happens at the same time: after a signal there is little of it.
+        tokio::join!(end(self.threads, &ending), self.evaluators.end());
         while let Ok(event) = self.events.try_recv() {
             match (event, &ending) {
                 // The reason of the failure is known already.
@@ -94,7 +95,6 @@ impl MainLoop {
                 (event, _) => tell(event, &mut self.display),
             }
         }
-        self.evaluators.end().await;
         if let Some(wire) = reached.wire {
             // An evaluator that misses this message notices the lost connection.
             timeout(CLOSE_PATIENCE, tokio::spawn(wire.close())).await.ok();
@@ -103,7 +103,7 @@ impl MainLoop {
     }
 
     async fn watch(&mut self, mut online: JoinHandle<anyhow::Result<Online>>, reached: &mut Reached) -> Ending {
-        let mut shutdown = std::pin::pin!(quad_runtime::shutdown_signal());
+        let mut shutdown = std::pin::pin!(quad_runtime::shutdown_signal(quad_runtime::LEAVE_WITHIN));
         let mut ticker = interval(self.display.interval());
         ticker.set_missed_tick_behavior(MissedTickBehavior::Skip);
         let mut is_online = false;
@@ -157,7 +157,7 @@ impl MainLoop {
             .say(&format!("run {} is at {zenoh}, its metrics at http://{metrics}/metrics", self.incarnation.run));
         reached.reachable_at = online.reachable_at;
         reached.wire = Some(online.wire);
-        self.evaluators.start(&reached.reachable_at, self.run_dir.path())
+        self.evaluators.start(&reached.reachable_at, self.run_dir.path(), self.incarnation.run.as_str())
     }
 
     fn trained(&self) -> String {
@@ -192,11 +192,7 @@ impl MainLoop {
 
     /// A thread that writes and has not reported for long waits for the disk.
     fn watch_disk(&self, told: &mut Vec<Saved>) {
-        let problems = self.health.problems();
-        let silent = |what: &Saved| {
-            problems.iter().any(|problem| problem.starts_with(&format!("{}: no sign of life", what.thread())))
-        };
-        let hangs: Vec<_> = Saved::ALL.into_iter().filter(silent).collect();
+        let hangs: Vec<_> = Saved::ALL.into_iter().filter(|what| self.health.is_silent(what.thread())).collect();
         for what in hangs.iter().filter(|what| !told.contains(what)) {
             self.metrics.disk.trouble(*what).set(1);
             let waits = match what {

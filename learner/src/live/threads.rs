@@ -84,7 +84,8 @@ impl Threads {
         let disk = |what| DiskStatus::new(what, &metrics.disk, events.clone());
         let scores =
             Scores { log: scores, deliveries, coordinator, metrics: metrics.clone(), disk: disk(Saved::Scores) };
-        let scores = spawn_alive("scores", events, health.part("scores", STUCK), move |beat| scores.run(beat))?;
+        let writer = Saved::Scores.thread();
+        let scores = spawn_alive(writer, events, health.part(writer, STUCK), move |beat| scores.run(beat))?;
 
         let step = checkpoint.as_ref().map_or(0, |checkpoint| checkpoint.step);
         metrics.training.gradient_steps.inc_by(step);
@@ -100,8 +101,8 @@ impl Threads {
             known,
             disk: disk(Saved::Run),
         };
-        let snapshots =
-            spawn_alive("snapshots", events, health.part("snapshots", STUCK), move |beat| snapshots.run(beat))?;
+        let writer = Saved::Run.thread();
+        let snapshots = spawn_alive(writer, events, health.part(writer, STUCK), move |beat| snapshots.run(beat))?;
 
         let stop = Arc::new(AtomicBool::new(false));
         let training = Training {

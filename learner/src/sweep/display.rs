@@ -39,19 +39,22 @@ impl Display {
         if self.bar.is_hidden() { info!("{text}") } else { self.bar.println(text) }
     }
 
-    /// Whether it is time to show something new.
-    pub fn is_due(&self) -> bool {
-        Instant::now() >= self.next
+    /// Whether it is time to show something new; then the next time is an interval later.
+    pub fn is_due(&mut self) -> bool {
+        let is_due = Instant::now() >= self.next;
+        if is_due {
+            self.next = Instant::now() + self.interval();
+        }
+        is_due
     }
 
     /// Shows these lines in place of the last ones.
-    pub fn show(&mut self, lines: &[String]) {
+    pub fn show(&self, lines: &[String]) {
         if self.bar.is_hidden() {
             lines.iter().for_each(|line| info!("{line}"));
         } else {
             self.bar.set_message(lines.join("\n"));
         }
-        self.next = Instant::now() + self.interval();
     }
 
     /// Takes the lines away.

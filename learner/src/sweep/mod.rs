@@ -19,5 +19,6 @@ mod study;
 mod work;
 
 pub(crate) use cost::Cost;
+pub(crate) use job::Learners;
 pub(crate) use study::{PlannedRun, Study};
 pub(crate) use work::{Ended, Sweep};

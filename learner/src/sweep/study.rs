@@ -103,7 +103,7 @@ impl PlannedRun {
         }
         if !differences.is_empty() {
             let (path, keys) = (dir.display(), differences.join(", "));
-            let hint = "give the study's file another name, choose another --runs, or move that folder away";
+            let hint = "give the study's file another name, choose another folder for it, or move that folder away";
             return Err(hinted(anyhow!("{path} has a run of other settings than the study's: {keys}"), hint));
         }
         Ok(State::of(&report)?)

@@ -63,8 +63,8 @@ impl State {
     }
 }
 
-/// How fast a run at work is, and how good.
-#[derive(Default)]
+/// What a run at work is seen to do.
+#[derive(Clone, Copy, Default)]
 pub struct Pace {
     /// Gradient steps done.
     pub step: u64,

@@ -36,14 +36,6 @@ impl Findings {
         self.0.push(Finding { verdict: "fail", check: check.to_owned(), what: what.into(), hint });
     }
 
-    /// As an indented JSON array.
-    ///
-    /// # Errors
-    /// Serialisation fails, which it does for no known value.
-    pub fn json(&self) -> serde_json::Result<String> {
-        serde_json::to_string_pretty(self)
-    }
-
     /// # Errors
     /// At least one check failed.
     pub fn verdict(&self) -> anyhow::Result<()> {

@@ -25,8 +25,8 @@ const LITTLE: u64 = 2 << 30;
 pub fn threads(findings: &mut Findings) {
     let cores = thread::available_parallelism().map_or(1, usize::from);
     let set = env::var(THREADS).ok();
-    match set.as_ref().map(|text| text.trim().parse::<usize>()) {
-        None => findings.ok("threads", format!("{cores}, one per core: {THREADS} is not set")),
+    match set.as_ref().map(|text| text.parse::<usize>()) {
+        None | Some(Ok(0)) => findings.ok("threads", format!("{cores}, one per core: {THREADS} is not set or 0")),
         Some(Ok(threads)) if threads <= cores => {
             findings.ok("threads", format!("{THREADS}={threads} of {cores} cores"))
         }

@@ -1,10 +1,12 @@
 //! `learner train --evaluators N`: one command that starts its own evaluators.
 
 use std::fs;
+use std::process::Command;
 
 use quad_tests::learner::Learner;
+use quad_tests::router::router;
 use quad_tests::setting::{ENDLESS, SHORT, Setting};
-use quad_tests::system::Scratch;
+use quad_tests::system::{Scratch, free_endpoint};
 use quad_tests::{PATIENCE, eventually};
 
 fn learner(scratch: &Scratch, setting: Setting) -> Learner {
@@ -37,6 +39,8 @@ fn at_work(learner: &Learner) -> Vec<u32> {
 #[test]
 fn one_command_trains_and_evaluates() {
     let scratch = Scratch::new();
+    let mut by_default = scratch.learner_with("default", SHORT, &[]);
+    by_default.assert_completes(&SHORT, PATIENCE);
     let mut learner = learner(&scratch, SHORT);
     learner.assert_completes(&SHORT, PATIENCE);
     for number in [1, 2] {
@@ -63,15 +67,46 @@ fn evaluators_end_with_their_learner_however_it_ends() {
 }
 
 #[test]
-fn one_that_dies_is_told_with_its_log() {
+fn one_that_dies_is_told_with_its_log_and_started_again() {
     let scratch = Scratch::new();
     let learner = learner(&scratch, ENDLESS);
     let evaluators = at_work(&learner);
-    std::process::Command::new("kill").args(["-KILL", &evaluators[0].to_string()]).status().unwrap();
+    for evaluator in &evaluators {
+        Command::new("kill").args(["-KILL", &evaluator.to_string()]).status().unwrap();
+    }
     let line = learner.process.wait_for_log("an evaluator has ended", PATIENCE);
     assert!(line.contains("signal: 9") && line.contains("evaluator-"), "{line}");
-    let scored = learner.scores().len();
-    learner.wait_for_scores(scored + 20);
+    let others = || children(learner.process.id()).into_iter().filter(|id| !evaluators.contains(id)).count();
+    eventually("there are two others", PATIENCE, || (others() == 2).then_some(()));
+    learner.wait_for_scores(learner.scores().len());
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn those_of_two_learners_at_one_router_have_names_of_their_own() {
+    let scratch = Scratch::new();
+    let endpoint = free_endpoint();
+    let _router = router(&endpoint).await;
+    let start = |run| scratch.learner_with(run, SHORT, &["--connect", &endpoint, "--evaluators", "1"]);
+    for mut learner in ["one", "two"].map(start) {
+        learner.assert_completes(&SHORT, PATIENCE);
+        assert!(!learner.process.log().contains("asks for a job while it has one"), "{}", learner.process.log());
+    }
+    let names = ["one", "two"].map(|run| {
+        let log = fs::read_to_string(scratch.path().join(run).join("evaluator-1.log")).unwrap();
+        log.lines().find_map(|line| Some(line.split_once("evaluator=")?.1.to_owned())).unwrap()
+    });
+    assert_ne!(names[0], names[1]);
+}
+
+/// A lab may set the variable for all users of a machine.
+#[test]
+fn certificates_that_only_the_environment_names_are_for_other_networks() {
+    let scratch = Scratch::new();
+    for (folder, flags) in [("/nowhere", ["--evaluators", "1"]), ("", ["--listen", "tcp/127.0.0.1:0"])] {
+        let launcher = ["env".to_owned(), format!("QUAD_CERTIFICATES={folder}")];
+        let learner = scratch.learner_through(&launcher, "run", ENDLESS, &flags);
+        learner.process.wait_for_log("run run is at tcp/", PATIENCE);
+    }
 }
 
 #[test]

@@ -6,7 +6,7 @@ use std::process::Command;
 
 use quad_tests::process::{Process, binary};
 use quad_tests::setting::{SHORT, Setting};
-use quad_tests::system::Scratch;
+use quad_tests::system::{Scratch, free_port};
 use quad_tests::{PATIENCE, eventually};
 
 /// Long enough for a signal in the middle of each run.
@@ -33,7 +33,7 @@ impl Study {
 
     fn command(&self, arguments: &[&str]) -> Command {
         let mut command = Command::new(binary("learner"));
-        command.arg("sweep").arg(self.scratch.path().join("study.toml")).arg("--runs").arg(self.scratch.path());
+        command.arg("sweep").arg(self.scratch.path().join("study.toml")).arg(self.scratch.path());
         // Those are for other networks than a sweep's own.
         command.args(arguments).env("QUAD_CERTIFICATES", "/nowhere");
         command
@@ -72,13 +72,20 @@ impl Study {
 }
 
 /// The learner that works on a run, among the processes that a sweep has started.
-fn learner_of(sweep: &Process, run: &str) -> Option<u32> {
+fn learner_of(sweep: &Process, run: &str) -> Option<String> {
+    child_of(sweep, |word| word.ends_with(run))
+}
+
+/// The first process that a sweep has started by a command line with such a word.
+fn child_of(sweep: &Process, is_its: impl Fn(&str) -> bool) -> Option<String> {
     let children = fs::read_to_string(format!("/proc/{0}/task/{0}/children", sweep.id())).ok()?;
-    let is_its = |id: &u32| {
-        let line = fs::read(format!("/proc/{id}/cmdline")).unwrap_or_default();
-        String::from_utf8_lossy(&line).split('\0').any(|word| word.ends_with(run))
-    };
-    children.split_whitespace().filter_map(|id| id.parse().ok()).find(is_its)
+    let line = |id: &&str| fs::read(format!("/proc/{id}/cmdline")).unwrap_or_default();
+    let fits = |id: &&str| String::from_utf8_lossy(&line(id)).split('\0').any(&is_its);
+    children.split_whitespace().find(fits).map(str::to_owned)
+}
+
+fn kill(signal: &str, process: &str) {
+    assert!(Command::new("kill").args([signal, process]).status().unwrap().success());
 }
 
 #[test]
@@ -101,7 +108,7 @@ fn a_sweep_goes_on_after_an_interruption_and_a_failed_run_ends_no_other() {
     let victim = RUNS[2];
     study.wait_for(victim);
     let learner = eventually("there is a learner", PATIENCE, || learner_of(&sweep, victim));
-    assert!(Command::new("kill").args(["-KILL", &learner.to_string()]).status().unwrap().success());
+    kill("-KILL", &learner);
     assert_eq!(sweep.wait(PATIENCE).code(), Some(1), "{}", sweep.log());
     let log = sweep.log();
     assert!(log.contains("1 of 4 runs have failed") && log.contains(&format!("{victim}/learner.log")), "{log}");
@@ -118,7 +125,9 @@ fn parts_of_a_study_are_done_by_number() {
     let study = Study::new();
     study.sweep(&["--shard", "2/2"]).assert_succeeds(PATIENCE);
     assert_eq!(study.states(), ["not begun", "complete", "not begun", "complete"]);
-    study.sweep(&["--index", "2"]).assert_succeeds(PATIENCE);
+    let address = format!("127.0.0.1:{}", free_port());
+    study.sweep(&["--index", "2", "--http", &address]).assert_succeeds(PATIENCE);
+    assert!(fs::read_to_string(study.dir(RUNS[2]).join("endpoints.json")).unwrap().contains(&address));
     assert_eq!(study.states(), ["not begun", "complete", "complete", "complete"]);
     let mut sweep = study.sweep(&["--index", "0"]);
     study.wait_for(RUNS[0]);
@@ -135,4 +144,83 @@ fn a_run_of_other_settings_is_never_taken_for_one_of_the_study() {
     let mut sweep = study.sweep(&[]);
     assert_eq!(sweep.wait(PATIENCE).code(), Some(1));
     assert!(sweep.log().contains("has a run of other settings than the study's: steps"), "{}", sweep.log());
+}
+
+/// Its runs would train, and each wait ten minutes for an evaluator.
+#[test]
+fn a_sweep_whose_only_evaluator_is_killed_gets_another() {
+    let study = Study::new();
+    let mut sweep = study.sweep(&["--jobs", "1", "--evaluators", "1"]);
+    study.wait_for(RUNS[0]);
+    let evaluator = eventually("there is an evaluator", PATIENCE, || child_of(&sweep, |word| word == "serve"));
+    kill("-KILL", &evaluator);
+    sweep.assert_succeeds(PATIENCE);
+    assert!(sweep.log().contains("an evaluator has ended (signal: 9"), "{}", sweep.log());
+}
+
+/// As some init scripts and containers start programs.
+#[test]
+fn a_parent_that_ignores_its_childrens_ends_and_asks_for_no_thread_changes_nothing() {
+    let study = Study::new();
+    let command = study.command(&["--index", "0"]);
+    let mut shell = Command::new("sh");
+    shell.args(["-c", "trap '' CHLD; exec \"$@\"", "sh"]).arg(command.get_program()).args(command.get_args());
+    shell.env("RAYON_NUM_THREADS", "0");
+    Process::start("sweep", study.scratch.path(), shell).assert_succeeds(PATIENCE);
+    assert_eq!(study.states()[0], "complete");
+}
+
+#[test]
+fn two_sweeps_of_one_study_do_not_disturb_each_other() {
+    let study = Study::new();
+    for (flags, run) in [(["--jobs", "1"], 0), (["--index", "2"], 2)] {
+        // Without evaluators a run is not complete before its sweep is told to end.
+        let mut sweep = study.sweep(&[&flags[..], &["--evaluators", "0"]].concat());
+        study.wait_for(RUNS[run]);
+        for others in [&[][..], &["--index", if run == 0 { "0" } else { "2" }]] {
+            let second = study.command(others).output().unwrap();
+            let said = String::from_utf8_lossy(&second.stderr);
+            assert_eq!(second.status.code(), Some(75), "{flags:?}, {others:?}: {said}");
+            assert!(!study.states()[run].starts_with("failed"), "{flags:?}, {others:?}: {:?}", study.states());
+        }
+        sweep.terminate(PATIENCE);
+    }
+}
+
+/// Slurm queues a task again by this exit code, so neither a slow disk nor a learner that has only begun may change it.
+#[test]
+fn a_sweep_that_is_told_to_end_says_that_it_is_not_complete_whatever_hangs() {
+    let study = Study::new();
+    // At once: the learner does not yet listen to signals.
+    let mut sweep = study.sweep(&["--index", "0"]);
+    eventually("there is a learner", PATIENCE, || learner_of(&sweep, RUNS[0]));
+    sweep.signal("TERM");
+    assert_eq!(sweep.wait(PATIENCE).code(), Some(75), "{}", sweep.log());
+    assert!(!study.states()[0].starts_with("failed"), "{:?}", study.states());
+
+    // A learner that is frozen, as by a disk that hangs.
+    let mut sweep = study.sweep(&["--index", "0"]);
+    let learner = eventually("there is a learner", PATIENCE, || learner_of(&sweep, RUNS[0]));
+    study.wait_for(RUNS[0]);
+    kill("-STOP", &learner);
+    sweep.signal("TERM");
+    assert_eq!(sweep.wait(PATIENCE).code(), Some(75), "{}", sweep.log());
+    assert!(!study.states()[0].starts_with("failed"), "{:?}", study.states());
+
+    // A disk that hangs when the sweep reads how one of two runs has ended.
+    let mut sweep = study.sweep(&["--jobs", "2"]);
+    study.wait_for(RUNS[1]);
+    let learner = eventually("there is a learner", PATIENCE, || learner_of(&sweep, RUNS[1]));
+    let hung = study.dir(RUNS[1]).join("config.toml");
+    let aside = hung.with_extension("aside");
+    fs::rename(&hung, &aside).unwrap();
+    assert!(Command::new("mkfifo").arg(&hung).status().unwrap().success());
+    kill("-KILL", &learner);
+    study.wait_for(RUNS[2]);
+    sweep.signal("TERM");
+    assert_eq!(sweep.wait(PATIENCE).code(), Some(75), "{}", sweep.log());
+    let log = fs::read_to_string(study.dir(RUNS[2]).join("learner.log")).unwrap();
+    assert!(log.contains("received SIGTERM") && log.contains("the same command goes on"), "{log}");
+    fs::remove_file(&hung).unwrap();
+    fs::rename(&aside, &hung).unwrap();
 }
