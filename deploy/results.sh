@@ -68,7 +68,7 @@ run() {
     # shellcheck disable=SC2046 # Several words.
     start_learner "$run" --task "$task" --dataset "$file" $(flags "$method") --episodes 1 --seed "$seed" \
       >"$run/learner.log" 2>&1 || { cat "$run/learner.log" >&2; return 1; }
-    $BIN/evaluator serve --connect "$endpoint" --metrics 127.0.0.1:0 >"$run/evaluator.log" 2>&1 &
+    $BIN/evaluator serve --connect "$endpoint" --http 127.0.0.1:0 >"$run/evaluator.log" 2>&1 &
     evaluator=$!
     wait "$learner" || { tail -n 5 "$run/learner.log" >&2; kill $evaluator; return 1; }
     kill $evaluator

@@ -20,8 +20,7 @@ Nothing needs to be installed. Keep bin/ and lib/ beside each other: evaluator f
 
     export PATH="\$PWD/bin:\$PATH"
     evaluator collect --env hopper --out hopper-demo.hdf5                   # records behaviour, a minute or two
-    learner train --task hopper-demo --dataset hopper-demo.hdf5 --run-dir run
-    evaluator serve                                                         # in a second terminal
+    learner train --task hopper-demo --dataset hopper-demo.hdf5             # and the evaluators that it starts
 
 licenses/ has the licences of QUAD, of MuJoCo and of all that is compiled in.
 README

@@ -224,7 +224,7 @@ fn other_environment(claimed: &str, expected: &str) -> String {
         Ok(_) => format!("choose a task in {claimed}, or another dataset"),
         Err(_) => format!(
             "it is another simulation, so a policy that learns from it cannot be scored in {expected}; train under a name of \
-             your own, without evaluations: --task own-data --set environment=NAME"
+             your own, without evaluations: --task own-data --env NAME"
         ),
     }
 }

@@ -4,11 +4,12 @@ use std::num::NonZeroUsize;
 use std::path::PathBuf;
 use std::sync::Arc;
 
+use anyhow::Context;
 use clap::{Args, CommandFactory, Parser, Subcommand};
 use clap_complete::Shell;
 use quad_dataset::EnvironmentSpec;
 use quad_dataset::environment;
-use quad_runtime::{Hint, print};
+use quad_runtime::{Hint, certificates_folder, json, print};
 
 use crate::doctor::{self, DoctorArgs};
 use crate::serve::{self, ServeArgs};
@@ -65,8 +66,8 @@ struct CollectArgs {
 /// Replay a recorded file one step at a time from its own states, and measure how far the simulation is from it
 ///
 /// The file needs infos/qpos, infos/qvel and, for a maze, infos/goal in addition to the arrays for learning. Without
-/// next_observations, the replay compares with the observation of the following row of the same episode. It reports
-/// differences and does not judge them: the exit code is 0 whenever the file could be replayed. A reward differs if it is more
+/// next_observations, the replay compares with the observation of the following row of the same episode. The exit
+/// code is 1 if rewards or terminals differ. A reward differs if it is more
 /// than 0.001 (relative, for rewards above 1) from the recorded one, and further than the next observation, which rounding to
 /// float32 cannot explain.
 #[derive(Debug, Args)]
@@ -84,8 +85,14 @@ struct VerifyArgs {
 impl Cli {
     /// Runs the command.
     pub fn run(self) -> anyhow::Result<()> {
+        // Else the first use of the threads would panic where there cannot be so many.
+        let threads = rayon::ThreadPoolBuilder::new().build_global();
+        threads.context("cannot start the threads").hint("ask for fewer by RAYON_NUM_THREADS")?;
         match self.command {
-            Command::Serve(args) => serve::serve(args, Arc::new(Simulations)),
+            Command::Serve(mut args) => {
+                args.certificates = certificates_folder(args.certificates);
+                serve::serve(args, Arc::new(Simulations))
+            }
             Command::Score(args) => print(&score::score(&args)?),
             Command::Film(args) => print(&film::film(&args)?),
             Command::Collect(args) => {
@@ -96,11 +103,14 @@ impl Cli {
             Command::VerifyDataset(args) => {
                 let spec = args.env.map_or_else(|| verify::environment_of(&args.file), Ok);
                 let report = spec.and_then(|spec| verify::verify(&args.file, spec)).hint_of(VerifyError::hint)?;
-                print(&if args.json { serde_json::to_string(&report)? } else { verified(&report) })
+                print(&if args.json { json(&report)? } else { verified(&report) })?;
+                let differ = report.rewards_differ + report.terminals_differ;
+                anyhow::ensure!(differ == 0, "the simulation differs from the file");
+                Ok(())
             }
             Command::Doctor(args) => {
                 let findings = doctor::examine(&args)?;
-                print(&if args.json { findings.json()? } else { findings.to_string() })?;
+                print(&if args.json { json(&findings)? } else { findings.to_string() })?;
                 findings.verdict()
             }
             Command::Completions { shell } => {

@@ -7,7 +7,7 @@ use clap::Args;
 use quad_policy::Precision;
 use quad_protocol::{JobReply, JobRequest, Name, PROTOCOL_VERSION, decode_from, encode, keys};
 use quad_runtime::doctor::{self, Findings};
-use quad_runtime::{DEFAULT_PORT, Endpoints, Role, default_endpoint, parse_endpoint};
+use quad_runtime::{DEFAULT_PORT, Endpoints, Role, certificates_folder, default_endpoint, parse_endpoint};
 use zenoh::Session;
 
 use crate::sim::{Environments, Rollout, Simulations};
@@ -30,8 +30,8 @@ pub struct DoctorArgs {
     /// Zenoh endpoint of a learner or a router [default: tcp/127.0.0.1:7447, or tls/… with --certificates]
     #[arg(long, value_name = "ENDPOINT", value_parser = parse_endpoint)]
     connect: Option<String>,
-    /// Folder with ca.pem, cert.pem and key.pem, for endpoints tls/HOST:PORT (docs/security.md)
-    #[arg(long, value_name = "DIR", env = "QUAD_CERTIFICATES")]
+    /// Folder with ca.pem, cert.pem and key.pem, for endpoints tls/HOST:PORT (docs/security.md) [default: QUAD_CERTIFICATES]
+    #[arg(long, value_name = "DIR")]
     certificates: Option<PathBuf>,
     /// Print a JSON array of objects with verdict, check, what and (if you can do something) hint
     #[arg(long)]
@@ -52,8 +52,8 @@ pub fn examine(args: &DoctorArgs) -> anyhow::Result<Findings> {
     findings.ok("precision", format!("evaluates in f32; {bf16}"));
     simulator(&mut findings);
     findings.ok("film", Gl::new().map_or_else(|_| format!("cannot be made: {INSTALL}"), |_| "can be made".to_owned()));
-    let folder = args.certificates.as_deref();
-    let certificates = folder.and_then(|folder| doctor::certificates(&mut findings, folder, Role::Evaluator));
+    let folder = certificates_folder(args.certificates.clone());
+    let certificates = folder.and_then(|folder| doctor::certificates(&mut findings, &folder, Role::Evaluator));
     let endpoint = args.connect.clone().unwrap_or_else(|| default_endpoint(certificates.as_ref(), DEFAULT_PORT));
     let endpoints = Endpoints { connect: vec![endpoint], certificates, ..Endpoints::default() };
     doctor::connected(&mut findings, &endpoints, runs)?;

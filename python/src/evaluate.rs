@@ -116,7 +116,7 @@ pub fn serve_environment(
     precision: &str,
 ) -> PyResult<()> {
     let precision = precision.parse().map_err(|error| PyValueError::new_err(format!("precision: {error}")))?;
-    let args = ServeArgs { connect, certificates, metrics: None, name: None, precision };
+    let args = ServeArgs { connect, certificates, http: None, name: None, precision };
     let environments = Arc::new(PythonEnvironments { name, sizes, factory: Arc::new(factory) });
     let served = py.detach(|| {
         let _logging = init_logging();

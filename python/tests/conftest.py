@@ -54,7 +54,7 @@ def data(tmp_path_factory):
 def snapshots(tmp_path_factory, data):
     """The file of a policy of each kind."""
     folder = tmp_path_factory.mktemp("runs")
-    own = ["--task", "own-data", "--set", "environment=my-robot", "--steps", "12"]
+    own = ["--task", "own-data", "--env", "my-robot", "--steps", "12"]
     return {name: train(folder / name, data, *own, *flags) for name, flags in POLICIES.items()}
 
 

@@ -38,7 +38,7 @@ class Learner:
 
     def __init__(self, folder, data, *arguments, environment="walk", steps=60, interval=20):
         self.folder = folder
-        command = ["learner", "train", "--task", "own-data", "--set", f"environment={environment}", "--dataset", str(data)]
+        command = ["learner", "train", "--task", "own-data", "--env", environment, "--dataset", str(data)]
         command += ["--run-dir", str(folder), "--listen", "tcp/127.0.0.1:0", *SMALL]
         command += ["--steps", str(steps), "--eval-interval", str(interval), "--episodes", "8", *arguments]
         self.process = subprocess.Popen(command, stderr=subprocess.PIPE, stdout=subprocess.DEVNULL, text=True)
@@ -135,7 +135,7 @@ def test_what_the_environment_raises_is_told_and_costs_an_attempt(tmp_path, data
 def test_workers_that_are_killed_cost_no_score_and_come_again(tmp_path, data):
     # One pool for two runs: Python's workers have one environment, the programs' evaluators the other.
     ours = Learner(tmp_path / "ours", data, steps=3000)
-    hopper = ["--task", "hopper-demo", "--set", "environment=hopper"]
+    hopper = ["--task", "hopper-demo", "--env", "hopper"]
     theirs = Learner(tmp_path / "theirs", data, *hopper[2:], environment="hopper", steps=1000)
     both = [ours.endpoint, theirs.endpoint]
     command = ["evaluator", "serve", *[word for endpoint in both for word in ("--connect", endpoint)]]

@@ -1,5 +1,6 @@
 //! The certificate by which a program shows its role: three files that `deploy/zenoh/certificates.sh` makes.
 
+use std::env;
 use std::fmt;
 use std::net::IpAddr;
 use std::path::{Path, PathBuf};
@@ -28,6 +29,14 @@ const HINT: &str = "--certificates takes a folder with ca.pem, cert.pem and key.
 const HINT_TIME: &str =
     "if the clock of this machine is right, make a new certificate with deploy/zenoh/certificates.sh";
 const HINT_ROLE: &str = "give the folder that was made for this program's role";
+
+/// Names the folder of certificates where the command line does not.
+const VARIABLE: &str = "QUAD_CERTIFICATES";
+
+/// The folder of certificates that the command line names, or else the variable QUAD_CERTIFICATES, unless it is empty.
+pub fn certificates_folder(named: Option<PathBuf>) -> Option<PathBuf> {
+    named.or_else(|| env::var_os(VARIABLE).filter(|folder| !folder.is_empty()).map(PathBuf::from))
+}
 
 /// What the owner of a certificate may do. Access control tells roles apart by the certificate's common name.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]

@@ -53,7 +53,7 @@ pub struct BindError {
 impl BindError {
     /// What to do about it.
     pub fn hint(&self) -> &'static str {
-        "choose another address or port for --metrics, or port 0 for a free one"
+        "choose another address or port for --http, or port 0 for a free one"
     }
 }
 

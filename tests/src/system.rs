@@ -69,8 +69,8 @@ impl Scratch {
         let mut command = through(launcher, "learner");
         command.arg("train").arg("--preset").arg(preset).arg("--dataset").arg(self.dataset());
         command.arg("--run-dir").arg(&run_dir).args(arguments);
-        if !arguments.contains(&"--metrics") {
-            command.args(["--metrics", "127.0.0.1:0"]);
+        if !arguments.contains(&"--http") {
+            command.args(["--http", "127.0.0.1:0"]);
         }
         let process = Process::start(name, self.path(), command);
         Learner { process, run_dir }
@@ -78,7 +78,7 @@ impl Scratch {
 
     /// Starts an evaluator that is called `name`.
     pub fn evaluator(&self, name: &str, endpoint: &str) -> Evaluator {
-        self.evaluator_with(name, &["--connect", endpoint, "--metrics", "127.0.0.1:0"])
+        self.evaluator_with(name, &["--connect", endpoint, "--http", "127.0.0.1:0"])
     }
 
     /// Starts an evaluator that is called `name`, with further arguments.

@@ -58,7 +58,7 @@ Examples:
   evaluator serve                                       a learner on this machine
   evaluator serve --connect tcp/learner.example:7447    a learner or router elsewhere
   evaluator serve --connect tls/learner.example:7447 --certificates certificates/box7    the same, by TLS
-  evaluator serve --metrics 127.0.0.1:9101              with http://127.0.0.1:9101/metrics
+  evaluator serve --http 127.0.0.1:9101              with http://127.0.0.1:9101/metrics
 
 RAYON_NUM_THREADS sets the number of processor cores; the default is all.";
 
@@ -70,12 +70,12 @@ pub struct ServeArgs {
     /// [default: tcp/127.0.0.1:7447, or tls/… with --certificates]
     #[arg(long, value_name = "ENDPOINT", value_parser = parse_endpoint)]
     pub connect: Vec<String>,
-    /// Folder with ca.pem, cert.pem and key.pem, for endpoints tls/HOST:PORT (docs/security.md)
-    #[arg(long, value_name = "DIR", env = "QUAD_CERTIFICATES")]
+    /// Folder with ca.pem, cert.pem and key.pem, for endpoints tls/HOST:PORT (docs/security.md) [default: QUAD_CERTIFICATES]
+    #[arg(long, value_name = "DIR")]
     pub certificates: Option<PathBuf>,
     /// Address of /metrics and /healthz; port 0 takes a free one
     #[arg(long, value_name = "ADDR:PORT")]
-    pub metrics: Option<SocketAddr>,
+    pub http: Option<SocketAddr>,
     /// Name in scores and metrics, unique among the evaluators of a run [default: HOST-PID-RANDOM]
     #[arg(long, value_parser = |text: &str| Name::new(text))]
     pub name: Option<Name>,
@@ -108,7 +108,7 @@ pub fn serve(args: ServeArgs, environments: Arc<dyn Environments>) -> anyhow::Re
 }
 
 async fn serve_until_stopped(args: ServeArgs, environments: Arc<dyn Environments>) -> anyhow::Result<()> {
-    let stop = quad_runtime::shutdown_signal();
+    let stop = quad_runtime::shutdown_signal(quad_runtime::LEAVE_WITHIN);
     let metrics = Metrics::new().context("cannot register the metrics")?;
     let name = args.name.map_or_else(unique_name, Ok)?;
     let endpoints = endpoints(args.connect, args.certificates.as_deref())?;
@@ -118,7 +118,7 @@ async fn serve_until_stopped(args: ServeArgs, environments: Arc<dyn Environments
     }
     let health = Health::default();
     // Serves as long as this value lives.
-    let _server = match args.metrics {
+    let _server = match args.http {
         Some(address) => {
             let server =
                 quad_runtime::serve_metrics(address, metrics.registry.clone(), health.clone(), Default::default())

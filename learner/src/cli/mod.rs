@@ -96,6 +96,7 @@ pub enum DatasetsCommand {
 
 /// Arguments of `learner datasets inspect`.
 #[derive(Debug, Args)]
+#[command(after_help = "The exit code is 1 if something is wrong with the dataset.")]
 pub struct InspectArgs {
     /// A file or folder of any format, a name of `learner datasets list`, or minari:ID
     #[arg(value_name = "FILE|NAME")]
@@ -110,10 +111,11 @@ pub struct InspectArgs {
 
 /// Arguments of `learner verify`.
 #[derive(Debug, Args)]
+#[command(after_help = "The exit code is 1 if a promise has not held.")]
 pub struct VerifyArgs {
-    /// Folder of a complete run
-    #[arg(value_name = "DIR")]
-    pub dir: PathBuf,
+    /// Folders of complete runs
+    #[arg(value_name = "DIR", required = true)]
+    pub dirs: Vec<PathBuf>,
     /// Folder of another run of the same configuration: it must have each score of DIR, bit for bit and of the same weights
     #[arg(long, value_name = "DIR")]
     pub same_as: Option<PathBuf>,
@@ -129,8 +131,8 @@ pub struct DoctorArgs {
     /// Folder of the run, new or existing
     #[arg(long, value_name = "DIR", default_value = "runs")]
     pub run_dir: PathBuf,
-    /// Folder with ca.pem, cert.pem and key.pem, for endpoints tls/HOST:PORT (docs/security.md)
-    #[arg(long, value_name = "DIR", env = "QUAD_CERTIFICATES")]
+    /// Folder with ca.pem, cert.pem and key.pem, for endpoints tls/HOST:PORT (docs/security.md) [default: QUAD_CERTIFICATES]
+    #[arg(long, value_name = "DIR")]
     pub certificates: Option<PathBuf>,
     /// Print a JSON array of objects with verdict, check, what and (if you can do something) hint
     #[arg(long)]
@@ -139,6 +141,7 @@ pub struct DoctorArgs {
 
 /// Arguments of `learner list`.
 #[derive(Debug, Args)]
+#[command(after_help = "The exit code is 1 if a run cannot be read.")]
 pub struct ListArgs {
     /// Run folders, or folders with runs below them
     #[arg(value_name = "DIR", default_value = "runs")]
@@ -152,11 +155,11 @@ pub struct ListArgs {
 #[derive(Debug, Args)]
 pub struct PageArgs {
     /// Run folder, or folder with runs below it
-    #[arg(long, value_name = "DIR", default_value = "runs")]
+    #[arg(value_name = "DIR", default_value = "runs")]
     pub runs: PathBuf,
     /// Address of the page; port 0 takes a free one
     #[arg(long, value_name = "ADDR:PORT", default_value = "127.0.0.1:8080")]
-    pub listen: SocketAddr,
+    pub http: SocketAddr,
 }
 
 /// Arguments of `learner report`.

@@ -1,5 +1,6 @@
 //! The arguments of `learner sweep`.
 
+use std::net::SocketAddr;
 use std::path::PathBuf;
 
 use clap::{Args, value_parser};
@@ -21,7 +22,8 @@ Examples:
 
 Each run is a `learner train` of one thread (RAYON_NUM_THREADS changes that) and logs to runs/STUDY/RUN/learner.log. A run that
 fails does not end the others. The same command continues the runs that are not complete. The exit code is 0 if all runs are
-complete, 1 if a run has failed, 75 if runs are left for the same command.";
+complete, 1 if a run has failed, 75 if runs are left for the same command. At Ctrl-C or SIGTERM the learners save checkpoints, and
+the sweep ends within 18 s.";
 
 /// Arguments of `learner sweep`.
 #[derive(Debug, Args)]
@@ -30,7 +32,7 @@ pub struct SweepArgs {
     #[arg(value_name = "STUDY.toml")]
     pub study: PathBuf,
     /// Parent folder of all studies: each run has the folder DIR/STUDY/RUN
-    #[arg(long, value_name = "DIR", default_value = "runs")]
+    #[arg(value_name = "DIR", default_value = "runs")]
     pub runs: PathBuf,
     /// Print number, name and state of each run, and start none
     #[arg(long)]
@@ -41,10 +43,14 @@ pub struct SweepArgs {
     /// Train only the I-th of N equal parts, e.g. 1/3, 2/3 and 3/3 on three machines
     #[arg(long, value_name = "I/N", value_parser = parse_shard)]
     pub shard: Option<Shard>,
+    /// Address of the page, /metrics and /healthz of the run that --index names [default: a free port]
+    #[arg(long, value_name = "ADDR:PORT", requires = "index")]
+    pub http: Option<SocketAddr>,
     /// Runs at a time [default: uses three of four cores, and leaves the fourth for evaluators]
     #[arg(long, value_name = "N", value_parser = value_parser!(u16).range(1..))]
     pub jobs: Option<u16>,
-    /// Number of evaluators to start; they serve all runs and log to DIR/STUDY [default: the cores that no learner has]
+    /// Number of evaluators to start; they serve all runs and log to DIR/STUDY [default: one for each
+    /// core that does not train, at least one]
     #[arg(long, value_name = "N", conflicts_with = "connect")]
     pub evaluators: Option<usize>,
     /// Use the evaluators at this Zenoh router instead, e.g. tcp/router:7447

@@ -24,7 +24,7 @@ fn wrong_command_lines_exit_with_2() {
         &["--set", "agent.tau"],
         &["--listen", "127.0.0.1:7447"],
         &["--listen", "tcp/127.0.0.1:1", "--connect", "tcp/127.0.0.1:2"],
-        &["--metrics", "9090"],
+        &["--http", "9090"],
         &["--device", "tpu"],
         &["--nonsense"],
     ];

@@ -15,8 +15,8 @@ use super::{parse_algorithm, parse_preset, parse_task};
 
 pub(super) const EXAMPLES: &str = "\
 Examples:
-  # One machine: the learner and two evaluators.
-  learner train --task hopper-demo --dataset data/hopper-demo.hdf5 --evaluators 2
+  # One machine: the learner, and the evaluators that it starts.
+  learner train --task hopper-demo --dataset data/hopper-demo.hdf5
 
   # Another algorithm on the same data.
   learner train --task hopper-demo --algorithm iql --dataset data/hopper-demo.hdf5
@@ -45,6 +45,10 @@ pub struct TrainArgs {
     /// A task, as --task NAME; or a file of your own with `task`, `algorithm` and the values to change
     #[arg(long, value_name = "NAME|FILE.toml", value_parser = parse_preset, conflicts_with = "task")]
     preset: Option<String>,
+    /// The environment in which the policy acts; one that no evaluator simulates can be any name (docs/python.md) [default: the
+    /// task's]
+    #[arg(long, value_name = "NAME")]
+    env: Option<String>,
     /// A file (`evaluator collect` records one), a name of `learner datasets list` (fetched if it is missing), or minari:ID
     /// [default: the task's]
     #[arg(long, value_name = "FILE|NAME")]
@@ -76,25 +80,27 @@ pub struct TrainArgs {
     #[arg(long, value_name = "ENDPOINT", value_parser = parse_endpoint)]
     pub connect: Option<String>,
     /// Number of evaluators to start on this machine; they end with the learner, and log to DIR/evaluator-1.log and so on
-    #[arg(long, value_name = "N", default_value_t = 0, conflicts_with = "certificates")]
-    pub evaluators: usize,
+    /// [default: one for each core that does not train, at least one; none with --listen, --connect or certificates, nor for an
+    /// environment of your own]
+    #[arg(long, value_name = "N", conflicts_with = "certificates")]
+    pub evaluators: Option<usize>,
     /// Training threads, each of which keeps a core busy [default: RAYON_NUM_THREADS, or one per core, at most 16]
     #[arg(long, value_name = "N")]
     pub threads: Option<NonZero<usize>>,
     /// Folder with ca.pem, cert.pem and key.pem: evaluators must show a certificate of the same authority, and endpoints are
-    /// tls/HOST:PORT (docs/security.md)
-    #[arg(long, value_name = "DIR", env = "QUAD_CERTIFICATES")]
+    /// tls/HOST:PORT (docs/security.md) [default: QUAD_CERTIFICATES, but none with --evaluators]
+    #[arg(long, value_name = "DIR")]
     pub certificates: Option<PathBuf>,
     /// Address of the page, /metrics and /healthz; port 0 takes a free one (see DIR/endpoints.json)
     #[arg(long, value_name = "ADDR:PORT", default_value = "127.0.0.1:0")]
-    pub metrics: SocketAddr,
+    pub http: SocketAddr,
     /// Train on the CPU, or on the first Nvidia GPU (with a learner that deploy/cuda.sh has built)
     #[arg(long, value_name = "cpu|cuda", value_enum, hide_possible_values = true, default_value_t)]
     pub device: Device,
     /// Change a hyper-parameter of the algorithm, in TOML's notation: guidance=dac, tau=0.5; repeatable
     #[arg(long, value_name = "KEY=VALUE", value_parser = |text: &str| parse_assignment(&format!("agent.{text}")))]
     agent: Vec<Table>,
-    /// Change any other key: batch_size=64, environment=my-robot; repeatable
+    /// Change any other key: batch_size=64; repeatable
     #[arg(long, value_name = "KEY=VALUE", value_parser = parse_assignment)]
     set: Vec<Table>,
     #[command(flatten)]
@@ -140,6 +146,7 @@ impl TrainArgs {
         }
         for (key, value) in [
             ("algorithm", self.algorithm.clone().map(Value::from)),
+            ("environment", self.env.clone().map(Value::from)),
             ("dataset", self.dataset.clone().map(Value::from)),
             ("scale", Some(&self.scale).filter(|scale| !scale.is_empty()).map(|scale| Value::from(scale.clone()))),
             ("steps", number(flags.steps)),

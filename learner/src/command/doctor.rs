@@ -2,7 +2,7 @@
 
 use quad_policy::Precision;
 use quad_runtime::doctor::{self, Findings};
-use quad_runtime::{DEFAULT_PORT, Endpoints, Role};
+use quad_runtime::{DEFAULT_PORT, Endpoints, Role, certificates_folder};
 
 use crate::cli::DoctorArgs;
 use crate::data;
@@ -22,8 +22,8 @@ pub fn examine(args: &DoctorArgs) -> anyhow::Result<Findings> {
         Ok(folder) => doctor::folder(&mut findings, "datasets", &folder, "D4RL_DATASET_DIR chooses another folder"),
         Err(error) => findings.warn("datasets", format!("{error:#}"), "name a folder in D4RL_DATASET_DIR"),
     }
-    let folder = args.certificates.as_deref();
-    let certificates = folder.and_then(|folder| doctor::certificates(&mut findings, folder, Role::Learner));
+    let folder = certificates_folder(args.certificates.clone());
+    let certificates = folder.and_then(|folder| doctor::certificates(&mut findings, &folder, Role::Learner));
     let Some(endpoint) = &args.connect else {
         doctor::port(&mut findings, DEFAULT_PORT);
         return Ok(findings);

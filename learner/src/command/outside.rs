@@ -1,9 +1,13 @@
-//! A run's connections: where it meets evaluators, and the evaluators that it starts itself.
+//! What a run has besides its training: where it meets evaluators, and those that it starts on the cores that are left.
 
+use std::num::NonZero;
 use std::thread::available_parallelism;
 
+use quad_dataset::environment;
+use quad_run::config::Experiment;
 use quad_runtime::{
-    Certificates, CertificatesError, DEFAULT_PORT, Endpoints, Hint, Role, SessionError, default_endpoint,
+    Certificates, CertificatesError, DEFAULT_PORT, Endpoints, Hint, Role, SessionError, certificates_folder,
+    default_endpoint, threads_asked,
 };
 use tracing::{info, warn};
 
@@ -11,6 +15,9 @@ use crate::cli::TrainArgs;
 use crate::live::{Opening, open_network};
 use crate::local_evaluators::LocalEvaluators;
 
+/// Default limit of training threads: a gradient step of the paper is cut into tiles (twenty with one next action per state),
+/// and threads that wait for a tile keep their cores busy.
+const MOST_THREADS: usize = 16;
 /// For a run that needs no known port, so that several can run at a time.
 const ANY_PORT: u16 = 0;
 
@@ -29,12 +36,22 @@ impl Outside {
     ///
     /// # Errors
     /// Endpoints or certificates that cannot be used, or no `evaluator` program to start.
-    pub fn new(args: &TrainArgs, eval_interval: u64) -> anyhow::Result<Self> {
-        Ok(Self {
-            endpoints: endpoints(args, eval_interval)?,
-            evaluators: LocalEvaluators::new(args.evaluators, available_parallelism()?.get())?,
-            is_default: args.listen.is_none() && args.connect.is_none(),
-        })
+    pub fn new(args: &TrainArgs, experiment: &Experiment) -> anyhow::Result<Self> {
+        let endpoints = endpoints(args, experiment.eval_interval)?;
+        let is_default = args.listen.is_none() && args.connect.is_none();
+        let cores = available_parallelism()?.get();
+        let is_alone =
+            is_default && endpoints.certificates.is_none() && environment::find(&experiment.environment).is_ok();
+        let (count, share) = match args.evaluators {
+            _ if args.dry_run || experiment.eval_interval == 0 => (0, cores),
+            Some(count) => (count, cores),
+            None if is_alone => {
+                let left = cores.saturating_sub(training_threads(args.threads)).max(1);
+                (left.min(experiment.episodes as usize), left)
+            }
+            None => (0, cores),
+        };
+        Ok(Self { endpoints, evaluators: LocalEvaluators::new(count, share)?, is_default })
     }
 
     /// Starts to open the session. If another learner on this machine has the usual port, it takes a free one.
@@ -54,9 +71,21 @@ impl Outside {
     }
 }
 
+/// Threads that train: so many as the command line or RAYON_NUM_THREADS asks for, or else one per core, up to a limit.
+pub(super) fn training_threads(asked: Option<NonZero<usize>>) -> usize {
+    let cores = available_parallelism().map_or(1, NonZero::get);
+    asked.or_else(threads_asked).map_or(cores.min(MOST_THREADS), NonZero::get)
+}
+
 /// Where the learner listens or connects.
 fn endpoints(args: &TrainArgs, eval_interval: u64) -> anyhow::Result<Endpoints> {
-    let certificates = args.certificates.as_deref().map(|folder| Certificates::read(folder, Role::Learner));
+    // Evaluators of its own have none, nor has the learner then: the variable is for other networks.
+    let folder = if args.evaluators.is_some_and(|count| count > 0) {
+        None
+    } else {
+        certificates_folder(args.certificates.clone())
+    };
+    let certificates = folder.map(|folder| Certificates::read(&folder, Role::Learner));
     let certificates = certificates.transpose().hint_of(CertificatesError::hint)?;
     let port = if eval_interval == 0 { ANY_PORT } else { DEFAULT_PORT };
     let listen = match (&args.listen, &args.connect) {

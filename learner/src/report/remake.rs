@@ -17,7 +17,10 @@ pub fn command(run: &RunReport) -> Option<String> {
     if let Some(dataset) = &experiment.dataset {
         say("--dataset", dataset);
     }
-    for key in differences(&ours, &theirs).filter(|key| *key != "seed") {
+    if experiment.environment != given.environment {
+        say("--env", &experiment.environment);
+    }
+    for key in differences(&ours, &theirs).filter(|key| !matches!(key.as_str(), "environment" | "seed")) {
         say("--set", &assignment(key, ours.get(key)?));
     }
     if run.config.run.device != Default::default() {
@@ -25,9 +28,6 @@ pub fn command(run: &RunReport) -> Option<String> {
     }
     say("--seed", &run.seed.to_string());
     say("--run-dir", &run.dir.to_string_lossy());
-    if experiment.eval_interval > 0 {
-        say("--evaluators", "2");
-    }
     Some(words.join(" "))
 }
 

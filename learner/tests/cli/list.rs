@@ -4,8 +4,8 @@ use std::fs::{self, File};
 
 use serde_json::{Value, json};
 
-use crate::printed;
 use crate::run::Run;
+use crate::{learner, printed};
 
 #[test]
 fn runs_are_listed_with_how_far_they_are_and_others_with_what_is_wrong() {
@@ -23,11 +23,19 @@ fn runs_are_listed_with_how_far_they_are_and_others_with_what_is_wrong() {
     whole.write(&path("whole"));
     fs::create_dir_all(path("other")).unwrap();
     fs::write(path("other/config.toml"), "[model]\nname = 'x'\n").unwrap();
-    let learner = File::open(path("study/half/scores.jsonl")).unwrap();
-    learner.lock().unwrap();
+    let at_work = File::open(path("study/half/scores.jsonl")).unwrap();
+    at_work.lock().unwrap();
 
     let asked = ["list", folder.path().to_str().unwrap(), "--json"];
-    let entries: Vec<Value> = serde_json::from_str(&printed(&asked)).unwrap();
+    let listed = |arguments: &[&str]| {
+        let output = learner(arguments);
+        let [text, errors] = [output.stdout, output.stderr].map(|bytes| String::from_utf8(bytes).unwrap());
+        assert_eq!(output.status.code(), Some(1), "a run cannot be read: {errors}");
+        (text, errors)
+    };
+    let (text, errors) = listed(&asked);
+    let entries: Vec<Value> = serde_json::from_str(&text).unwrap();
+    assert!(errors.contains("other: ") && !errors.contains("whole"), "{errors}");
     let names: Vec<_> = entries.iter().map(|entry| entry["name"].as_str().unwrap()).collect();
     assert_eq!(names, ["other", "study/half", "whole"]);
     assert!(entries[0]["error"].as_str().unwrap().contains("config.toml, line 1, is not what a learner writes"));
@@ -43,10 +51,14 @@ fn runs_are_listed_with_how_far_they_are_and_others_with_what_is_wrong() {
     ] {
         assert_eq!(entries[entry][key], value, "{key} of {}", entries[entry]);
     }
-    let text = printed(&[asked[0], asked[1], "/nowhere"]);
+    let (text, errors) = listed(&[asked[0], asked[1], "/nowhere"]);
     let line = |words: &str| text.lines().find(|line| line.contains(words)).unwrap();
     assert!(line("study/half").contains("30 of 40 steps, at work"), "{text}");
     assert!(line("study/half").contains("6.0 @20"), "{text}");
-    assert!(line("other: ").contains("unknown field `model`"), "{text}");
-    assert!(line("/nowhere: ").contains("No such file"), "{text}");
+    let error = |words: &str| errors.lines().find(|line| line.contains(words)).unwrap();
+    assert!(error("other: ").contains("unknown field `model`"), "{errors}");
+    assert!(error("/nowhere: ").contains("No such file"), "{errors}");
+    assert!(!text.contains("/nowhere"), "{text}");
+    fs::remove_dir_all(path("other")).unwrap();
+    assert!(printed(&asked[..2]).contains("whole"));
 }

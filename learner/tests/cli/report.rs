@@ -225,7 +225,7 @@ fn a_page_holds_all_that_is_shown_and_takes_nothing_for_html() {
     // Nothing is fetched: neither scripts nor pictures have addresses.
     assert!(!page.contains("href=\"http") && !page.contains("src=\"/") && !page.contains("url("), "{page}");
     let film = "src=\"data:image/gif;base64,R0lGODlhIG9mIGEgcnVu\"";
-    let command = format!("--seed 4 --run-dir {} --evaluators 2", path("b"));
+    let command = format!("--seed 4 --run-dir {}", path("b"));
     for words in ["<svg", film, &command, "8.50 ± 0.71 (0.50)", "steps = 6000", "100 transitions of 3 episodes"] {
         assert!(page.contains(words), "{words} is missing in\n{page}");
     }

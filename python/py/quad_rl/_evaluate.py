@@ -165,7 +165,7 @@ class Evaluators:
 def evaluate(name: str, environment: str | Callable[[int], Any], **arguments: Any) -> None:
     """Evaluates learners' policies in an environment of yours until Ctrl-C: `evaluator serve` for any environment.
 
-    name: what the learner's run calls the environment: `learner train --task own-data --set environment=NAME`.
+    name: what the learner's run calls the environment: `learner train --task own-data --env NAME`.
     environment: a Gymnasium id, or a function that takes a seed and gives an environment: an object with `reset(seed=…)`,
         which gives (observation, info), and `step(action)`, which gives (observation, reward, terminated, truncated, info),
         as in Gymnasium. The seed is the run's, the same for all episodes. Observations are flattened to one row of numbers.

@@ -60,13 +60,11 @@ pub fn list(dirs: &[PathBuf]) -> Vec<Entry> {
     entries
 }
 
-/// The runs as a table for people; below it what cannot be read.
+/// The runs that can be read, as a table for people.
 pub fn table(entries: &[Entry]) -> String {
     let texts = ["run", "task", "method", "state"].map(|name| (name, Left));
     let mut table = Table::new(&[&texts[..], &[("last score", Right), ("size", Right)]].concat());
-    let mut errors = String::new();
-    for Entry { name, run, error, .. } in entries {
-        errors.extend(error.as_ref().map(|error| format!("{name}: {error}\n")));
+    for Entry { name, run, .. } in entries {
         let Some(run) = run else { continue };
         let state = format!("{}{}", run.state, if run.at_work { ", at work" } else { "" });
         let score = run.score.zip(run.score_step);
@@ -74,7 +72,14 @@ pub fn table(entries: &[Entry]) -> String {
         let size = HumanBytes(run.bytes).to_string();
         table.push([name.clone(), run.task.clone(), run.method.clone(), state, score, size]);
     }
-    table.render(Style::Text) + &errors
+    table.render(Style::Text)
+}
+
+impl Entry {
+    /// The name of the folder and why it cannot be read, if it cannot.
+    pub fn unreadable(&self) -> Option<String> {
+        self.error.as_ref().map(|error| format!("{}: {error}", self.name))
+    }
 }
 
 impl Listed {

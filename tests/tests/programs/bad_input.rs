@@ -62,7 +62,7 @@ fn a_port_that_is_taken() {
     let run_dir = scratch.path().join("run");
     let taken = TcpListener::bind("127.0.0.1:0").unwrap().local_addr().unwrap();
     let _taken = TcpListener::bind(taken).unwrap();
-    let output = train(&scratch, &scratch.dataset(), &run_dir, &["--metrics", &taken.to_string()]);
+    let output = train(&scratch, &scratch.dataset(), &run_dir, &["--http", &taken.to_string()]);
     assert_refused(&output, &format!("cannot serve metrics at {taken}"), "port 0");
     assert!(!run_dir.exists());
 }
@@ -109,9 +109,13 @@ fn files_that_are_no_runs_or_presets_and_places_that_cannot_be_written() {
 }
 
 #[test]
-fn a_recording_that_cannot_be_replayed() {
+fn a_recording_that_is_replayed_differently_or_not_at_all() {
     let verify = |path: &Path| Command::new(binary("evaluator")).arg("verify-dataset").arg(path).output().unwrap();
     let scratch = Scratch::new();
+    // Its rewards are made up.
+    let differs = verify(&scratch.dataset());
+    assert_eq!(differs.status.code(), Some(1));
+    assert!(String::from_utf8_lossy(&differs.stdout).contains("rewards differ     3000"), "{differs:?}");
     hdf5::File::open_rw(scratch.dataset()).unwrap().unlink("infos").unwrap();
     assert_refused(&verify(&scratch.dataset()), "array `infos/qpos` is missing", "evaluator collect");
     let notes = scratch.path().join("notes.hdf5");

@@ -3,7 +3,7 @@
 use std::process::{Command, Output};
 
 use quad_tests::PATIENCE;
-use quad_tests::process::binary;
+use quad_tests::process::{assert_refused, binary};
 use quad_tests::setting::SHORT;
 use quad_tests::system::Scratch;
 
@@ -29,7 +29,7 @@ fn a_wrong_command_line_exits_with_2() {
         ("learner", &["presets", "no-such-task"]),
         ("evaluator", &[]),
         ("evaluator", &["serve", "--name", "not a name"]),
-        ("evaluator", &["serve", "--metrics", "everywhere"]),
+        ("evaluator", &["serve", "--http", "everywhere"]),
         ("evaluator", &["serve", "--connect", "127.0.0.1:7447"]),
         ("evaluator", &["collect", "--env", "hopper"]),
         ("evaluator", &["score"]),
@@ -40,6 +40,14 @@ fn a_wrong_command_line_exits_with_2() {
         let text = String::from_utf8_lossy(&output.stderr);
         assert_eq!(output.status.code(), Some(2), "{program} {arguments:?}: {text}");
     }
+}
+
+#[test]
+fn more_threads_than_the_system_has_are_an_error_and_not_a_panic() {
+    let mut shell = Command::new("sh");
+    shell.args(["-c", "ulimit -v 4000000; exec \"$0\" completions bash"]).arg(binary("evaluator"));
+    let output = shell.env("RAYON_NUM_THREADS", "60000").output().unwrap();
+    assert_refused(&output, "cannot start the threads", "RAYON_NUM_THREADS");
 }
 
 #[test]

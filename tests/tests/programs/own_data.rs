@@ -29,7 +29,7 @@ fn write_log(path: &Path, strength: f64) {
 
 fn train(dataset: &Path, run_dir: &Path, flags: &[&str]) -> Output {
     let mut command = Command::new(binary("learner"));
-    command.args(["train", "--task", "own-data", "--set", "environment=my-robot", "--steps", "20"]);
+    command.args(["train", "--task", "own-data", "--env", "my-robot", "--steps", "20"]);
     command.args(["--agent", "actor.hidden=[32]", "--agent", "critic.hidden=[32]", "--set", "batch_size=64"]);
     command.arg("--dataset").arg(dataset).arg("--run-dir").arg(run_dir).args(flags).output().unwrap()
 }
@@ -65,6 +65,7 @@ fn a_robot_whose_actions_are_large_is_learnt_from_in_its_own_units() {
     let refused = said(&train(&dataset, &run_dir, &["--scale", "states"]), 1);
     assert!(refused.contains("outside [-1, 1]") && refused.contains("--scale actions"), "{refused}");
     let inspected = Command::new(binary("learner")).args(["datasets", "inspect"]).arg(&dataset).output().unwrap();
+    assert_eq!(inspected.status.code(), Some(1), "it has a problem");
     let inspected = String::from_utf8(inspected.stdout).unwrap();
     assert!(inspected.contains("it can be trained on") && inspected.contains("--scale actions"), "{inspected}");
 

@@ -19,7 +19,7 @@ const SETTING: Setting = Setting { steps: 40, eval_interval: 20, episodes: 7, ca
 /// A finished run, evaluated in the arithmetic of that name.
 fn run(scratch: &Scratch, name: &str, precision: &str) -> Learner {
     let mut learner = scratch.learner(name, SETTING);
-    let connect = ["--connect", &learner.endpoint(), "--metrics", "127.0.0.1:0", "--precision", precision];
+    let connect = ["--connect", &learner.endpoint(), "--http", "127.0.0.1:0", "--precision", precision];
     let _evaluator = scratch.evaluator_with(&format!("evaluator-of-{name}"), &connect);
     learner.process.assert_succeeds(PATIENCE);
     learner

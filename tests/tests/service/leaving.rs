@@ -40,7 +40,7 @@ fn a_stderr_that_is_never_read_holds_up_neither_the_work_nor_the_end() {
     let run_dir = scratch.path().join("run");
     let mut learner = Command::new(binary("learner"));
     learner.arg("train").arg("--preset").arg(preset).arg("--dataset").arg(scratch.dataset());
-    learner.arg("--run-dir").arg(&run_dir).args(["--metrics", "127.0.0.1:0", "--listen", &endpoint]);
+    learner.arg("--run-dir").arg(&run_dir).args(["--http", "127.0.0.1:0", "--listen", &endpoint]);
     let learner = start(&mut learner);
     let evaluator = start(Command::new(binary("evaluator")).args(["serve", "--name", "mute", "--connect", &endpoint]));
     let scored = || std::fs::read_to_string(run_dir.join("scores.jsonl")).is_ok_and(|lines| lines.lines().count() > 20);

@@ -62,7 +62,7 @@ fn a_browser_compares_finished_runs() {
     let runs = scratch.path().join("runs");
     std::fs::rename(runs.join("other"), runs.join("<img src=x onerror=alert(1)>")).unwrap();
     let mut command = Command::new(binary("learner"));
-    command.args(["page", "--listen", "127.0.0.1:0", "--runs"]).arg(runs);
+    command.args(["page", "--http", "127.0.0.1:0"]).arg(runs);
     let mut server = Process::start("page", scratch.path(), command);
     let line = server.wait_for_log("page: http://", PATIENCE);
     let address = line.split_whitespace().find(|word| word.starts_with("http://")).unwrap();

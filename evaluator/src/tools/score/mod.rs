@@ -33,7 +33,7 @@ pub(crate) fn score(args: &ScoreArgs) -> anyhow::Result<String> {
     info!("scoring {} policies", subjects.len());
     let subjects: Vec<Subject> = subjects.into_iter().flatten().collect();
     let scored = subjects.par_iter().with_max_len(1).map(measure).collect::<anyhow::Result<Vec<Scored>>>()?;
-    Ok(if args.json { serde_json::to_string(&scored)? } else { table(&scored) })
+    Ok(if args.json { quad_runtime::json(&scored)? } else { table(&scored) })
 }
 
 /// Runs a policy's episodes. An episode's result depends on neither its batch nor the number of threads.

@@ -16,7 +16,7 @@ fn flags_change_the_values_of_the_task() {
 #[test]
 fn only_this_machine_sees_the_metrics_unless_told_otherwise() {
     let Command::Train(train) = parse(&[]).unwrap().command else { panic!("not train") };
-    assert!(train.metrics.ip().is_loopback(), "{}", train.metrics);
+    assert!(train.http.ip().is_loopback(), "{}", train.http);
 }
 
 #[test]
