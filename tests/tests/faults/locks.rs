@@ -27,7 +27,7 @@ fn where_files_have_no_locks_a_folder_is_still_one_learners() {
     let mut next = start(&scratch);
     next.process.wait_for_log("goes on after step", PATIENCE);
     next.assert_scores_are_distinct();
-    assert_eq!(next.process.terminate(PATIENCE).1.code(), Some(75), "{}", next.process.log());
+    assert_eq!(next.process.terminate(PATIENCE).code(), Some(75), "{}", next.process.log());
 
     // Of another host nobody knows.
     let claim = folder.join("scores.host");
