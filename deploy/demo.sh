@@ -3,7 +3,7 @@
 #
 # Sets up what is missing, builds, records the dataset if it is not there, trains, and ends with the run's table, its learning
 # curve, where OpenGL is installed a film of its best snapshot, and a report of all that as one HTML file. Run again, it skips what is done: a run that was interrupted
-# goes on where it was. Ctrl-C stops everything.
+# continues where it was. Ctrl-C stops everything.
 #
 #   deploy/demo.sh [--fresh]        --fresh: begin another run; the one that is there is kept under another name
 set -euo pipefail
@@ -39,7 +39,7 @@ say "4 of 4: training, then the table, a film and a report"
 status=0
 $BIN/learner train --task $TASK --dataset $DATASET --run-dir $RUN --evaluators $EVALUATORS "$@" || status=$?
 if [ "$status" -ne 0 ]; then
-  say "the learner ended with status $status; run this again to go on where it was"
+  say "the learner ended with status $status; run this again to continue"
   exit "$status"
 fi
 touch "$RUN/complete"

@@ -34,10 +34,10 @@ struct Counters {
     step: u64,
 }
 
-/// A saved state that cannot be gone on from.
+/// A saved state from which training cannot continue.
 #[derive(Debug, thiserror::Error)]
 pub enum StateError {
-    /// Of another algorithm.
+    /// The state is of another algorithm.
     #[error("the state is of the algorithm {found}, this run is of {expected}")]
     Algorithm {
         /// The state's.
@@ -51,7 +51,7 @@ pub enum StateError {
 }
 
 impl Agent {
-    /// At step 0, with the hyper-parameters of this table.
+    /// Makes an agent at step 0, with the hyper-parameters of this table.
     ///
     /// # Errors
     /// They cannot be used, or candle fails.

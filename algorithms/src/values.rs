@@ -27,7 +27,7 @@ pub struct Values {
 }
 
 impl Values {
-    /// Those of an algorithm.
+    /// Reads an algorithm's values.
     ///
     /// # Errors
     /// Its file is broken, which a test of each excludes.

@@ -39,7 +39,7 @@ fn group<'a>(criterion: &'a mut Criterion, name: &str, elements: usize) -> Bench
     group
 }
 
-/// Of the right-hand side of that number: its left and right side, and the result.
+/// A product to be timed, with the right-hand side of a number: left side, right side, result.
 type Product<'a> = &'a dyn Fn(usize, &[f32], &[f32], &mut [f32]);
 
 /// How a slice is taken.

@@ -47,7 +47,8 @@ impl Level {
         Self::Plain
     }
 
-    /// That of this process: the widest, but no wider than AVX2 where the environment has `QUAD_INSTRUCTIONS=avx2`.
+    /// The level of this process: the widest, but no wider than AVX2 where the environment has
+    /// `QUAD_INSTRUCTIONS=avx2`.
     pub fn in_use() -> Self {
         static IN_USE: LazyLock<Level> = LazyLock::new(|| {
             let only_avx2 = std::env::var("QUAD_INSTRUCTIONS").is_ok_and(|asked| asked == Level::Avx2.name());

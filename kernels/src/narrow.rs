@@ -20,7 +20,7 @@ fn combine(mut acc: [f32; LANES], coefficients: &[f32], vectors: &[f32], stride:
     acc
 }
 
-/// The same for one column.
+/// [`combine`] for one column.
 #[inline(always)]
 fn combine_one(mut acc: f32, coefficients: &[f32], vectors: &[f32], stride: usize, at: usize) -> f32 {
     for (j, c) in coefficients.iter().enumerate() {

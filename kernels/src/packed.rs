@@ -38,7 +38,7 @@ impl Packed {
         Some(Self(Blocks::F32 { lines, k, n }))
     }
 
-    /// The same with its numbers rounded to bfloat16, as those of the left side will be; sums are in f32.
+    /// Packs a matrix with its numbers rounded to bfloat16, as those of the left side will be; sums are in f32.
     pub fn rounded(matrix: &[f32], k: usize, n: usize) -> Option<Self> {
         Some(Self(Blocks::Bf16(Rounded::new(matrix, k, n)?)))
     }

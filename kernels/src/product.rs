@@ -18,7 +18,7 @@ pub use crate::packed::Packed;
 /// The left or right side of a product.
 #[derive(Clone, Copy)]
 pub enum Matrix<'a> {
-    /// Of these elements, row by row.
+    /// The matrix that has these elements, row by row.
     RowMajor(&'a [f32]),
     /// The transpose of the matrix that has these elements, row by row.
     TransposeOf(&'a [f32]),
@@ -103,7 +103,7 @@ unsafe fn by_avx2(avx2: V3, [m, n, k]: [usize; 3], out: &mut [f32], a: Strided, 
     }
 }
 
-/// By AVX-512 where the CPU has it and the result is whole blocks wide, else by `gemm`.
+/// Multiplies by AVX-512 where the CPU has it and the result is whole blocks wide, else by `gemm`.
 fn multiply([m, k, n]: [usize; 3], a: Matrix, b: &[f32], out: &mut [f32]) {
     #[cfg(target_arch = "x86_64")]
     if avx512::serves(n) {

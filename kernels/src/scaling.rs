@@ -7,10 +7,10 @@ use serde::{Deserialize, Serialize};
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Scaling {
-    /// Of observations.
+    /// Map of observations.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub observations: Option<Affine>,
-    /// Of actions.
+    /// Map of actions.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub actions: Option<Affine>,
 }
@@ -33,17 +33,17 @@ impl Affine {
         lengths && offsets && self.scale.iter().all(|scale| scale.is_finite() && *scale > 0.0)
     }
 
-    /// From the user's numbers to the network's, in place; `numbers` is `rows × columns`.
+    /// Maps the user's numbers to the network's, in place; `numbers` is `rows × columns`.
     pub fn to_network(&self, numbers: &mut [f32]) {
         self.change(numbers, |x, offset, scale| (x - offset) / scale);
     }
 
-    /// From the network's numbers to the user's, in place; `numbers` is `rows × columns`.
+    /// Maps the network's numbers to the user's, in place; `numbers` is `rows × columns`.
     pub fn to_user(&self, numbers: &mut [f32]) {
         self.change(numbers, |x, offset, scale| offset + scale * x);
     }
 
-    /// In f64, so that a large offset costs no digits.
+    /// Computes in f64, so that a large offset costs no digits.
     fn change(&self, numbers: &mut [f32], with: impl Fn(f64, f64, f64) -> f64) {
         let columns = self.offset.iter().zip(&self.scale).cycle();
         for (x, (offset, scale)) in numbers.iter_mut().zip(columns) {

@@ -32,7 +32,7 @@ pub struct Progress {
 }
 
 impl Progress {
-    /// Of `job`, in which nothing has been done yet, by an evaluator that has done nothing yet.
+    /// Progress of `job` before its first step, by an evaluator that has done nothing yet.
     pub fn of(job: &Job, evaluator: Name) -> Self {
         Self {
             evaluator,

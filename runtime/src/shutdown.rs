@@ -19,7 +19,7 @@ const LAST_WORDS: Duration = Duration::from_millis(100);
 
 /// Becomes ready at the first SIGINT (Ctrl-C) or SIGTERM after this call, even before a task awaits it.
 ///
-/// From this call on, the first of the two signals does not end the process. A further signal, half a second later or more,
+/// Takes over the two signals: the first no longer ends the process. A further signal, half a second later or more,
 /// ends it at once with exit code 130. All that the process does to end shares one budget: this long after the first signal it
 /// ends, whatever it waits for, with exit code 75, because the same command continues its work. Needs a tokio runtime, and
 /// lasts as long as that runtime.

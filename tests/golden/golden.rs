@@ -7,7 +7,7 @@ use std::process::Command;
 
 /// Largest error, relative to the number itself or, for numbers near zero, to their tensor's root mean square.
 const TOLERANCE: f32 = 1e-4;
-/// The same for numbers of a fresh seed, any of which may happen to lie close to zero. A slip shows far more.
+/// Largest error for numbers of a fresh seed, any of which may happen to lie close to zero. A slip shows far more.
 #[allow(dead_code)] // not every crate makes some
 const FRESH_TOLERANCE: f32 = 1e-2;
 

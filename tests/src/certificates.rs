@@ -14,7 +14,7 @@ pub struct Certificates {
 }
 
 impl Certificates {
-    /// Of a new authority. `None` if the test is to be skipped.
+    /// Makes certificates of a new authority. `None` if the test is to be skipped.
     pub fn make() -> Option<Certificates> {
         let folder = tempdir().unwrap();
         let made: [&[&str]; 5] = [
@@ -54,7 +54,7 @@ impl Certificates {
         self.folder.path().join(name)
     }
 
-    /// The same, for a command line.
+    /// Path of the folder of that name, for a command line.
     pub fn argument(&self, name: &str) -> String {
         self.of(name).to_str().unwrap().to_owned()
     }

@@ -38,7 +38,7 @@ pub enum Pace {
     Still,
     /// A job takes some seconds, with progress meanwhile, as with real episodes.
     Real,
-    /// The same in a twentieth of the time, so that there is a claim at every moment.
+    /// A job takes a twentieth of that, so that there is a claim at every moment.
     Quick,
 }
 

@@ -19,7 +19,7 @@ const PREFIX: &str = "quad-";
 
 /// A bridge with hosts. All of it goes when dropped.
 pub struct Network {
-    /// Of the bridge: unique on this machine.
+    /// Name of the bridge: unique on this machine.
     name: String,
     /// Address of this machine on the bridge.
     pub address: String,
@@ -27,7 +27,7 @@ pub struct Network {
 
 /// A host on it, and the line from there to this machine.
 pub struct Host {
-    /// Of the namespace, and of the outer end of the cable whose inner end is the host's eth0.
+    /// Name of the namespace, and of the outer end of the cable whose inner end is the host's eth0.
     name: String,
     endpoint: String,
 }

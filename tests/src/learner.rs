@@ -65,7 +65,7 @@ impl Learner {
         complete.lines().map(|line| Score(serde_json::from_str(line).expect("a line is a JSON object"))).collect()
     }
 
-    /// The same, after no episode was found to be scored twice.
+    /// Reads all scores, and asserts that no episode is scored twice.
     pub fn assert_scores_are_distinct(&self) -> Vec<Score> {
         let scores = self.scores();
         let mut keys: Vec<_> = scores.iter().map(Score::key).collect();

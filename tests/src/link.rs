@@ -28,7 +28,7 @@ struct State {
 }
 
 impl Link {
-    /// To a port that may be opened now or later.
+    /// Makes a link to a port that may be opened now or later.
     pub fn to(port: u16) -> Link {
         let listener = TcpListener::bind("127.0.0.1:0").expect("there is a free port");
         let endpoint = format!("tcp/{}", listener.local_addr().expect("it is bound"));

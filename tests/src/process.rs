@@ -27,7 +27,7 @@ pub fn preload(example: &str) -> Vec<String> {
     vec!["env".to_owned(), format!("LD_PRELOAD={}", library.display())]
 }
 
-/// That a program ended with exit code 1, an error that has this sentence, and a hint that has that.
+/// Asserts that a program ended with exit code 1, an error that has this sentence, and a hint that has that.
 pub fn assert_refused(output: &Output, sentence: &str, hint: &str) {
     let text = String::from_utf8_lossy(&output.stderr);
     assert_eq!(output.status.code(), Some(1), "{sentence}: {text}");

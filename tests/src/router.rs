@@ -26,7 +26,8 @@ pub async fn router(endpoint: &str) -> Session {
     zenoh::open(listening(endpoint)).await.expect("the port is free")
 }
 
-/// The same, but it passes on no scores: however fast a machine is, no job is over before a test lets something happen to it.
+/// Opens a router that passes on no scores: however fast a machine is, no job is over before a test lets something
+/// happen to it.
 /// A learner that listens itself is one to `connect` to.
 pub async fn router_without_scores(endpoint: &str, connect: Option<&str>) -> Session {
     let mut config = listening(endpoint);

@@ -21,7 +21,7 @@ pub struct Setting {
 pub const SHORT: Setting = Setting { steps: 80, eval_interval: 20, episodes: 6, candidates: 2, hidden: 16, seed: 1 };
 /// A run that is still training when its test is over.
 pub const ENDLESS: Setting = Setting { steps: 100_000_000, eval_interval: 500, ..SHORT };
-/// The same, without a snapshot to evaluate before the test is over.
+/// An endless run without a snapshot to evaluate before the test is over.
 pub const IDLE: Setting = Setting { eval_interval: 50_000_000, ..ENDLESS };
 
 impl Setting {

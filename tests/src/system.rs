@@ -25,7 +25,7 @@ impl Scratch {
         Self::inside(&std::env::temp_dir())
     }
 
-    /// The same inside of that folder.
+    /// Makes the folder inside of another.
     pub fn inside(parent: &Path) -> Scratch {
         let folder = tempfile::tempdir_in(parent).expect("there is room for a scratch folder");
         write_dataset(&folder.path().join("tiny.hdf5"));

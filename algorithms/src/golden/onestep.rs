@@ -42,7 +42,7 @@ fn golden_update_of_a_fresh_seed() {
     }
 }
 
-/// Three episodes of two steps: the first terminates, the second is cut off, the third, of one step more, goes on to the end.
+/// Three episodes of two steps: the first terminates, the second is cut off, the third, of one step more, continues to the end.
 fn small_context(golden: &Golden) -> Context {
     let transitions = Transitions::of(Arrays {
         observation_dim: 1,

@@ -84,7 +84,7 @@ pub(super) struct Quad {
     pub eta: Eta,
     /// Adam's learning rate for the actor at the first step; decays to 0 along a cosine.
     pub actor_learning_rate: Positive,
-    /// The same for the critics.
+    /// Adam's learning rate for the critics at the first step; decays to 0 along a cosine.
     pub critic_learning_rate: Positive,
     /// Global norm at which each network's gradient is clipped.
     pub gradient_clip: Positive,

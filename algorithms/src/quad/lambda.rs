@@ -46,7 +46,7 @@ fn mean(values: impl ExactSizeIterator<Item = f32>) -> f32 {
     (values.map(f64::from).sum::<f64>() / count) as f32
 }
 
-/// Those at 10 %, 50 % and 90 %, linear between the two nearest values.
+/// Quantiles at 10 %, 50 % and 90 %, linear between the two nearest values.
 fn quantiles(values: &[f32]) -> [f32; 3] {
     let mut sorted = values.to_vec();
     sorted.sort_unstable_by(f32::total_cmp);

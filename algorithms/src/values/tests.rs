@@ -71,7 +71,7 @@ fn keys(group: &Table) -> Vec<String> {
     group.iter().flat_map(|(key, value)| inner(key, value)).collect()
 }
 
-/// Of two patterns with as many letters neither wins.
+/// Two patterns with as many letters would contradict each other: neither wins.
 #[test]
 fn in_no_file_two_patterns_are_equally_good_for_a_key() {
     for definition in ALGORITHMS {

@@ -16,7 +16,7 @@ pub(crate) fn available() -> bool {
     amx::available() || has_bf16() && [vendor.ebx, vendor.edx, vendor.ecx] != INTEL
 }
 
-/// Which of the two it takes.
+/// Name of the instructions in use: AMX or AVX-512.
 pub(crate) fn instructions() -> &'static str {
     if amx::available() { "amx" } else { "avx512" }
 }

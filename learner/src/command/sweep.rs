@@ -150,10 +150,10 @@ fn conclude(folder: &Path, count: usize, ended: Ended) -> anyhow::Result<()> {
     let Ended { unfinished: stopped, failed } = ended;
     if !failed.is_empty() {
         let error = anyhow!("{} of {count} runs have failed:\n  {}", failed.len(), failed.join("\n  "));
-        return Err(error).hint("when that is mended, the same command goes on with what is not complete");
+        return Err(error).hint("fix it and run the same command: unfinished runs continue");
     }
     if stopped > 0 {
-        let kept = "what they have reached is kept, and the same command goes on from there";
+        let kept = "what they have reached is kept, and the same command continues from there";
         return Err(unfinished(anyhow!("{stopped} of {count} runs are not complete"), kept));
     }
     print(&format!("all {count} runs are complete: learner report {}", folder.display()))

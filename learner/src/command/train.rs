@@ -178,7 +178,7 @@ fn conclude(run_dir: &RunDir, config: &RunConfig, ending: Ending) -> anyhow::Res
         }
     };
     let kept =
-        format!("everything up to the newest checkpoint is kept in {folder}; the same command goes on from there");
+        format!("everything up to the newest checkpoint is kept in {folder}; the same command continues from there");
     let error = match ending {
         Ending::Complete => return all_scored(reported?),
         Ending::Failed(error) => hinted(error, kept),
@@ -207,7 +207,7 @@ fn all_scored(report: RunReport) -> anyhow::Result<()> {
     if missing == 0 {
         return Ok(());
     }
-    let hint = "the log says why; when that is mended, the same command hands them out again";
+    let hint = "the log says why; fix it, and the same command hands them out again";
     Err(anyhow!("training is complete, but {missing} episodes have no score")).hint(hint)
 }
 

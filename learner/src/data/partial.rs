@@ -25,7 +25,7 @@ impl Partial {
             }
         }
         let file = OpenOptions::new().append(true).create_new(true).open(&path)?;
-        // Where the file system has no locks, this run goes on all the same, and nothing is taken over there.
+        // Where the file system has no locks, this run continues all the same, and nothing is taken over there.
         file.try_lock().ok();
         Ok(Self { path, length: 0, file })
     }

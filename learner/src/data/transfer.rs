@@ -19,7 +19,7 @@ const CONNECT: Duration = Duration::from_secs(10);
 pub enum Failure {
     /// The file cannot be written here, which no address can mend.
     Local(io::Error),
-    /// The same address may do better a little later.
+    /// A later attempt at this address may succeed.
     Passing(String),
     /// It will not.
     Lasting(String),

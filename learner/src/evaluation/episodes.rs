@@ -54,13 +54,13 @@ enum EpisodeState {
     HandedOut {
         job: u64,
     },
-    /// Not waited for any more. Its score is still accepted.
+    /// The episode is not waited for any more. Its score is still accepted.
     GivenUp,
     Scored(EpisodeScore),
 }
 
 impl Evaluation {
-    /// Of the episodes `seeds`, some of which may have a score already.
+    /// Opens an evaluation of the episodes `seeds`, some of which may have a score already.
     pub fn new(weights: Hash, seeds: &[u64], scores: &[EpisodeScore]) -> Self {
         let episode = |&seed| {
             let score = scores.iter().find(|score| score.seed == seed);

@@ -14,7 +14,7 @@ const PREPARATION: Duration = Duration::from_secs(60);
 #[derive(Debug)]
 pub(super) struct OpenJob {
     pub evaluator: Name,
-    /// Of the claim that it was handed out for.
+    /// Number of the claim that it was handed out for.
     pub attempt: u64,
     pub step: u64,
     pub seeds: Vec<u64>,
@@ -39,8 +39,7 @@ impl OpenJob {
     }
 
     /// Extends the lease, if the evaluator is further than before: one whose simulation hangs loses its job. Before the
-    /// first environment step there is nothing to be further with, but only a short time; and the whole job has a longest
-    /// time, too.
+    /// first environment step the lease is short; every job has a maximum time.
     pub fn advance(&mut self, progress: &Progress, now: Instant) -> Result<(), Refusal> {
         require(progress.evaluator == self.evaluator, Refusal::Evaluator)?;
         let (steps, episodes) = (progress.steps_done, progress.episodes_done);
@@ -96,7 +95,7 @@ impl OpenJobs {
         Some(job)
     }
 
-    /// Those whose lease has run out.
+    /// Jobs whose lease has run out.
     pub fn expired(&self, now: Instant) -> Vec<u64> {
         self.jobs.iter().filter(|(_, job)| job.lease_until <= now).map(|(&id, _)| id).collect()
     }

@@ -28,7 +28,7 @@ pub(crate) struct Recorded {
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct Claim<'a> {
     pub evaluator: &'a Name,
-    /// The same number, if it asks the same again.
+    /// Number of the claim; a repeated claim has the number of the first.
     pub attempt: u64,
     /// The environments that it has.
     pub environments: &'a [String],
@@ -41,7 +41,7 @@ pub(crate) struct Claim<'a> {
 pub(crate) enum Claimed {
     Job {
         job: Job,
-        /// The same one once more: the answer was lost.
+        /// True if the job is handed out once more, because the answer was lost.
         again: bool,
     },
     /// Nothing now.

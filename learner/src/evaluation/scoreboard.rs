@@ -15,7 +15,7 @@ use super::refusal::{Refusal, require};
 /// After this time an evaluator asks again when there was no job for it, or after this time for each evaluator that there is
 /// if that is longer, so that hundreds which have nothing to do do not keep the learner busy. A new snapshot wakes them all.
 const ASK_AGAIN: [Duration; 2] = [Duration::from_millis(500), Duration::from_millis(100)];
-/// The same for how often progress is told.
+/// Time between an evaluator's progress messages, or this time for each evaluator if that is longer.
 const TELL_PROGRESS: [Duration; 2] = [Duration::from_secs(1), Duration::from_millis(40)];
 /// Progress is told at least this often.
 const RARELY: Duration = Duration::from_secs(20);

@@ -15,7 +15,7 @@ const LINE: Duration = Duration::from_secs(5);
 /// Window over which the rate is measured.
 const RATE_WINDOW: Duration = Duration::from_secs(15);
 /// How long training runs before the forecast of its duration.
-const FORETELL: Duration = Duration::from_secs(3);
+const ESTIMATE: Duration = Duration::from_secs(3);
 /// How many of the newest evaluations are shown.
 const SCORES_SHOWN: usize = 3;
 
@@ -30,7 +30,7 @@ pub(crate) struct Display {
     scores: VecDeque<(u64, f64)>,
     last_line: Instant,
     /// Whether the forecast has been printed.
-    foretold: bool,
+    estimated: bool,
 }
 
 impl Display {
@@ -48,7 +48,7 @@ impl Display {
             samples: VecDeque::new(),
             scores: VecDeque::new(),
             last_line: Instant::now(),
-            foretold: false,
+            estimated: false,
         }
     }
 
@@ -81,7 +81,7 @@ impl Display {
         while self.samples.front().is_some_and(|(then, _)| now.duration_since(*then) > RATE_WINDOW) {
             self.samples.pop_front();
         }
-        self.foretell(step, now);
+        self.estimate(step, now);
         match &self.bar {
             Some(bar) => {
                 bar.set_position(step);
@@ -98,13 +98,13 @@ impl Display {
     }
 
     /// Prints once how long training will take, if that is more than a minute: the user may have meant fewer steps.
-    fn foretell(&mut self, step: u64, now: Instant) {
+    fn estimate(&mut self, step: u64, now: Instant) {
         let Some(&(begin, first)) = self.samples.front() else { return };
         let rate = self.rate();
-        if self.foretold || now.duration_since(begin) < FORETELL || step == first || rate <= 0.0 {
+        if self.estimated || now.duration_since(begin) < ESTIMATE || step == first || rate <= 0.0 {
             return;
         }
-        self.foretold = true;
+        self.estimated = true;
         let left = Duration::from_secs_f64((self.steps - step.min(self.steps)) as f64 / rate);
         if left > Duration::from_secs(60) {
             self.say(&format!("{rate:.1} steps/s: this takes about {}", HumanDuration(left)));

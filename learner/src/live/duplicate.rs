@@ -83,7 +83,7 @@ pub(super) async fn watch(session: &Session, incarnation: &Incarnation, events: 
     tokio::spawn(async move {
         tokio::time::sleep(TOGETHER).await;
         if let Err(error) = tokens.undeclare().await {
-            debug!(%error, "learners' tokens go on to be received");
+            debug!(%error, "learners' tokens are still received");
         }
     });
     Ok(())

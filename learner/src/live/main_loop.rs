@@ -196,7 +196,7 @@ impl MainLoop {
         for what in hangs.iter().filter(|what| !told.contains(what)) {
             self.metrics.disk.trouble(*what).set(1);
             let waits = match what {
-                Saved::Run => "snapshots and checkpoints wait for it; training goes on",
+                Saved::Run => "snapshots and checkpoints wait for it; training continues",
                 Saved::Scores => "scores wait for it; evaluators keep theirs",
             };
             self.display.say(&format!("the disk hangs: {waits}"));
@@ -248,7 +248,7 @@ fn tell(event: Event, display: &mut Display) {
             format!("step {step}: score {mean:.2}{std} over {} episodes", values.len())
         }
         Event::DiskTrouble(what, error) => format!(
-            "{} cannot be saved: {error}; training goes on, and it is tried again until the disk takes it",
+            "{} cannot be saved: {error}; training continues, and it is tried again until the disk takes it",
             what.name()
         ),
         Event::DiskWell(what) => format!("{} can be saved again", what.name()),

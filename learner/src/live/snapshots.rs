@@ -108,7 +108,7 @@ fn with_hint(error: anyhow::Error) -> anyhow::Error {
     match error.is::<OtherWeights>() {
         true => hinted(
             error,
-            "another kind of processor, another number of threads or another version computes other bits: go on where the \
+            "another kind of processor, another number of threads or another version computes other bits: continue where the \
              run was before, or begin anew with --fresh",
         ),
         false => error,

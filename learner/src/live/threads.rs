@@ -33,7 +33,7 @@ const JOB_EPISODES: [usize; 2] = [5, 40];
 const LEASE: Duration = Duration::from_secs(15);
 /// A thread that answers or writes is stuck if it has not reported for this long.
 pub(crate) const STUCK: Duration = Duration::from_secs(30);
-/// The same for training, whose slowest steps take seconds.
+/// Training is stuck if it has not reported for this long; its slowest steps take seconds.
 const TRAINING_STUCK: Duration = Duration::from_secs(300);
 
 /// A run and its state.

@@ -41,7 +41,7 @@ struct Row {
 }
 
 impl History {
-    /// That of the file, of which nothing is read yet.
+    /// History of the file, of which nothing is read yet.
     pub fn of(path: PathBuf) -> Self {
         Self { path, read: 0, stride: 1, lines: 0, names: Vec::new(), rows: Vec::new() }
     }

@@ -40,7 +40,7 @@ pub(super) type Asked = (Question, oneshot::Sender<Option<Bytes>>);
 pub(super) struct Reader {
     root: PathBuf,
     list: Kept,
-    /// By the name in the list.
+    /// Folders of the runs, by the name in the list.
     dirs: HashMap<String, PathBuf>,
     runs: HashMap<String, (RunPage, Kept)>,
 }

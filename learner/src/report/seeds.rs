@@ -53,14 +53,14 @@ pub struct GroupReport {
     pub goals: Option<usize>,
     /// `mean_last_3` over the runs; absent if one of them has none.
     pub mean_last_3: Option<Spread>,
-    /// The same of `mean_last_5`.
+    /// `mean_last_5` over the runs; absent if one of them has none.
     pub mean_last_5: Option<Spread>,
-    /// The same of `mean_last_50000_steps`.
+    /// `mean_last_50000_steps` over the runs; absent if one of them has none.
     pub mean_last_50000_steps: Option<Spread>,
     /// The score of each run's best evaluation, over the runs; absent unless that is what counts.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub best: Option<Spread>,
-    /// Those whose evaluations are not complete, each with how many there are.
+    /// Runs whose evaluations are not complete, each with how many there are.
     pub unfinished: Vec<String>,
     /// Runs that are not counted, each with the reason.
     pub left_out: Vec<String>,

@@ -54,22 +54,22 @@ pub struct Comparison {
     pub against: String,
     /// What both have learnt.
     pub tasks: Vec<String>,
-    /// That a run of the one scores more than a run of the other.
+    /// Probability that a run of the one scores more than a run of the other.
     pub probability_of_improvement: Estimate,
     /// Pairs of runs with the same task and seed.
     pub pairs: usize,
     /// The mean of their differences; absent without pairs, as are the p-values.
     pub mean_difference: Option<f64>,
-    /// That of the sign-flip test.
+    /// p-value of the sign-flip test.
     pub p: Option<f64>,
-    /// The same, corrected for the number of comparisons.
+    /// `p`, corrected for the number of comparisons by Holm's method.
     pub p_holm: Option<f64>,
 }
 
 /// Groups of one method, each of another task.
 type Method<'a> = Vec<&'a GroupReport>;
 
-/// Of all groups that have scores: each method, and each but the first against that.
+/// Summarises all groups that have scores: each method, and each but the first against the first.
 pub fn study(groups: &[GroupReport]) -> (Vec<MethodReport>, Vec<Comparison>) {
     let mut scopes: Vec<Vec<Method>> = Vec::new();
     // Returns of different tasks have no common unit.

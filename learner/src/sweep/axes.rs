@@ -8,7 +8,7 @@ use toml::{Table, Value};
 pub(super) struct Axis {
     /// A key as after `--set`, or `task`, `preset`, `method`.
     pub key: String,
-    /// At least one; no two are the same.
+    /// Values of the axis: at least one; no two are the same.
     pub values: Vec<Value>,
 }
 

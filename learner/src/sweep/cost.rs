@@ -20,9 +20,9 @@ const MOST_MEASURED: usize = 20;
 pub(crate) struct Cost {
     /// Seconds of a gradient step, by the run's number.
     pub step_seconds: BTreeMap<usize, f64>,
-    /// Of training that is left, in all runs together.
+    /// Seconds of training that is left, in all runs together.
     seconds: f64,
-    /// At the end, of all runs together.
+    /// Disk space at the end, of all runs together, bytes.
     bytes: u64,
     /// Configurations that were measured.
     measured: usize,
@@ -65,7 +65,7 @@ impl Cost {
         Ok(cost)
     }
 
-    /// In words, for so many runs at a time.
+    /// Says the cost in words, for this many runs at a time.
     pub fn text(&self, jobs: usize) -> String {
         let left = HumanDuration(Duration::from_secs_f64(self.seconds / jobs as f64));
         format!(

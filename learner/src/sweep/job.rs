@@ -122,7 +122,7 @@ impl Job {
         match code {
             Some(0) => return End::Complete,
             Some(UNFINISHED) => return End::Unfinished,
-            // It was ended before it could do as it was told; the same command goes on all the same.
+            // It was ended before it could do as it was told; the same command continues all the same.
             None | Some(ENDED_AT_ONCE) if self.stopped => return End::Unfinished,
             _ => {}
         }

@@ -6,7 +6,7 @@
 //! [`train`](crate::train) to measure how long steps take.
 //!
 //! In reading order: `study` is the file, `axes` are its lists of values, `rules` say which combinations, `names` what runs are
-//! called; `cost` is foretold; `work` runs the learners, each a `job`, and
+//! called; `cost` estimates; `work` runs the learners, each a `job`, and
 //! `display` shows them.
 
 mod axes;

@@ -34,7 +34,7 @@ pub(crate) struct Sweep {
     pub jobs: usize,
     /// How they are started.
     pub learners: Learners,
-    /// Those that were started for it.
+    /// Evaluators that were started for it.
     pub evaluators: LocalEvaluators,
     /// Seconds of a gradient step, by the run's number; without one, all are taken to be the same.
     pub step_seconds: BTreeMap<usize, f64>,
@@ -43,7 +43,7 @@ pub(crate) struct Sweep {
 /// How the runs have ended.
 #[derive(Default)]
 pub(crate) struct Ended {
-    /// Runs that go on by the same command.
+    /// Runs that the same command continues.
     pub unfinished: usize,
     /// What went wrong, a sentence for each run that has failed.
     pub failed: Vec<String>,
@@ -62,7 +62,7 @@ struct Floor {
     failed: Vec<String>,
     display: Display,
     begin: Instant,
-    /// Seconds of work, as foretold, that learners which have ended have done.
+    /// Estimated seconds of work that learners which have ended have done.
     done: f64,
     /// When the sweep was told to end.
     interrupted: Option<Instant>,
@@ -172,7 +172,7 @@ impl Sweep {
                 let score = progress.score.map(|(_, score)| format!(", last score {score:.1}")).unwrap_or_default();
                 floor.display.say(&format!("{name} is complete{score}"));
             }
-            End::Unfinished => floor.display.say(&format!("{name} has stopped; the same command goes on")),
+            End::Unfinished => floor.display.say(&format!("{name} has stopped; the same command continues")),
             End::Failed(reason) => floor.fail(reason),
         }
     }
@@ -201,7 +201,7 @@ impl Sweep {
         lines
     }
 
-    /// Seconds, as foretold, from one step of a run to another.
+    /// Estimated seconds from one step of a run to another.
     fn seconds(&self, run: &PlannedRun, from: u64, to: u64) -> f64 {
         to.saturating_sub(from) as f64 * self.step_seconds.get(&run.index).copied().unwrap_or(1.0)
     }

@@ -5,7 +5,7 @@ use quad_policy::Precision;
 use quad_run::config::Device;
 use quad_runtime::Hint;
 
-/// That the device is there and can compute with this precision.
+/// Checks that the device is there and can compute with this precision.
 ///
 /// # Errors
 /// It is not, or it cannot.

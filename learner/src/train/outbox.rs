@@ -1,7 +1,7 @@
 //! The queue from training to the disk.
 //!
 //! A disk that is full or hangs delays the thread that takes from here, and not training. What waits is bounded: of
-//! checkpoints the newest, of rows so many that people miss none, of snapshots so many bytes that training goes on for hours
+//! checkpoints the newest, of rows so many that people miss none, of snapshots so many bytes that training continues for hours
 //! before it waits for the disk, too.
 
 use std::collections::VecDeque;
@@ -41,7 +41,7 @@ pub(crate) struct Outbox {
 #[derive(Debug, Default)]
 struct Waiting {
     snapshots: VecDeque<TrainedPolicy>,
-    /// Of these, and of the one that is being written.
+    /// Bytes of these snapshots and of the one that is being written.
     bytes: usize,
     checkpoint: Option<Checkpoint>,
     rows: Vec<Row>,

@@ -46,7 +46,7 @@ pub(crate) struct Outlets<'a> {
     pub beat: &'a Beat,
 }
 
-/// Why training cannot go on.
+/// Why training cannot continue.
 #[derive(Debug, thiserror::Error)]
 pub(crate) enum TrainError {
     /// Something is not a number any more.

@@ -1,4 +1,4 @@
-//! The work of the thread `training`: goes on from a checkpoint, trains. The agent is made before the run's folder.
+//! The work of the thread `training`: continues from a checkpoint, trains. The agent is made before the run's folder.
 
 use std::sync::Arc;
 use std::sync::atomic::AtomicBool;
@@ -72,9 +72,9 @@ impl Training {
     pub fn run(self, beat: &Beat) -> anyhow::Result<()> {
         let Self { experiment, mut agent, .. } = self;
         if let Some(Checkpoint { step, state }) = &self.checkpoint {
-            let advice = "begin anew with --fresh, or go on with the version of the learner that wrote it";
+            let advice = "begin anew with --fresh, or continue with the version of the learner that wrote it";
             let loaded = agent.load(state).hint(advice);
-            loaded.with_context(|| format!("cannot go on from the checkpoint of step {step}"))?;
+            loaded.with_context(|| format!("cannot continue from the checkpoint of step {step}"))?;
         }
         let (batch_size, origin) = (experiment.batch_size as usize, origin(&experiment));
         let mut sampler = BatchSampler::new(agent.items(), batch_size, experiment.seed, agent.step());

@@ -90,7 +90,7 @@ fn quad_has_the_values_of_tables_3_and_4_for_each_row() {
     }
 }
 
-/// Of IQL's paper and code: Rret and 0.7, 3 in locomotion; r - 1 and 0.9, 10 in mazes.
+/// Values of IQL's paper and code: Rret and 0.7, 3 in locomotion; r - 1 and 0.9, 10 in mazes.
 #[test]
 fn iql_has_its_authors_values_for_each_row() {
     for (name, environment, ..) in TABLE_4 {

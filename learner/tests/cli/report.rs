@@ -49,14 +49,14 @@ impl Reported {
         str::from_utf8(&self.figures[name]).unwrap()
     }
 
-    /// That both forms of the report say this.
+    /// Asserts that both forms of the report say this.
     pub(super) fn says(&self, words: &[&str]) {
         for text in [&self.text, &self.markdown] {
             words.iter().for_each(|words| assert!(text.contains(words), "{words} is missing in\n{text}"));
         }
     }
 
-    /// That both have a line with all these words.
+    /// Asserts that both have a line with all these words.
     pub(super) fn has_row(&self, words: &[&str]) {
         for text in [&self.text, &self.markdown] {
             let has_all = |line: &str| words.iter().all(|word| line.contains(word));

@@ -18,12 +18,12 @@ pub struct Run {
 }
 
 impl Run {
-    /// By QUAD.
+    /// Makes a run by QUAD.
     pub fn new(task: &str, seed: u64) -> Self {
         Self::by("quad", task, seed)
     }
 
-    /// By another algorithm.
+    /// Makes a run by another algorithm.
     pub fn by(algorithm: &str, task: &str, seed: u64) -> Self {
         let mut experiment: Table = printed(&["presets", task, "--algorithm", algorithm]).parse().unwrap();
         experiment.insert("seed".into(), (seed as i64).into());

@@ -6,10 +6,10 @@ use serde::{Deserialize, Serialize};
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize, clap::ValueEnum)]
 #[serde(rename_all = "lowercase")]
 pub enum Device {
-    /// On the processor.
+    /// The processor.
     #[default]
     Cpu,
-    /// On the first Nvidia GPU.
+    /// The first Nvidia GPU.
     Cuda,
 }
 

@@ -1,4 +1,4 @@
-//! What decides the outcome of a run, key by key: by it a run is compared with others, and with itself when it goes on.
+//! What decides the outcome of a run, key by key: by it a run is compared with others, and with itself when it continues.
 
 use std::collections::BTreeMap;
 

@@ -11,7 +11,8 @@ use super::selection::Select;
 use crate::config::settings::{self, Settings, differences};
 use crate::config::{self, Experiment, hyperparameters, tasks};
 
-/// Of runs that differ in their seed alone. `scored_in` is the precision of their scores.
+/// Lists where runs that differ only in their seed differ from their authors' settings. `scored_in` is the precision of
+/// their scores.
 pub fn departures(runs: &[&RunReport], scored_in: &str, select: Select) -> Vec<String> {
     let Some(run) = runs.first() else { return Vec::new() };
     let ours = &run.config.experiment;

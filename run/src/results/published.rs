@@ -48,7 +48,7 @@ pub struct Printed {
 #[serde(deny_unknown_fields)]
 struct Tables {
     method: Vec<Method>,
-    /// By task and method: the mean, and where there is one the deviation.
+    /// Scores by task and method: the mean, and where there is one the deviation.
     scores: BTreeMap<String, BTreeMap<String, Vec<f64>>>,
     remark: Vec<KnownRemark>,
 }
@@ -72,7 +72,7 @@ struct KnownRemark {
     /// How the names of its tasks begin; empty: any task.
     #[serde(default)]
     tasks: Vec<String>,
-    /// By task, the figure with which the reason ends; empty: it ends with none.
+    /// The figure with which the reason ends, by task; empty: it ends with none.
     #[serde(default)]
     instead: BTreeMap<String, f64>,
     reason: String,

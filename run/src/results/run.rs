@@ -77,9 +77,9 @@ pub struct RunReport {
     pub missing: Vec<Missing>,
     /// Mean score of the last 3 complete evaluations; absent if they are fewer.
     pub mean_last_3: Option<f64>,
-    /// The same of the last 5.
+    /// Mean score of the last 5 complete evaluations; absent if they are fewer.
     pub mean_last_5: Option<f64>,
-    /// The same of those in the last 50,000 steps of the run; absent if it has no more steps than that.
+    /// Mean score of the complete evaluations in the run's last 50,000 steps; absent if it has no more steps than that.
     pub mean_last_50000_steps: Option<f64>,
     /// What its algorithm says of its metrics, such as QUAD of λ, under a name of the algorithm's; absent if nothing.
     #[serde(flatten)]

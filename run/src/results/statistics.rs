@@ -20,7 +20,7 @@ pub type Runs<T = f64> = Vec<Vec<T>>;
 /// A statistic, and the ends of its 95 % interval; without these where a task has a single seed, of whose spread nothing is known.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize)]
 pub struct Estimate {
-    /// Of the runs themselves.
+    /// The statistic of the runs themselves.
     pub value: f64,
     /// 2.5 % of the resamples are below it.
     pub low: Option<f64>,

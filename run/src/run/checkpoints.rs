@@ -1,4 +1,4 @@
-//! Checkpoints: the training's whole state, from which it goes on as if it had never stopped.
+//! Checkpoints: the training's whole state, from which it continues as if it had never stopped.
 
 use std::fs;
 use std::io;

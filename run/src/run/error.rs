@@ -34,9 +34,9 @@ pub enum RunDirError {
     /// A file of the run has contents that no learner writes.
     #[error("{path}{} is not what a learner writes: {reason}", line.map(|n| format!(", line {n},")).unwrap_or_default())]
     Content {
-        /// Which file.
+        /// The file.
         path: PathBuf,
-        /// Which line, from 1.
+        /// The line, from 1.
         line: Option<usize>,
         /// What is wrong.
         reason: String,
@@ -47,8 +47,8 @@ impl RunDirError {
     /// What to do about it.
     pub fn hint(&self) -> &'static str {
         match self {
-            Self::Occupied(_) => "give the command again to go on with that run, or choose another folder by --run-dir",
-            Self::Gone(_) => "put it back, and give the command again to go on; or begin anew",
+            Self::Occupied(_) => "give the command again to continue that run, or choose another folder by --run-dir",
+            Self::Gone(_) => "put it back, and give the command again to continue; or begin anew",
             Self::Claimed(_) => "wait for the end of that learner; if it is gone, as with its host, remove that file",
             Self::InUse(_) => "wait for its end, or choose another folder by --run-dir",
             Self::Content { .. } => {

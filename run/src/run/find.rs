@@ -11,7 +11,7 @@ pub fn runs_in(path: &Path) -> Vec<PathBuf> {
     walk(path, &mut |_, _| {})
 }
 
-/// The same; folders that cannot be read are handed to `unreadable`.
+/// Finds all runs below a path; folders that cannot be read are handed to `unreadable`.
 pub fn walk(path: &Path, unreadable: &mut impl FnMut(&Path, io::Error)) -> Vec<PathBuf> {
     if RunDir::is_occupied(path) {
         return vec![path.to_owned()];

@@ -6,7 +6,7 @@
 //! metrics.jsonl                      training metrics, a line every hundred gradient steps
 //! scores.jsonl                       a line per scored episode, written before the evaluator gets its acknowledgement
 //! snapshots/step_000003000.safetensors   target actor and target critics; written before the evaluation of it begins
-//! checkpoints/step_000003000_….safetensors   the newest three states of the training, to go on from
+//! checkpoints/step_000003000_….safetensors   the newest three states of the training, to continue from
 //! report.json, learning_curve.svg    written at the end
 //! ```
 
@@ -241,7 +241,7 @@ impl RunDir {
         Log::open(path, Some(lock))
     }
 
-    /// `metrics.jsonl`, opened for appending, without the lines after `step`: a learner that goes on from there writes them
+    /// `metrics.jsonl`, opened for appending, without the lines after `step`: a learner that continues from there writes them
     /// again. Also gives the seconds of training that its last line tells.
     pub fn metrics_log(&self, step: u64) -> Result<(Log, f64), RunDirError> {
         #[derive(Deserialize)]

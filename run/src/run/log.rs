@@ -15,11 +15,11 @@ use super::lock::Lock;
 pub struct Log {
     path: PathBuf,
     file: File,
-    /// Of the whole lines, bytes.
+    /// Length of the whole lines, bytes.
     length: u64,
     /// Whether half a line may follow them.
     torn: bool,
-    /// Of a file that is synchronised after each write; the other file of a run is its writer's alone, too.
+    /// Lock of a file that is synchronised after each write; the run's other file has the same writer and needs none.
     lock: Option<Lock>,
 }
 

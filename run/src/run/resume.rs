@@ -1,4 +1,4 @@
-//! A run folder that is there already: whether this learner may go on in it, and what an earlier one left.
+//! A run folder that is there already: whether this learner may continue in it, and what an earlier one left.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::Path;
@@ -35,7 +35,7 @@ pub struct Begun {
 /// What a run has reached so far; nothing for one that begins.
 #[derive(Default)]
 pub struct Past {
-    /// Where the training goes on.
+    /// Where the training continues.
     pub checkpoint: Option<Checkpoint>,
     /// The snapshots on disk that evaluations may be of, by step.
     pub snapshots: BTreeMap<u64, Hash>,
@@ -43,7 +43,7 @@ pub struct Past {
     pub scores: BTreeMap<u64, Earlier>,
 }
 
-/// Opens and locks the folder if there is a run in it, to go on with it or, for a `fresh` one, to set it aside.
+/// Opens and locks the folder if there is a run in it, to continue it or, for a `fresh` one, to set it aside.
 ///
 /// # Errors
 /// Another learner is at work there, or a file is not what a learner writes.
@@ -58,7 +58,7 @@ pub fn open(path: &Path, fresh: bool) -> Result<Option<Begun>, RunDirError> {
 }
 
 impl Begun {
-    /// That the run is the one that `config` describes, unless it is to be set aside.
+    /// Checks that the run is the one that `config` describes, unless it is to be set aside.
     ///
     /// # Errors
     /// Every setting that differs.
@@ -81,7 +81,7 @@ impl Begun {
         }
         if begun.run.version != config.run.version {
             let (old, new) = (&begun.run.version, &config.run.version);
-            warn!("the run was begun by version {old}, this is {new}: its numbers may go on differently");
+            warn!("the run was begun by version {old}, this is {new}: its numbers may differ from here on");
         }
         Ok(())
     }
@@ -140,7 +140,7 @@ impl Past {
     fn summary(&self, dir: &RunDir) -> String {
         let step = self.checkpoint.as_ref().map_or(0, |checkpoint| checkpoint.step);
         let scores: usize = self.scores.values().map(|earlier| earlier.episodes.len()).sum();
-        format!("the run in {} goes on after step {step}; {scores} episodes are scored", dir.path().display())
+        format!("the run in {} continues after step {step}; {scores} episodes are scored", dir.path().display())
     }
 }
 

@@ -129,7 +129,7 @@ fn scores_survive_a_reopened_log_and_an_unfinished_line_is_left_out() {
     std::fs::write(&path, &text).unwrap();
     assert_eq!(run.read_scores().unwrap(), [line(1, 1, 0.1), line(1, 2, 0.2)]);
 
-    // A learner that goes on cuts it off first, however long it is.
+    // A learner that continues cuts it off first, however long it is.
     for tail in ["", &"x".repeat(200_000)] {
         std::fs::write(&path, format!("{text}{tail}")).unwrap();
         run.score_log().unwrap().append(&[line(1, 3, 0.3)]).unwrap();

@@ -25,7 +25,7 @@ pub struct Findings {
     pub what: &'static str,
     /// Episodes that are.
     pub found: usize,
-    /// Of how many.
+    /// Episodes that should be.
     pub expected: usize,
     /// What is wrong, kind by kind.
     pub wrong: BTreeMap<&'static str, Vec<String>>,

@@ -40,7 +40,7 @@ struct Listed {
     /// The last complete evaluation: its gradient step and mean score.
     score_step: Option<u64>,
     score: Option<f64>,
-    /// Of all files in the folder.
+    /// Size of all files in the folder, bytes.
     bytes: u64,
 }
 

@@ -27,7 +27,7 @@ pub enum State {
 }
 
 impl State {
-    /// That of a run whose report was read.
+    /// State of a run whose report was read.
     ///
     /// # Errors
     /// The folder of its snapshots cannot be read.
@@ -51,7 +51,7 @@ impl State {
         }
     }
 
-    /// In words, for a run of so many steps.
+    /// Says the state in words, for a run of this many steps.
     pub fn text(self, steps: u64) -> String {
         match self {
             Self::NotBegun => "not begun".to_owned(),
@@ -68,14 +68,14 @@ impl State {
 pub struct Pace {
     /// Gradient steps done.
     pub step: u64,
-    /// In a second.
+    /// Gradient steps a second.
     pub rate: f64,
     /// The newest whole evaluation: step and mean score.
     pub score: Option<(u64, f64)>,
 }
 
 impl Pace {
-    /// That of the run in a folder.
+    /// Reads the progress of the run in a folder.
     pub fn read(dir: &Path) -> Self {
         let rows = rows(dir);
         let rate = match &rows[..] {

@@ -37,7 +37,7 @@ impl Findings {
     }
 
     /// # Errors
-    /// At least one check failed.
+    /// Fails if at least one check failed.
     pub fn verdict(&self) -> anyhow::Result<()> {
         let failed = self.0.iter().filter(|finding| finding.verdict == "fail").count();
         anyhow::ensure!(failed == 0, "{failed} of {} checks failed", self.0.len());

@@ -133,7 +133,7 @@ pub fn has_ended(container: &str) -> bool {
     inspect(container, "{{.State.Status}}") == "exited"
 }
 
-/// What a container has printed in all its lives.
+/// Everything that a container has printed, over all its starts.
 pub fn logs(container: &str) -> String {
     let output = Command::new("docker").args(["logs", container]).output().expect("docker was found before");
     String::from_utf8_lossy(&[output.stdout, output.stderr].concat()).into_owned()

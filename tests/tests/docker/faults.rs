@@ -63,7 +63,7 @@ fn whatever_happens_to_containers_the_run_ends_as_if_nothing_had() {
     assert!(verdict.contains("80 of 80 episodes are "), "{verdict}");
     let log = logs(&learner);
     let steps =
-        log.lines().filter_map(|line| line.split_once("goes on after step ")?.1.split(';').next()?.parse().ok());
+        log.lines().filter_map(|line| line.split_once("continues after step ")?.1.split(';').next()?.parse().ok());
     let steps: Vec<u64> = steps.collect();
     assert!(steps.len() == 2 && 0 < steps[0] && steps[0] < steps[1], "it went on after steps {steps:?}");
     eprintln!("gone on after steps {steps:?}; {verdict}");

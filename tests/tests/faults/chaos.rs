@@ -18,7 +18,7 @@ use rand_chacha::ChaCha8Rng;
 
 use crate::system::{EVALUATORS, Fault, Program, System, all_faults};
 
-/// Gradient steps for each fault, so that training goes on until the last of them.
+/// Gradient steps for each fault, so that training continues until the last of them.
 const STEPS_PER_FAULT: u64 = 12_000;
 
 /// Lets so many faults of those kinds happen.

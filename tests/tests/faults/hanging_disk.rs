@@ -43,7 +43,7 @@ fn a_disk_that_hangs_holds_up_neither_training_nor_the_end() {
         [(1, 75, "9 s after SIGTERM something still hangs"), (2, 130, "received SIGTERM after SIGTERM")]
     {
         let mut learner = scratch.learner_with("run", SETTING, &LISTEN);
-        learner.process.wait_for_log("goes on after step", PATIENCE);
+        learner.process.wait_for_log("continues after step", PATIENCE);
         learner.wait_for_metric("gradient_steps_total", "", |steps| steps == SETTING.steps as f64);
         sleep(Duration::from_millis(200));
         assert!(!learner.snapshot(next).exists(), "the disk did not hang");

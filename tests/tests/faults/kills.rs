@@ -9,7 +9,7 @@ use quad_tests::system::{Scratch, free_endpoint};
 use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 
-/// Gradient steps for each life.
+/// Gradient steps for each incarnation.
 const STEPS_PER_LIFE: u64 = 3000;
 
 /// Kills a learner so often, each time at a random moment.

@@ -25,7 +25,7 @@ fn where_files_have_no_locks_a_folder_is_still_one_learners() {
     // One that was killed on this host keeps nobody out.
     first.process.kill();
     let mut next = start(&scratch);
-    next.process.wait_for_log("goes on after step", PATIENCE);
+    next.process.wait_for_log("continues after step", PATIENCE);
     next.assert_scores_are_distinct();
     assert_eq!(next.process.terminate(PATIENCE).code(), Some(75), "{}", next.process.log());
 

@@ -129,14 +129,14 @@ fn cut_power(cuts: u64) {
             learner.process.kill();
             system.promised.extend(keys_of(&learner));
             learner = system.learner();
-            learner.process.wait_for_log("goes on after step", PATIENCE);
+            learner.process.wait_for_log("continues after step", PATIENCE);
         }
         system.cut_power(&mut learner);
         let log = learner.process.log();
-        gone_on += u64::from(log.contains("goes on after step") && !log.contains("goes on after step 0"));
+        gone_on += u64::from(log.contains("continues after step") && !log.contains("continues after step 0"));
         assert!(!log.contains("is damaged"), "{log}");
     }
-    assert!(gone_on >= cuts / 2, "only {gone_on} of {cuts} lives went on from a checkpoint");
+    assert!(gone_on >= cuts / 2, "only {gone_on} of {cuts} incarnations continued from a checkpoint");
     assert!(!system.promised.is_empty(), "nothing was acknowledged before a power cut");
     system.finish();
 }

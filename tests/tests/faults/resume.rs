@@ -1,4 +1,4 @@
-//! A learner goes on from what its run's folder holds, whatever has become of that.
+//! A learner continues from what its run's folder holds, whatever has become of that.
 
 use std::fs;
 
@@ -18,14 +18,14 @@ fn a_stopped_learner_goes_on_from_its_very_step() {
         scratch.learner_with("run", ENDLESS, &[&["--listen", "tcp/127.0.0.1:0"], arguments].concat())
     };
     let step_of = |learner: &Learner| -> u64 {
-        let line = learner.process.wait_for_log("goes on after step", PATIENCE);
-        let step = line.split("goes on after step ").nth(1).unwrap().split(';').next().unwrap();
+        let line = learner.process.wait_for_log("continues after step", PATIENCE);
+        let step = line.split("continues after step ").nth(1).unwrap().split(';').next().unwrap();
         step.parse().unwrap()
     };
     let mut first = learner(&[]);
     first.process.wait_for_log("snapshot handed to evaluation", PATIENCE);
     assert_eq!(first.process.terminate(PATIENCE).code(), Some(75));
-    assert!(first.process.log().contains("the same command goes on from there"), "{}", first.process.log());
+    assert!(first.process.log().contains("the same command continues from there"), "{}", first.process.log());
 
     let mut second = learner(&[]);
     let step = step_of(&second);
@@ -59,7 +59,7 @@ fn a_folder_is_of_one_configuration_and_of_one_learner_at_a_time() {
     let fresh = learner("6", &["--fresh"]);
     fresh.process.wait_for_log("snapshot handed to evaluation", PATIENCE);
     assert!(scratch.path().join("run.old1/config.toml").exists());
-    assert!(!fresh.process.log().contains("goes on after step"));
+    assert!(!fresh.process.log().contains("continues after step"));
     let mut twin = learner("6", &[]);
     assert_eq!(twin.process.wait(PATIENCE).code(), Some(1));
     assert!(twin.process.log().contains("another learner is at work"), "{}", twin.process.log());

@@ -60,7 +60,7 @@ pub struct System<L> {
     learners_line: L,
     evaluators: Vec<(Evaluator, L)>,
     started: usize,
-    /// That of the run's folder, where it can be a disk of its own.
+    /// Disk of the run's folder, where it can be a disk of its own.
     disk: Option<SmallDisk>,
     /// How often each fault has happened.
     pub faults: BTreeMap<Fault, usize>,

@@ -24,15 +24,15 @@ const MOST_TOKENS: usize = 1000;
 enum Flood {
     Progress,
     Claims,
-    /// Whose return is not a number.
+    /// Scores whose return is not a number.
     Reports,
-    /// Of another version of the protocol, and of noise.
+    /// Messages of another version of the protocol, and noise.
     Garbage,
     /// Messages that are larger than any of their kind, in each part of a query.
     Large,
     /// Evaluators that come, ask for work and leave.
     Evaluators,
-    /// Of weights.
+    /// Requests for weights.
     Downloads,
 }
 

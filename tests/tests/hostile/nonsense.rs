@@ -1,4 +1,4 @@
-//! Bytes from the wire are not trusted: what cannot be understood is counted, and the work goes on.
+//! Bytes from the wire are not trusted: what cannot be understood is counted, and the work continues.
 
 use std::sync::atomic::{AtomicUsize, Ordering};
 use std::time::Duration;

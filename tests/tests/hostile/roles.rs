@@ -136,7 +136,7 @@ async fn only_learners_and_evaluators_say_that_they_are_there() {
     assert_eq!(there, ["quad/run/live/evaluator/e", "quad/run/live/learner/1"]);
 }
 
-/// Not even another learner may speak in its place.
+/// Asserts that not even another learner may speak in its place.
 #[tokio::test(flavor = "multi_thread")]
 async fn at_a_learner_that_listens_only_evaluators_progress_passes() {
     let Some(certificates) = make_certificates() else { return };

@@ -85,7 +85,7 @@ impl Scene {
         scene
     }
 
-    /// Until none of them does anything.
+    /// Waits until none of them does anything.
     fn pause(&self) {
         self.crowd.set(Pace::Still);
         eventually("all have done their jobs", PATIENCE, || (self.crowd.busy() == 0).then_some(()));

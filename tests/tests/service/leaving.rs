@@ -59,7 +59,7 @@ async fn a_learner_that_waits_for_another_to_be_gone_leaves_in_order() {
     let mut learner = scratch.learner_with("run", ENDLESS, &["--connect", &endpoint]);
     learner.process.wait_for_log("waiting to see if it is gone", PATIENCE);
     assert_eq!(learner.process.terminate(PATIENCE).code(), Some(75), "{}", learner.process.log());
-    assert!(learner.process.log().contains("the same command goes on from there"), "{}", learner.process.log());
+    assert!(learner.process.log().contains("the same command continues from there"), "{}", learner.process.log());
 }
 
 #[tokio::test(flavor = "multi_thread")]

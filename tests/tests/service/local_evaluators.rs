@@ -61,7 +61,7 @@ fn evaluators_end_with_their_learner_however_it_ends() {
         eventually("the evaluators are gone", PATIENCE, || are_gone(&evaluators));
     }
     let mut learner = learner(&scratch, ENDLESS);
-    learner.process.wait_for_log("goes on after step", PATIENCE);
+    learner.process.wait_for_log("continues after step", PATIENCE);
     learner.assert_scores_are_distinct();
     learner.process.terminate(PATIENCE);
 }

@@ -101,7 +101,7 @@ fn a_sweep_goes_on_after_an_interruption_and_a_failed_run_ends_no_other() {
     study.wait_for(RUNS[1]);
     sweep.signal("INT");
     assert_eq!(sweep.wait(PATIENCE).code(), Some(75), "{}", sweep.log());
-    assert!(sweep.log().contains("the same command goes on"), "{}", sweep.log());
+    assert!(sweep.log().contains("the same command continues"), "{}", sweep.log());
     assert_eq!(study.states()[3], "not begun");
 
     let mut sweep = study.sweep(&["--jobs", "2"]);
@@ -220,7 +220,7 @@ fn a_sweep_that_is_told_to_end_says_that_it_is_not_complete_whatever_hangs() {
     sweep.signal("TERM");
     assert_eq!(sweep.wait(PATIENCE).code(), Some(75), "{}", sweep.log());
     let log = fs::read_to_string(study.dir(RUNS[2]).join("learner.log")).unwrap();
-    assert!(log.contains("received SIGTERM") && log.contains("the same command goes on"), "{log}");
+    assert!(log.contains("received SIGTERM") && log.contains("the same command continues"), "{log}");
     fs::remove_file(&hung).unwrap();
     fs::rename(&aside, &hung).unwrap();
 }

@@ -18,7 +18,7 @@ fn content() -> Vec<u8> {
     b"\x89HDF\r\n\x1a\n".iter().copied().chain(numbers).collect()
 }
 
-/// The same with one byte changed.
+/// `content` with one byte changed.
 fn garbage() -> Vec<u8> {
     let mut bytes = content();
     bytes[150_000] ^= 1;

@@ -33,7 +33,7 @@ impl Bench {
         Self::after(BTreeMap::new())
     }
 
-    /// The same in a later incarnation of the run.
+    /// A scoreboard of a later incarnation of the run.
     fn after(earlier: BTreeMap<u64, Earlier>) -> Self {
         let rules = Rules {
             run: name("run"),
@@ -75,7 +75,7 @@ impl Bench {
         self.board.progress(progress, now)
     }
 
-    /// At some second, if the job failed.
+    /// Hands a job back; `failed` is the second at which it failed, if it did.
     fn hand_back(&mut self, evaluator: &str, job: &Job, failed: Option<u64>) -> Option<HandedBack> {
         let failed = failed.map(|seconds| self.at(seconds));
         self.board.hand_back(&name(evaluator), job.id, failed)
@@ -124,7 +124,7 @@ pub(crate) fn full_report(job: &Job, evaluator: &str) -> ScoreReport {
     report(job, evaluator, job.seeds.iter().map(|&seed| score(seed, 500.0)).collect())
 }
 
-/// Of so many environment steps.
+/// Progress of a job after this many environment steps.
 pub(crate) fn progress(job: &Job, evaluator: &str, steps_done: u64) -> Progress {
     Progress { steps_done, environment_steps: 10, episodes: 1, ..Progress::of(job, name(evaluator)) }
 }

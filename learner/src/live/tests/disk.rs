@@ -75,7 +75,7 @@ async fn nothing_is_published_before_it_is_written() {
     claim(&client, &bench.run, "a").await.expect("there is work");
 }
 
-/// To try again would never help.
+/// A run without its folder ends: to try again would never help.
 #[tokio::test(flavor = "multi_thread")]
 async fn a_run_whose_folder_is_removed_ends() {
     let mut bench = Bench::start().await;

@@ -106,7 +106,7 @@ async fn a_job_that_an_evaluator_could_not_do_goes_to_others_and_its_reason_is_t
     assert!(reason.starts_with("the policy[2J cannot act, says axxx") && reason.len() == 300, "{reason}");
     assert_eq!(bench.metrics.evaluation.jobs_failed.get(), 2);
     assert!(bench.events.try_recv().is_err(), "the second is not told");
-    assert_eq!(bench.coordinator.pending(), 4, "the run goes on");
+    assert_eq!(bench.coordinator.pending(), 4, "the run continues");
 }
 
 #[tokio::test(flavor = "multi_thread")]

@@ -35,7 +35,8 @@ use crate::fixtures::config;
 use crate::train::{Outbox, TrainedPolicy};
 
 const PATIENCE: Duration = Duration::from_secs(60);
-/// Of jobs that are to be lost. One that works tells it much more often, and this machine may stand still for a while.
+/// Lease of jobs that are to be lost. An evaluator at work reports much more often, and this machine may stand still
+/// for a while.
 const LEASE: Duration = Duration::from_secs(6);
 const INCARNATION: u64 = 5;
 

@@ -70,8 +70,8 @@ fn the_same_scores_give_the_same_interval_and_a_single_seed_gives_none() {
     assert_eq!(of(vec![vec![1.0, 2.0], vec![3.0]]), Estimate { value: 2.25, low: None, high: None });
 }
 
-/// Of nine scores ⌊9 / 4⌋ / 9 of the weight is cut at either end: two of equal weight. With six and three of them in two
-/// tasks, one of the first weighs 1/12 and one of the second 1/6.
+/// With nine scores, ⌊9 / 4⌋ / 9 of the weight is cut at either end: two of equal weight. With six and three of them in
+/// two tasks, one of the first weighs 1/12 and one of the second 1/6.
 #[test]
 fn the_interquartile_mean_weighs_tasks_alike() {
     let nine = vec![vec![0.0, 1.0, 2.0, 3.0, 4.0, 5.0, 6.0, 7.0, 100.0]];
