@@ -115,7 +115,7 @@ fn draw(worth: &[f32], temperature: f32, uniform: f64) -> usize {
         left -= weight;
         left < 0.0
     });
-    // By rounding, nothing may be left of the last.
+    // Rounding may leave no weight for the last: then it is the best.
     place.unwrap_or(best(worth))
 }
 

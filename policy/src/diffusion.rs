@@ -128,10 +128,10 @@ impl DiffusionPolicy {
     ) -> Result<Self, PolicyError> {
         shape.check()?;
         let weights = Weights::take(shape.actor().layout(), tensors, ACTOR)?;
-        let actor = NoisePredictor::new(shape.actor(), weights, precision).fixed();
+        let actor = NoisePredictor::new(shape.actor(), weights, precision).packed()?;
         let mut ensemble = |of: EnsembleShape, prefix| -> Result<Ensemble, PolicyError> {
             let weights = Weights::take(of.layout(), tensors, prefix)?;
-            Ok(Ensemble::new(of, weights, precision).fixed())
+            Ok(Ensemble::new(of, weights, precision).packed()?)
         };
         let critics = ensemble(shape.critics(), CRITIC)?;
         let value = shape.value().map(|of| ensemble(of, VALUE)).transpose()?;

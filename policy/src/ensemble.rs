@@ -26,10 +26,10 @@ impl Ensemble {
         Self { shape, networks, weights, packing: Packing::new(precision) }
     }
 
-    /// The same for a policy that acts: its weights do not change, so that kernels are laid out for its products once.
-    pub fn fixed(mut self) -> Self {
-        self.packing.fixed = true;
-        self
+    /// Lays its kernels out for products now: for a policy that acts, whose weights do not change.
+    pub fn packed(self) -> Result<Self> {
+        self.packing.pack(&self.networks, &self.weights)?;
+        Ok(self)
     }
 
     /// Its weights.
@@ -39,6 +39,7 @@ impl Ensemble {
 
     /// Its weights, to be changed.
     pub fn weights_mut(&mut self) -> &mut Weights {
+        self.packing = Packing::new(self.packing.precision);
         &mut self.weights
     }
 

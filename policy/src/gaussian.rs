@@ -57,7 +57,7 @@ impl GaussianPolicy {
         check_range("observation_dim", shape.observation_dim, MOST)?;
         check_range("action_dim", shape.action_dim, MOST)?;
         let weights = Weights::take(shape.actor().layout(), tensors, ACTOR)?;
-        let actor = Ensemble::new(shape.actor(), weights, Precision::F32).fixed();
+        let actor = Ensemble::new(shape.actor(), weights, Precision::F32).packed()?;
         Ok(Self { shape, actor })
     }
 }

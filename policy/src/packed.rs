@@ -6,40 +6,41 @@ use crate::slices::read;
 use crate::weights::Weights;
 use candle_core::Result;
 use rayon::prelude::*;
-use std::sync::{Arc, Mutex, PoisonError};
+use std::sync::{Arc, OnceLock};
 
-/// How the kernels of some networks are packed.
+/// The packed kernels of some networks.
 pub(crate) struct Packing {
     pub precision: Precision,
-    /// Whether the weights stay. In f32, packing kernels for one gradient step costs as much as it gains.
-    pub fixed: bool,
-    /// What was made of the weights, and of which state of them.
-    made: Mutex<Option<(u64, Arc<Kernels>)>>,
+    /// Set without waiting for another thread: a thread that waits in rayon for a part of its own packing may take up another
+    /// call of the same policy, which must not wait for the first.
+    made: OnceLock<Arc<Kernels>>,
 }
 
 impl Packing {
-    /// For weights that change.
+    /// Nothing is packed yet.
     pub fn new(precision: Precision) -> Self {
-        Self { precision, fixed: false, made: Mutex::default() }
+        Self { precision, made: OnceLock::new() }
     }
 
-    /// The kernels of these networks, packed now or before; `None` if they are not to be packed.
+    /// Packs all kernels, on this thread alone: a process that loads a policy may fork before it acts, and its child would lack
+    /// rayon's threads.
+    pub fn pack(&self, mlp: &Mlp, weights: &Weights) -> Result<()> {
+        if mlp.is_fast(weights) {
+            let members = 0..mlp.layers.members;
+            let pack = |weights: &[f32]| members.filter_map(|i| mlp.network(weights, i).pack(self.precision)).collect();
+            self.made.set(Arc::new(read(weights.values(), pack)?)).ok();
+        }
+        Ok(())
+    }
+
+    /// The packed kernels of these networks, if there are any. Rounded kernels are made when they are first needed. In f32,
+    /// packing kernels for one gradient step costs as much as it gains.
     pub fn kernels(&self, mlp: &Mlp, weights: &Weights) -> Result<Option<Arc<Kernels>>> {
-        if self.precision == Precision::F32 && !self.fixed {
-            return Ok(None);
-        }
-        let mut made = self.made.lock().unwrap_or_else(PoisonError::into_inner);
-        if let Some((changes, kernels)) = &*made
-            && *changes == weights.changes()
-        {
-            return Ok(Some(kernels.clone()));
-        }
-        let pack = |weights: &[f32]| {
+        if self.made.get().is_none() && self.precision == Precision::Bf16 {
             let members = (0..mlp.layers.members).into_par_iter();
-            members.filter_map(|member| mlp.network(weights, member).pack(self.precision)).collect::<Kernels>()
-        };
-        let kernels = Arc::new(read(weights.values(), pack)?);
-        *made = Some((weights.changes(), kernels.clone()));
-        Ok(Some(kernels))
+            let pack = |weights: &[f32]| members.filter_map(|i| mlp.network(weights, i).pack(self.precision)).collect();
+            self.made.set(Arc::new(read(weights.values(), pack)?)).ok();
+        }
+        Ok(self.made.get().cloned())
     }
 }

@@ -143,7 +143,6 @@ pub struct Weights {
     layout: Layout,
     values: Tensor,
     kept: Option<Arc<KeptGradient>>,
-    changes: u64,
 }
 
 impl Weights {
@@ -152,12 +151,12 @@ impl Weights {
         let values = Var::from_tensor(values)?.into_inner();
         let kept =
             if has_fast_implementation(values.device()) { Some(Arc::new(KeptGradient::new(&values)?)) } else { None };
-        Ok(Self { layout, values, kept, changes: 0 })
+        Ok(Self { layout, values, kept })
     }
 
     /// Weights that no gradient is taken of.
     pub fn constant(layout: Layout, values: Tensor) -> Self {
-        Self { layout, values, kept: None, changes: 0 }
+        Self { layout, values, kept: None }
     }
 
     /// The same, of named tensors, which are taken out of `tensors`.
@@ -176,7 +175,7 @@ impl Weights {
 
     /// The same vector as a constant; it changes with this one.
     pub fn detach(&self) -> Self {
-        Self { kept: None, layout: self.layout.clone(), values: self.values.detach(), changes: self.changes }
+        Self { kept: None, layout: self.layout.clone(), values: self.values.detach() }
     }
 
     /// What each part begins with.
@@ -214,15 +213,9 @@ impl Weights {
         Ok(self.change(|mine| mine.slice_set(&values, 0, 0))?)
     }
 
-    /// Changes the vector in place. Kernels that were rounded from it are no longer used.
+    /// Changes the vector in place.
     pub fn change(&mut self, work: impl FnOnce(&Tensor) -> Result<()>) -> Result<()> {
-        self.changes += 1;
         work(&self.values.detach())
-    }
-
-    /// How often they were changed.
-    pub(crate) fn changes(&self) -> u64 {
-        self.changes
     }
 
     /// Where the fast implementation leaves the gradient of these weights.
