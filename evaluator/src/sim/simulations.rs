@@ -89,7 +89,6 @@ impl Environment for Simulated {
 ///
 /// # Errors
 /// This program does not simulate the environment.
-/// There is no simulation of the environment.
 pub fn mjcf(spec: &EnvironmentSpec) -> Result<String, EnvironmentError> {
     Ok(match Kind::of(spec)? {
         Kind::Locomotion(robot) => robot.mjcf.to_owned(),

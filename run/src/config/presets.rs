@@ -99,6 +99,7 @@ pub fn is_path(preset: &str) -> bool {
 fn word(value: &Value) -> String {
     value.as_str().map_or_else(|| value.to_string(), str::to_owned)
 }
+
 /// Reads a preset (the name of a task, or a path that ends in `.toml`), lays changes over it, checks every range. The
 /// changes may name another `algorithm` than the preset.
 ///
