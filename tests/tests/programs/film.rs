@@ -1,7 +1,8 @@
 //! `evaluator film` shows the episode that is scored, in files that others read.
 
-use std::fs::{self, File};
+use std::fs::{self, File, Permissions};
 use std::io::BufReader;
+use std::os::unix::fs::PermissionsExt;
 use std::path::Path;
 use std::process::{Command, Output};
 
@@ -10,6 +11,7 @@ use quad_tests::learner::Learner;
 use quad_tests::peers::has_egl;
 use quad_tests::process::{assert_refused, binary};
 use quad_tests::setting::Setting;
+use quad_tests::small_disk::SmallDisk;
 use quad_tests::system::Scratch;
 
 const SETTING: Setting = Setting { steps: 40, eval_interval: 20, episodes: 2, candidates: 3, hidden: 16, seed: 5 };
@@ -100,8 +102,41 @@ fn what_cannot_be_filmed_is_said_in_a_sentence() {
     let at = bytes.windows(6).position(|window| window == b"hopper").unwrap();
     fs::write(&moon, [&bytes[..at], b"onmoon", &bytes[at + 6..]].concat()).unwrap();
     refused(&[moon.to_str().unwrap()], "is a policy for another environment", "docs/python.md");
+    let without_driver = film(folder, &[snapshot]).env("__EGL_VENDOR_LIBRARY_DIRS", folder).output().unwrap();
+    assert_refused(&without_driver, "pictures need EGL", "apt-get install --no-install-recommends libegl1");
     if has_egl() {
         let output = film(folder, &[snapshot, "--out", "film.mp4"]).env("PATH", folder).output().unwrap();
         assert_refused(&output, "ffmpeg cannot be started", "--out film.gif");
+        assert!(!folder.join("film.mp4").exists());
+    }
+}
+
+/// An ffmpeg that writes what it is fed to the file that it is told, by a name that means no option and no protocol.
+const FFMPEG: &str = "#!/bin/sh\nfor last; do :; done\ncat > \"${last#file:}\" && [ \"$last\" != \"${last#file:}\" ]\n";
+
+#[test]
+fn a_film_is_whole_or_is_not_there_whatever_its_name() {
+    if !has_egl() {
+        return;
+    }
+    let scratch = Scratch::new();
+    let learner = run(&scratch);
+    let (folder, snapshot) = (scratch.path(), learner.snapshot(40));
+    let snapshot = snapshot.to_str().unwrap();
+    fs::create_dir(folder.join("a:b")).unwrap();
+    let ffmpeg = folder.join("ffmpeg");
+    fs::write(&ffmpeg, FFMPEG).unwrap();
+    fs::set_permissions(&ffmpeg, Permissions::from_mode(0o755)).unwrap();
+    let path = format!("{}:{}", folder.display(), std::env::var("PATH").unwrap());
+    for name in ["-y.mp4", "a:b/x.mp4"] {
+        said(&film(folder, &[snapshot, &format!("--out={name}")]).env("PATH", &path).output().unwrap());
+        assert!(fs::metadata(folder.join(name)).unwrap().len() > 480 * 360 * 3, "{name} has pictures");
+    }
+    let Some(disk) = SmallDisk::mount(&folder.join("disk"), 1) else { return };
+    disk.fill();
+    for name in ["disk/film.gif", "disk/film.png"] {
+        let output = film(folder, &[snapshot, "--out", name]).output().unwrap();
+        assert_refused(&output, &format!("cannot write {name}: No space left"), "has room");
+        assert_eq!(fs::read_dir(folder.join("disk")).unwrap().count(), 1, "something is left of {name}");
     }
 }

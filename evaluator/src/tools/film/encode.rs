@@ -1,6 +1,7 @@
 //! Writes pictures to a file: an animation, a video or a strip.
 
-use std::fs::File;
+use std::ffi::OsStr;
+use std::fs::{self, File};
 use std::io::{BufWriter, Write};
 use std::iter::once;
 use std::path::Path;
@@ -19,27 +20,37 @@ const COLOURS: usize = 64;
 /// Sampling of the first picture to choose colours: 1 is all of it, 10 a tenth.
 const SAMPLE: i32 = 10;
 
-/// Writes pictures, each shown for `seconds`.
+/// Writes pictures, each shown for `seconds`. The file is `<path>.partial` until it is whole.
 ///
 /// # Errors
-/// A picture cannot be drawn, or the file cannot be written.
+/// A picture cannot be drawn, or the file cannot be written: then a file that was there stays.
 pub fn write(
     output: &Output,
     seconds: f64,
     pictures: impl Iterator<Item = anyhow::Result<Picture>>,
 ) -> anyhow::Result<()> {
-    let path = &output.path;
-    match output.format {
-        Format::Gif => animation(path, seconds, pictures),
-        Format::Mp4 => video(path, seconds, pictures),
-        Format::Png => strip(path, pictures),
+    let (path, partial) = (&output.path, output.path.with_added_extension("partial"));
+    let mut undrawn = Ok(());
+    let drawn = pictures.map_while(|picture| picture.map_err(|error| undrawn = Err(error)).ok());
+    let written = match output.format {
+        Format::Gif => animation(&partial, seconds, drawn),
+        Format::Mp4 => video(&partial, seconds, drawn),
+        Format::Png => strip(&partial, drawn),
+    };
+    let named = undrawn.and_then(|()| {
+        written
+            .and_then(|()| Ok(fs::rename(&partial, path)?))
+            .with_context(|| format!("cannot write {}", path.display()))
+            .hint("--out names a file in a folder that you may write in and that has room")
+    });
+    if named.is_err() {
+        fs::remove_file(&partial).ok();
     }
-    .with_context(|| format!("cannot write {}", path.display()))
-    .hint("--out names a file in a folder that you may write in")
+    named
 }
 
-fn strip(path: &Path, pictures: impl Iterator<Item = anyhow::Result<Picture>>) -> anyhow::Result<()> {
-    let strip = Picture::strip(&pictures.collect::<anyhow::Result<Vec<_>>>()?);
+fn strip(path: &Path, pictures: impl Iterator<Item = Picture>) -> anyhow::Result<()> {
+    let strip = Picture::strip(&pictures.collect::<Vec<_>>());
     let file = BufWriter::new(File::create(path)?);
     let mut encoder = png::Encoder::new(file, strip.width as u32, strip.height() as u32);
     encoder.set_color(png::ColorType::Rgb);
@@ -50,12 +61,8 @@ fn strip(path: &Path, pictures: impl Iterator<Item = anyhow::Result<Picture>>) -
 }
 
 /// All pictures have the colours of the first: with a palette for each picture, the floor would flicker.
-fn animation(
-    path: &Path,
-    seconds: f64,
-    mut pictures: impl Iterator<Item = anyhow::Result<Picture>>,
-) -> anyhow::Result<()> {
-    let first = pictures.next().context("there is no picture")??;
+fn animation(path: &Path, seconds: f64, mut pictures: impl Iterator<Item = Picture>) -> anyhow::Result<()> {
+    let first = pictures.next().context("there is no picture")?;
     let (width, height) = (first.width as u16, first.height() as u16);
     let rgba: Vec<u8> = first.rgb.chunks_exact(3).flat_map(|rgb| [rgb[0], rgb[1], rgb[2], 255]).collect();
     let colours = NeuQuant::new(SAMPLE, COLOURS, &rgba);
@@ -63,8 +70,8 @@ fn animation(
     let file = BufWriter::new(File::create(path)?);
     let mut encoder = Encoder::new(file, width, height, &colours.color_map_rgb())?;
     encoder.set_repeat(Repeat::Infinite)?;
-    for picture in once(Ok(first)).chain(pictures) {
-        let pixels: Vec<u8> = picture?.rgb.chunks_exact(3).map(nearest).collect();
+    for picture in once(first).chain(pictures) {
+        let pixels: Vec<u8> = picture.rgb.chunks_exact(3).map(nearest).collect();
         let frame = Frame::from_indexed_pixels(width, height, pixels, None);
         encoder.write_frame(&Frame { delay: (100.0 * seconds).round() as u16, ..frame })?;
     }
@@ -72,22 +79,23 @@ fn animation(
     Ok(())
 }
 
-fn video(path: &Path, seconds: f64, mut pictures: impl Iterator<Item = anyhow::Result<Picture>>) -> anyhow::Result<()> {
-    let first = pictures.next().context("there is no picture")??;
+fn video(path: &Path, seconds: f64, mut pictures: impl Iterator<Item = Picture>) -> anyhow::Result<()> {
+    let first = pictures.next().context("there is no picture")?;
     let size = format!("{}x{}", first.width, first.height());
     let mut ffmpeg = Command::new("ffmpeg")
         .args(["-loglevel", "error", "-nostdin", "-y", "-f", "rawvideo", "-pixel_format", "rgb24"])
         .args(["-video_size", &size, "-framerate", &(1.0 / seconds).to_string(), "-i", "pipe:0"])
-        .args(["-pix_fmt", "yuv420p", "-movflags", "+faststart"])
-        .arg(path)
+        .args(["-pix_fmt", "yuv420p", "-movflags", "+faststart", "-f", "mp4"])
+        // Without this, ffmpeg takes a path that begins with - for an option, and one with a colon for a protocol.
+        .arg([OsStr::new("file:"), path.as_os_str()].join(OsStr::new("")))
         .stdin(Stdio::piped())
         .spawn()
         .context("ffmpeg cannot be started")
         .hint("apt-get install --no-install-recommends ffmpeg, or --out film.gif, which needs nothing")?;
     if let Some(mut pipe) = ffmpeg.stdin.take() {
-        for picture in once(Ok(first)).chain(pictures) {
+        for picture in once(first).chain(pictures) {
             // If ffmpeg has ended, its message says why.
-            if pipe.write_all(&picture?.rgb).is_err() {
+            if pipe.write_all(&picture.rgb).is_err() {
                 break;
             }
         }
@@ -97,4 +105,33 @@ fn video(path: &Path, seconds: f64, mut pictures: impl Iterator<Item = anyhow::R
         bail!("ffmpeg ended with {status}");
     }
     Ok(())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// Pictures of one colour each, of which the one with number `broken` cannot be drawn.
+    fn pictures(broken: u8) -> impl Iterator<Item = anyhow::Result<Picture>> {
+        let picture = |colour| Picture { width: 64, rgb: vec![colour; 3 * 64 * 48] };
+        (0..9).map(move |number| if number == broken { bail!("no light") } else { Ok(picture(20 * number)) })
+    }
+
+    #[test]
+    fn a_film_has_its_name_only_when_it_is_whole() {
+        let folder = tempfile::tempdir().unwrap();
+        for (name, format) in [("film.gif", Format::Gif), ("film.png", Format::Png)] {
+            let output = Output { path: folder.path().join(name), format };
+            let unnamed = pictures(9).inspect(|_| assert!(!output.path.exists(), "{name} is half-made"));
+            write(&output, 0.04, unnamed).unwrap();
+            let whole = fs::read(&output.path).unwrap();
+            for broken in [0, 5] {
+                let error = write(&output, 0.04, pictures(broken)).unwrap_err();
+                assert_eq!(format!("{error:#}"), "no light", "{name}: nothing is wrong with the file");
+                assert!(fs::read(&output.path).unwrap() == whole, "{name} was changed");
+            }
+            fs::remove_file(&output.path).unwrap();
+            assert_eq!(fs::read_dir(folder.path()).unwrap().count(), 0, "something is left of {name}");
+        }
+    }
 }

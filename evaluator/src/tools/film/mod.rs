@@ -16,8 +16,8 @@ mod stage;
 
 use std::path::Path;
 
-use anyhow::anyhow;
 use quad_runtime::Hint;
+use anyhow::{Context, anyhow};
 use tracing::info;
 
 use crate::sim;
@@ -56,7 +56,8 @@ pub(crate) fn film(args: &FilmArgs) -> anyhow::Result<String> {
     let last = episodes.iter().map(Episode::length).max().unwrap_or(0);
     let steps = steps(format, last, control_period);
     info!("drawing {} pictures", steps.len());
-    let pictures = steps.iter().map(|&step| stage.draw(&episodes, step));
+    let draw = |&step| stage.draw(&episodes, step).with_context(|| format!("cannot draw step {step}"));
+    let pictures = steps.iter().map(draw);
     encode::write(&args.out, control_period * stride(control_period) as f64, pictures)?;
     Ok(summary(args, &subjects, &episodes))
 }
