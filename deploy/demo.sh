@@ -43,7 +43,13 @@ if [ "$status" -ne 0 ]; then
   exit "$status"
 fi
 touch "$RUN/complete"
-# Where this machine draws no pictures, the evaluator says what to install.
-$BIN/evaluator film "$RUN" --out "$RUN/film.gif" || say "the run is complete, but there is no film of it"
+# A machine that draws no pictures lacks packages, which the evaluator names.
+if told=$($BIN/evaluator film "$RUN" --out "$RUN/film.gif" 2>&1); then
+  echo "$told"
+elif install=$(grep -o 'apt-get install .*egl.*' <<<"$told"); then
+  say "for a film of it: $install, then $BIN/evaluator film $RUN --out $RUN/film.gif"
+else
+  echo "$told" >&2
+fi
 # All of it in one file, for a browser.
 $BIN/learner report "$RUN" --html "$RUN/report.html" >/dev/null
