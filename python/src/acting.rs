@@ -1,15 +1,21 @@
 //! Acting in the rows of an array, and the seeds of rows.
 
+use std::process;
+use std::sync::OnceLock;
+
 use numpy::PyArrayDyn;
-use pyo3::exceptions::PyValueError;
+use pyo3::exceptions::{PyRuntimeError, PyValueError};
 use pyo3::prelude::*;
-use quad_policy::{EpisodeState, Policy};
+use quad_policy::{EpisodeState, Policy, PolicyError};
 
 use crate::arrays::Rows;
 use crate::error::of_policy;
 
 /// Memory that one call of the policy may take, bytes; more rows are split. An action does not depend on the other rows.
 const MEMORY: u64 = 256 << 20;
+
+const FORKED: &str = "this process was forked from one in which a policy has acted, and a fork lacks the threads that compute\n\
+                      hint: multiprocessing.set_start_method(\"spawn\"), or let policies act only after the fork";
 
 /// What comes out of a policy.
 pub type Array<'py> = Bound<'py, PyArrayDyn<f32>>;
@@ -23,7 +29,7 @@ pub fn act<'py>(
 ) -> PyResult<Array<'py>> {
     let width = policy.action_dim();
     let mut actions = vec![0.0; rows.count * width];
-    let acted = py.detach(|| {
+    compute(py, || {
         let mut left = actions.as_mut_slice();
         for (observations, states) in parts(policy, &rows.values, states) {
             let (now, later) = left.split_at_mut(states.len() * width);
@@ -31,9 +37,21 @@ pub fn act<'py>(
             left = later;
         }
         Ok(())
-    });
-    acted.map_err(|error| of_policy(&error))?;
+    })?;
     rows.array(py, actions, &[width])
+}
+
+/// Has a policy compute without Python's lock.
+///
+/// # Errors
+/// It fails, or this process was forked from one in which a policy has computed: then rayon's threads, which a fork does not
+/// copy, would never answer.
+pub fn compute<T: Send>(py: Python<'_>, work: impl Send + FnOnce() -> Result<T, PolicyError>) -> PyResult<T> {
+    static PROCESS: OnceLock<u32> = OnceLock::new();
+    if *PROCESS.get_or_init(process::id) != process::id() {
+        return Err(PyRuntimeError::new_err(FORKED));
+    }
+    py.detach(work).map_err(|error| of_policy(&error))
 }
 
 /// Rows and their states, in parts of which each takes bounded memory.

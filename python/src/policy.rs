@@ -10,19 +10,20 @@ use pyo3::types::{PyBytes, PyDict, PyTuple};
 use quad_policy::{Header, Policy, PolicyConfig, PolicyError, Precision, load_policy};
 use quad_protocol::Origin;
 
-use crate::acting::{Array, act, begin, not_seeds, parts, seeds};
+use crate::acting::{Array, act, begin, compute, not_seeds, parts, seeds};
 use crate::arrays::{Like, Rows};
 use crate::choosing::{Changes, as_dictionary, choosing};
 use crate::episodes::Episodes;
-use crate::error::{of_policy, with_hint};
+use crate::error::with_hint;
 
 const HINT: &str =
     "a policy is a file like RUN/snapshots/step_000020000.safetensors, as `learner train` of this version writes them";
+
 /// A policy that `learner train` has saved: `Policy.load(path)`.
 ///
 /// It takes and gives the units of the data that it has learnt from. All calls release Python's lock and share the processor's
-/// cores with rayon: the environment variable RAYON_NUM_THREADS says, before the first call, how many. A process that was
-/// forked after a call cannot make one; with multiprocessing use "spawn".
+/// cores with rayon: the environment variable RAYON_NUM_THREADS says, before the first call, how many. In a process that was
+/// forked after a call, calls raise RuntimeError; with multiprocessing use "spawn".
 #[pyclass(name = "Policy", module = "quad_rl", frozen)]
 pub struct PyPolicy {
     policy: Arc<dyn Policy>,
@@ -129,7 +130,7 @@ impl PyPolicy {
         let rows = self.rows(&observations)?;
         let policy = choosing(&self.policy, Changes { candidates, value, ..Changes::default() })?;
         let mut states = begin(&*policy, &seeds(seed, rows.count)?);
-        let sampled = py.detach(|| {
+        let (actions, values) = compute(py, || {
             let (mut actions, mut values) = (Vec::new(), Vec::new());
             for (observations, states) in parts(&*policy, &rows.values, &mut states) {
                 let sampled = policy.sample(observations, states)?;
@@ -137,8 +138,7 @@ impl PyPolicy {
                 values.extend(sampled.values);
             }
             Ok((actions, values))
-        });
-        let (actions, values) = sampled.map_err(|error| of_policy(&error))?;
+        })?;
         let candidates = policy.choice().map_or(1, |choice| choice.candidates as usize);
         Ok((rows.array(py, actions, &[candidates, policy.action_dim()])?, rows.array(py, values, &[candidates])?))
     }
@@ -165,7 +165,7 @@ impl PyPolicy {
         let policy = choosing(&self.policy, Changes { value, ..Changes::default() })?;
         let values = match rows.count {
             0 => Vec::new(),
-            _ => py.detach(|| policy.value(&rows.values, &taken.values)).map_err(|error| of_policy(&error))?,
+            _ => compute(py, || policy.value(&rows.values, &taken.values))?,
         };
         rows.array(py, values, &[])
     }

@@ -143,7 +143,8 @@ def test_workers_that_are_killed_cost_no_score_and_come_again(tmp_path, data):
     rng = random.Random(7)
     with quad_rl.Evaluators("walk", lambda seed: Walk(), connect=both, workers=3) as evaluators:
         for _ in range(20):
-            victims = [process.pid for process in evaluators._processes if process.poll() is None]
+            processes = [worker.process for worker in evaluators._workers]
+            victims = [process.pid for process in processes if process.poll() is None]
             if victims:
                 os.kill(rng.choice(victims), signal.SIGKILL)
             time.sleep(rng.uniform(0.0, 0.6))
@@ -156,9 +157,91 @@ def test_workers_that_are_killed_cost_no_score_and_come_again(tmp_path, data):
         assert program.wait(60) == 0
 
 
-SCRIPT = """
+def run(script):
+    """Runs a script that must end within a minute."""
+    ended = subprocess.run([sys.executable, "-c", script], cwd=pathlib.Path(__file__).parent, capture_output=True, timeout=60)
+    assert ended.returncode == 0, ended.stderr.decode()
+
+
+FORKING_ENVIRONMENT = """
+import multiprocessing, os, signal, time
 import quad_rl, test_evaluate
-quad_rl.evaluate("walk", lambda seed: test_evaluate.Walk(), connect="tcp/127.0.0.1:1", workers=2)
+
+def make(seed):
+    multiprocessing.get_context("fork").Process(target=time.sleep, args=(90,)).start()
+    return test_evaluate.Walk()
+
+groups = []
+with quad_rl.Evaluators("walk", make, connect="tcp/127.0.0.1:1", workers=1) as evaluators:
+    worker = evaluators._workers[0]
+    groups.append(worker.process.pid)
+    worker.process.kill()
+    test_evaluate.wait(lambda: worker.process.pid != groups[0], 30)
+    groups.append(worker.process.pid)
+    worker.wait_until_ready()
+for group in groups:
+    os.killpg(group, signal.SIGKILL)
+"""
+
+
+def test_a_killed_worker_whose_environment_has_forked_comes_again_and_ends():
+    run(FORKING_ENVIRONMENT)
+
+
+FORK = """
+import os, signal, time
+import quad_rl, test_evaluate
+
+with quad_rl.Evaluators("walk", lambda seed: test_evaluate.Walk(), connect="tcp/127.0.0.1:1", workers=2) as evaluators:
+    forks = []
+    for stops in (True, False):
+        forks.append(os.fork())
+        if forks[-1] == 0:
+            if stops:
+                evaluators.stop()
+            time.sleep(90)
+            os._exit(0)
+    time.sleep(1)
+    assert all(worker.process.poll() is None for worker in evaluators._workers), "a fork has ended them"
+[os.kill(fork, signal.SIGKILL) for fork in forks]
+codes = [worker.process.returncode for worker in evaluators._workers]
+assert -signal.SIGKILL not in codes, codes
+"""
+
+
+def test_a_fork_of_the_process_that_started_workers_changes_nothing():
+    run(FORK)
+
+
+def test_a_worker_that_ends_again_and_again_is_given_up(tmp_path, monkeypatch):
+    monkeypatch.setattr("quad_rl._process._ENDS", 3)
+    made = tmp_path / "made"
+
+    def make(seed):
+        if made.exists():
+            os._exit(3)
+        made.touch()
+        return Walk()
+
+    evaluators = quad_rl.Evaluators("walk", make, connect="tcp/127.0.0.1:1", workers=1)
+    try:
+        evaluators._workers[0].process.kill()
+        wait(evaluators._stopping.is_set)
+    finally:
+        evaluators.stop()
+    with pytest.raises(RuntimeError, match="ended 3 times in a row soon after its start .exit code 3.; its standard error"):
+        evaluators.wait()
+
+
+SCRIPT = """
+import os, time
+import quad_rl, test_evaluate
+
+evaluators = quad_rl.Evaluators("walk", lambda seed: test_evaluate.Walk(), connect="tcp/127.0.0.1:1", workers=2)
+if os.fork() == 0:
+    time.sleep(90)
+    os._exit(0)
+evaluators.wait()
 """
 
 
@@ -169,14 +252,16 @@ def children(of):
 @pytest.mark.parametrize("by", [signal.SIGINT, signal.SIGKILL])
 def test_workers_end_with_the_process_that_started_them(by):
     process = subprocess.Popen([sys.executable, "-c", SCRIPT], cwd=pathlib.Path(__file__).parent, stderr=subprocess.PIPE)
-    wait(lambda: len(children(process.pid)) == 2)
-    workers = [pathlib.Path("/proc") / worker / "stat" for worker in children(process.pid)]
+    wait(lambda: len(children(process.pid)) == 3)
+    *workers, fork = children(process.pid)
+    workers = [pathlib.Path("/proc") / worker / "stat" for worker in workers]
     for _ in range(2):  # Both are ready.
         while b"ready to serve" not in process.stderr.readline():
             assert process.poll() is None
     process.send_signal(by)
     assert process.wait(60) == (1 if by == signal.SIGKILL else 0) or process.returncode in (-by, 130, 1)
     wait(lambda: all(not worker.exists() or ") Z" in worker.read_text() for worker in workers))
+    os.kill(int(fork), signal.SIGKILL)
     process.stderr.close()
 
 
@@ -191,6 +276,8 @@ def test_arguments_that_cannot_be_are_refused_at_once():
     refused(ValueError, '"return", "success" or a pair', "walk", lambda seed: Walk(), score="best")
     refused(ValueError, "not .3.0, 3.0.", "walk", lambda seed: Walk(), score=(3.0, 3.0))
     refused(RuntimeError, "ZeroDivisionError", "walk", lambda seed: 1 // 0, workers=1)
+    refused(RuntimeError, "SystemExit: no licence", "walk", lambda seed: sys.exit("no licence"), workers=1)
+    refused(RuntimeError, "before it had an environment .exit code 3.", "walk", lambda seed: os._exit(3), workers=1)
     refused(RuntimeError, "No module named|doesn't exist|NameNotFound", "walk", "NoSuch-v0", workers=1)
     refused(RuntimeError, "Box", "walk", "CartPole-v1", workers=1)
 

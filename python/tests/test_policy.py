@@ -4,6 +4,7 @@ import copy
 import json
 import pickle
 import subprocess
+import sys
 import threading
 import time
 import warnings
@@ -204,3 +205,35 @@ def test_other_threads_run_meanwhile(snapshots):
     [thread.start() for thread in threads]
     [thread.join() for thread in threads]
     assert all(np.array_equal(*pair) for pair in zip(expected, found))
+
+
+FORKS = """
+import os, signal, sys
+from quad_rl import Policy
+
+policy = Policy.load(sys.argv[1])
+state, action = [0.0] * policy.observation_size, [0.0] * policy.action_size
+
+def in_a_fork(call):
+    child = os.fork()
+    if child == 0:
+        signal.alarm(30)  # Ends a fork that waits for ever.
+        try:
+            call()
+        except RuntimeError as error:
+            os._exit(7 if "spawn" in str(error) else 8)
+        os._exit(0)
+    return os.waitstatus_to_exitcode(os.waitpid(child, 0)[1])
+
+calls = [lambda: policy.act(state), lambda: policy.sample(state), lambda: policy.value(state, action),
+         lambda: policy.begin([1]).act([state])]
+assert [in_a_fork(call) for call in calls] == [0] * 4, "a fork may act if its parent has only loaded"
+policy.act(state)
+assert [in_a_fork(call) for call in calls] == [7] * 4
+"""
+
+
+def test_a_fork_of_a_process_that_has_acted_is_told_so(snapshots):
+    command = [sys.executable, "-W", "ignore", "-c", FORKS, str(snapshots["quad"])]
+    ended = subprocess.run(command, capture_output=True, timeout=200)
+    assert ended.returncode == 0, ended.stderr.decode()

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import os
-import subprocess
 import sys
 import threading
 import time
@@ -17,9 +16,10 @@ from typing import Any
 import cloudpickle  # type: ignore[import-untyped]
 
 from quad_rl import _quad_rl
+from quad_rl._process import Worker
 
-# A worker that was killed is started again after this time, seconds.
-_AGAIN = 1.0
+# Between two looks for workers that were killed, seconds.
+_LOOK = 1.0
 # Workers get this long to deliver their scores and leave, seconds.
 _LEAVE = 12.0
 
@@ -57,67 +57,32 @@ class Evaluators:
             raise ValueError(f"workers is {workers}, but must be at least 1")
         connect = [connect] if isinstance(connect, str) else list(connect)
         serve = {"connect": connect, "certificates": certificates, "precision": precision}
-        task = {"name": name, "make": environment, "score": _score(score), "seed": 0, "serve": serve}
-        self._payload = [json.dumps(sys.path).encode(), cloudpickle.dumps(task)]
+        task = {"name": name, "make": environment, "score": _score(score), "seed": 0, "parent": os.getpid(), "serve": serve}
+        payload = [json.dumps(sys.path).encode(), cloudpickle.dumps(task)]
+        self._process = os.getpid()
         self._stopping = threading.Event()
         self._error: Exception | None = None
-        self._processes: list[subprocess.Popen[bytes]] = []
+        self._workers: list[Worker] = []
         self._watcher = threading.Thread(target=self._watch, daemon=True)
         try:
             for _ in range(workers):
-                self._processes.append(self._start())
-            for process in self._processes:
-                self._sizes(process)
+                self._workers.append(Worker(payload))
+            for worker in self._workers:
+                worker.wait_until_ready()
         except BaseException:
             self.stop()
             raise
         self._watcher.start()
 
-    def _start(self) -> subprocess.Popen[bytes]:
-        environment = {"RAYON_NUM_THREADS": "1", "OMP_NUM_THREADS": "1", **os.environ}
-        # A session of its own: a terminal's Ctrl-C is this process's to pass on.
-        command = [sys.executable, "-m", "quad_rl._worker"]
-        process = subprocess.Popen(
-            command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, env=environment, start_new_session=True
-        )
-        assert process.stdin
-        try:
-            for part in self._payload:
-                process.stdin.write(len(part).to_bytes(8, "little") + part)
-            process.stdin.flush()
-        except BrokenPipeError:
-            pass  # It has ended, which its answer tells.
-        return process
-
-    def _sizes(self, process: subprocess.Popen[bytes]) -> None:
-        assert process.stdout
-        answer = process.stdout.readline()
-        if not answer:
-            raise RuntimeError("a worker ended before it had an environment; its standard error says why")
-        self._check(answer)
-
-    def _check(self, line: bytes) -> None:
-        error = json.loads(line).get("error")
-        if error is not None:
-            raise RuntimeError(error)
-
     def _watch(self) -> None:
-        """Starts a worker again that was killed. One that cannot work ends them all."""
-        while not self._stopping.wait(_AGAIN):
-            for place, process in enumerate(self._processes):
-                if process.poll() is None:
-                    continue
-                assert process.stdout
-                try:
-                    for line in process.stdout:
-                        self._check(line)
-                    _close(process)
-                    print(f"quad_rl: a worker ended with {process.returncode}; it is started again", file=sys.stderr)
-                    self._processes[place] = self._start()
-                except (RuntimeError, OSError) as error:
-                    self._error = error
-                    self._stopping.set()
-                    return
+        """Starts workers again that were killed. One that cannot work ends them all."""
+        while not self._stopping.wait(_LOOK):
+            try:
+                for worker in self._workers:
+                    worker.revive()
+            except (RuntimeError, OSError) as error:
+                self._error = error
+                self._stopping.set()
 
     def wait(self) -> None:
         """Waits until the workers are stopped: by Ctrl-C, after which they leave in order, or by `stop()` of another thread.
@@ -136,20 +101,16 @@ class Evaluators:
 
     def stop(self) -> None:
         """Lets the workers deliver the scores that they have, hand back the jobs that they have begun, and end."""
+        if os.getpid() != self._process:
+            return  # A fork of the process whose workers they are.
         self._stopping.set()
         if self._watcher.is_alive():
             self._watcher.join()
-        for process in self._processes:
-            _close(process)
+        for worker in self._workers:
+            worker.end()
         until = time.monotonic() + _LEAVE
-        for process in self._processes:
-            try:
-                process.wait(max(0.0, until - time.monotonic()))
-            except subprocess.TimeoutExpired:
-                process.kill()
-                process.wait()
-            if process.stdout:
-                process.stdout.close()
+        for worker in self._workers:
+            worker.wait(until)
 
     def __enter__(self) -> Evaluators:
         return self
@@ -180,15 +141,6 @@ def evaluate(name: str, environment: str | Callable[[int], Any], **arguments: An
     Raises ValueError for arguments that cannot be, RuntimeError if the environment cannot be made.
     """
     Evaluators(name, environment, **arguments).wait()
-
-
-def _close(process: subprocess.Popen[bytes]) -> None:
-    """Tells a worker to end."""
-    try:
-        if process.stdin:
-            process.stdin.close()
-    except OSError:
-        pass  # It has ended.
 
 
 class _Gymnasium:

@@ -1,4 +1,4 @@
-"""One process of `quad_rl.evaluate`: it moves environments for a learner, until its standard input ends.
+"""One process of `quad_rl.evaluate`: it moves environments for a learner, until SIGTERM or the end of its parent.
 
 `quad_rl.evaluate` starts it as `python -m quad_rl._worker`, and writes what it is to do to its standard input. The worker
 answers with one line of JSON: the sizes of the environment, or an error.
@@ -11,6 +11,7 @@ import os
 import signal
 import sys
 import threading
+import time
 import traceback
 from collections.abc import Callable
 from typing import IO, Any
@@ -30,7 +31,7 @@ def _call(function: Callable[..., Any], *arguments: Any, **keywords: Any) -> Any
     """Calls the user's code. What it raises goes to this process's log as it is, and to the learner in one line."""
     try:
         return function(*arguments, **keywords)
-    except Exception as error:
+    except (Exception, SystemExit) as error:
         traceback.print_exc(file=sys.stderr)
         frame = traceback.extract_tb(error.__traceback__)[-1]
         place = f"{os.path.basename(frame.filename)}:{frame.lineno}, in {frame.name}"
@@ -139,9 +140,11 @@ def _read(stream: IO[bytes]) -> bytes:
     return stream.read(length)
 
 
-def _end_with(stream: IO[bytes]) -> None:
-    """Ends this process in order when the process that started it closes the stream, or is gone."""
-    stream.read()
+def _end_with(parent: int) -> None:
+    """Ends this process in order when the process that started it is gone. A pipe would not tell: whatever that process has
+    forked holds it open."""
+    while os.getppid() == parent:
+        time.sleep(1.0)
     os.kill(os.getpid(), signal.SIGTERM)
 
 
@@ -157,12 +160,12 @@ def main() -> None:
     sys.path[:] = json.loads(paths)
     try:
         task = cloudpickle.loads(task)
+        threading.Thread(target=_end_with, args=(task["parent"],), daemon=True).start()
         factory = Factory(task["make"], task["score"])
         made = factory.make(task.pop("seed"))
         sizes = made.sizes()
         factory.release(made)
         tell(sizes=sizes)
-        threading.Thread(target=_end_with, args=(sys.stdin.buffer,), daemon=True).start()
         _quad_rl.serve_environment(task["name"], factory, sizes=sizes, **task["serve"])
         factory.close()
     except Exception as error:

@@ -16,8 +16,8 @@ mod stage;
 
 use std::path::Path;
 
-use quad_runtime::Hint;
 use anyhow::{Context, anyhow};
+use quad_runtime::Hint;
 use tracing::info;
 
 use crate::sim;
