@@ -50,7 +50,11 @@ pub fn write(
 }
 
 fn strip(path: &Path, pictures: impl Iterator<Item = Picture>) -> anyhow::Result<()> {
-    let strip = Picture::strip(&pictures.collect::<Vec<_>>());
+    let pictures: Vec<_> = pictures.collect();
+    if pictures.is_empty() {
+        bail!("there is no picture");
+    }
+    let strip = Picture::strip(&pictures);
     let file = BufWriter::new(File::create(path)?);
     let mut encoder = png::Encoder::new(file, strip.width as u32, strip.height() as u32);
     encoder.set_color(png::ColorType::Rgb);
