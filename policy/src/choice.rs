@@ -39,7 +39,7 @@ pub enum Rule {
     Best,
     /// One that is drawn, with a probability proportional to exp(value / temperature).
     Softmax {
-        /// In units of the value, above 0.
+        /// Temperature in units of the value, above 0.
         temperature: f32,
     },
     /// The one whose value Q is nearest to the state's own, V: the largest -(Q - V)² (AlignIQL).
@@ -55,7 +55,7 @@ impl Choice {
         Self { candidates, value: Reduce::Mean, rule: Rule::Best }
     }
 
-    /// That it can be acted with.
+    /// Checks that a policy can act by this choice.
     ///
     /// # Errors
     /// A number of candidates or a temperature out of range.

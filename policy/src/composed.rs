@@ -26,7 +26,8 @@ pub(crate) struct Pass {
 }
 
 impl Pass {
-    /// Of inputs `[rows, in]`, which all members share; `differentiable` keeps what a backward pass needs.
+    /// Computes the outputs for inputs `[rows, in]`, which all members share; `differentiable` keeps what a backward
+    /// pass needs.
     pub fn forward(layers: &Arc<Layers>, weights: &Weights, x: &Tensor, differentiable: bool) -> Result<Self> {
         let values = weights.values().detach();
         let (rows, inputs) = x.dims2()?;

@@ -63,19 +63,19 @@ impl DiffusionShape {
         }
     }
 
-    /// Of the noise predictor.
+    /// Shape of the noise predictor.
     pub fn actor(&self) -> NoiseShape {
         let Self { observation_dim, action_dim, diffusion_steps, reverse, .. } = *self;
         NoiseShape { observation_dim, action_dim, layers: self.actor.clone(), diffusion_steps, reverse }
     }
 
-    /// Of the critics.
+    /// Shape of the critics.
     pub fn critics(&self) -> EnsembleShape {
         let Self { observation_dim, action_dim, critics, .. } = *self;
         EnsembleShape { members: critics, observation_dim, action_dim, layers: self.critic.clone(), outputs: 1 }
     }
 
-    /// Of the value function, if there is one.
+    /// Shape of the value function, if there is one.
     pub fn value(&self) -> Option<EnsembleShape> {
         let layers = self.value.clone()?;
         Some(EnsembleShape { members: 1, action_dim: 0, layers, ..self.critics() })
@@ -138,7 +138,7 @@ impl DiffusionPolicy {
         Self { shape, choice, networks: Arc::new(Networks { actor, critics, value }), precision }.choosing(choice)
     }
 
-    /// The same networks, which choose so.
+    /// Makes a policy of the same networks that chooses by `choice`.
     fn choosing(&self, choice: Choice) -> Result<Self, PolicyError> {
         choice.check()?;
         if choice.rule == Rule::Nearest && self.networks.value.is_none() {

@@ -43,12 +43,12 @@ impl Ensemble {
         &mut self.weights
     }
 
-    /// The same networks with a copy of the weights as constants: a target network at its beginning.
+    /// Copies the networks, with constant weights: a target network at its beginning.
     pub fn copy(&self) -> Result<Self> {
         Ok(Self::new(self.shape.clone(), self.weights.copy()?, self.packing.precision))
     }
 
-    /// The same networks with their weights as constants, which share their memory with these.
+    /// Makes constants of the weights; they share the memory of these networks.
     pub fn detach(&self) -> Self {
         let (shape, networks) = (self.shape.clone(), self.networks.clone());
         Self { shape, networks, weights: self.weights.detach(), packing: Packing::new(Precision::F32) }
@@ -74,7 +74,7 @@ impl Ensemble {
         self.outputs(observations, actions)?.squeeze(2)
     }
 
-    /// The same of networks of s alone: `[K, n]`.
+    /// Values of networks that see only the state, `[K, n]`.
     pub fn state_values(&self, observations: &Tensor) -> Result<Tensor> {
         self.state_outputs(observations)?.squeeze(2)
     }

@@ -16,7 +16,7 @@ pub struct EpisodeState {
 }
 
 impl EpisodeState {
-    /// At an episode's beginning. Its noise is the stream of the episode's seed that is apart from those of the environment.
+    /// Begins an episode. Its noise is a stream of the episode's seed that the environment does not use.
     pub fn new(seed: u64) -> Self {
         let mut noise = ChaCha8Rng::seed_from_u64(seed);
         noise.set_stream(POLICY_STREAM);

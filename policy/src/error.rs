@@ -70,12 +70,12 @@ pub enum PolicyError {
 /// Widest layer and most critics that are believed.
 pub(crate) const MOST: usize = u16::MAX as usize;
 
-/// That a number of a shape is from 1 to `most`.
+/// Checks that a number of a shape is from 1 to `most`.
 pub(crate) fn check_range(field: &'static str, value: usize, most: usize) -> Result<(), PolicyError> {
     if (1..=most).contains(&value) { Ok(()) } else { Err(PolicyError::Range { field, value }) }
 }
 
-/// That none of these is a NaN.
+/// Checks that none of these is a NaN.
 pub(crate) fn check_numbers(what: &'static str, numbers: &[f32]) -> Result<(), PolicyError> {
     if numbers.iter().any(|x| x.is_nan()) { Err(PolicyError::NotANumber(what)) } else { Ok(()) }
 }

@@ -28,7 +28,7 @@ pub struct GaussianShape {
 }
 
 impl GaussianShape {
-    /// Of the network whose tanh is the mean.
+    /// Shape of the network whose tanh is the mean.
     pub fn actor(&self) -> EnsembleShape {
         let Self { observation_dim, action_dim, .. } = *self;
         let layers = self.actor.clone();

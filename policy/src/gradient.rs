@@ -18,7 +18,8 @@ impl Gradients {
         Ok(Self { store: store?, pass })
     }
 
-    /// Of all weights of a network, in the order of its vector. It is overwritten by the next backward pass to these weights.
+    /// Gradient of all weights of a network, in the order of its vector. The next backward pass to these weights
+    /// overwrites it.
     ///
     /// # Errors
     /// The loss does not depend on them, or another backward pass has come in between.

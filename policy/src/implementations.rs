@@ -82,7 +82,7 @@ fn noise_predictor(generator: &mut ChaCha8Rng, layers: MlpConfig, diffusion_step
     NoisePredictor::new(shape, weights, Precision::F32)
 }
 
-/// That the gradient of a loss is what moving `at` along it, and along a random direction, makes of the loss.
+/// Checks the gradient of a loss by finite differences: along the gradient, and along a random direction.
 fn check_gradient(
     (what, step, room): (&str, f64, f64),
     generator: &mut ChaCha8Rng,

@@ -28,14 +28,14 @@ const MAX_HEADER: u64 = 1 << 20;
 pub enum PolicyConfig {
     /// One of several samples of a diffusion model.
     Diffusion {
-        /// Of its networks.
+        /// Shape of its networks.
         shape: DiffusionShape,
         /// Which sample it is.
         choice: Choice,
     },
     /// The mean of a Gaussian.
     Gaussian {
-        /// Of its network.
+        /// Shape of its network.
         shape: GaussianShape,
     },
 }
@@ -130,7 +130,7 @@ pub fn read_tensors(bytes: &[u8]) -> Result<Tensors, PolicyError> {
     file.tensors().into_iter().map(|(name, view)| Ok((name, view.load(&Device::Cpu)?))).collect()
 }
 
-/// That the header is not too long, which the file's first eight bytes say; one without them is refused later.
+/// Checks the header's length, which the file's first eight bytes say; a file without them is refused later.
 fn check_header(file: &[u8]) -> Result<(), PolicyError> {
     match file.first_chunk() {
         Some(length) if u64::from_le_bytes(*length) > MAX_HEADER => Err(SafeTensorError::HeaderTooLarge.into()),

@@ -22,7 +22,7 @@ pub(crate) struct Layers {
     pub norm: bool,
     pub activation: Activation,
     initial: Initial,
-    /// Of each layer's first kernel; behind the last layer, of the end.
+    /// Where each layer's parameters begin in the vector; behind the last layer, its end.
     offsets: Vec<usize>,
 }
 

@@ -19,7 +19,7 @@ use std::sync::Arc;
 /// For each network the kernels between its hidden layers, packed; none where products are as fast without.
 pub(crate) type Kernels = Vec<Vec<Packed>>;
 
-/// Those of one member, if any were packed.
+/// Kernels of one member, if any were packed.
 pub(crate) fn of_member(packed: Option<&Kernels>, member: usize) -> Option<&[Packed]> {
     packed.and_then(|packed| packed.get(member)).map(Vec::as_slice)
 }
@@ -43,7 +43,7 @@ impl Mlp {
         self.forward_by(None, weights, inputs)
     }
 
-    /// The same; where no gradient is taken, by these kernels of the members, packed.
+    /// Applies the network; where no gradient is taken, by these packed kernels of the members.
     pub fn forward_by(&self, packed: Option<Arc<Kernels>>, weights: &Weights, inputs: &[&Tensor]) -> Result<Tensor> {
         let x = if let [x] = inputs { (*x).clone() } else { Tensor::cat(inputs, 1)? };
         let (values, layers) = (weights.values(), &self.layers);

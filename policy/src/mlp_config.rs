@@ -40,7 +40,7 @@ pub enum Initial {
 }
 
 impl Initial {
-    /// Of a linear layer's kernel and bias.
+    /// Initial values of a linear layer's kernel and bias.
     pub(crate) fn of_layer(self, inputs: usize, outputs: usize) -> (Start, Start) {
         match self {
             Self::Xavier => (Start::Uniform((6.0 / (inputs + outputs) as f32).sqrt()), Start::Constant(0.0)),

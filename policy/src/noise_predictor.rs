@@ -77,7 +77,7 @@ impl NoisePredictor {
         trunk.forward(&self.weights, &[observations, actions, &embedding])?.squeeze(0)
     }
 
-    /// The same network with its weights as constants, which share their memory with these.
+    /// Makes constants of the weights; they share the memory of this network.
     pub fn detach(&self) -> Self {
         let (parts, weights) = (self.parts.clone(), self.weights.detach());
         Self { parts, weights, packing: Packing::new(Precision::F32) }

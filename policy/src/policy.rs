@@ -21,7 +21,7 @@ pub trait Policy: Send + Sync {
         None
     }
 
-    /// The same networks, which share their memory with these, choosing in another way. This one stays as it is.
+    /// Makes a policy that chooses in another way, by the same networks in the same memory. This one stays as it is.
     ///
     /// # Errors
     /// It draws no actions, it lacks a network that this takes, or a number is out of range.
@@ -75,6 +75,6 @@ pub trait Policy: Send + Sync {
 pub struct Sampled {
     /// The actions, `n × candidates × action_dim`, in the order in which they were drawn.
     pub actions: Vec<f32>,
-    /// Of each its value, `n × candidates`, by the choice's [`Reduce`](crate::Reduce).
+    /// The value of each action, `n × candidates`, by the choice's [`Reduce`](crate::Reduce).
     pub values: Vec<f32>,
 }

@@ -12,7 +12,7 @@ use std::sync::Arc;
 
 /// Scales what goes in, and what comes out back.
 struct Scaled {
-    /// In the network's units.
+    /// The policy, in the network's units.
     policy: Box<dyn Policy>,
     scaling: Arc<Scaling>,
 }
@@ -117,7 +117,7 @@ mod tests {
         }
     }
 
-    /// The same policy without and with maps.
+    /// One policy, without and with maps.
     fn pair(scaling: Scaling) -> [Result<Box<dyn Policy>, PolicyError>; 2] {
         let load = |scaling| load_policy(&file_of(Choice::best_of(6), 1.0, None, scaling), Precision::F32);
         [load(None), load(Some(scaling))]

@@ -25,16 +25,16 @@ pub struct Schedule {
     reverse: Reverse,
 }
 
-/// Of one t.
+/// Coefficients of one t.
 #[derive(Clone, Copy, Debug, PartialEq)]
 struct Step {
     /// sqrt(ᾱ_t).
     signal: f32,
     /// sqrt(1 - ᾱ_t).
     deviation: f32,
-    /// Of the clipped x_0 in the posterior's mean.
+    /// Factor of the clipped x_0 in the posterior's mean.
     from_clean: f32,
-    /// Of x_t in the posterior's mean.
+    /// Factor of x_t in the posterior's mean.
     from_noisy: f32,
     /// Standard deviation of the noise, 0 at t = 1.
     noise: f32,

@@ -131,7 +131,7 @@ pub fn take(tensors: &mut Tensors, name: String, shape: &[usize]) -> std::result
     Ok(tensor)
 }
 
-/// That a tensor holds neither a NaN nor an infinity.
+/// Checks that a tensor holds neither a NaN nor an infinity.
 pub(crate) fn check_finite(name: &str, tensor: &Tensor) -> std::result::Result<(), PolicyError> {
     let numbers = tensor.flatten_all()?.to_vec1::<f32>()?;
     if numbers.iter().all(|x| x.is_finite()) { Ok(()) } else { Err(PolicyError::NotFinite(name.to_owned())) }
@@ -159,7 +159,7 @@ impl Weights {
         Self { layout, values, kept: None }
     }
 
-    /// The same, of named tensors, which are taken out of `tensors`.
+    /// Joins named tensors, which it takes out of `tensors`, into one vector of variables.
     ///
     /// # Errors
     /// As [`Layout::join`].
@@ -173,7 +173,7 @@ impl Weights {
         Ok(Self::constant(self.layout.clone(), self.values.detach().copy()?))
     }
 
-    /// The same vector as a constant; it changes with this one.
+    /// Makes a constant of the vector; it changes with this one.
     pub fn detach(&self) -> Self {
         Self { kept: None, layout: self.layout.clone(), values: self.values.detach() }
     }

@@ -13,7 +13,7 @@ fn refused(error: &DatasetError) -> PyErr {
     with_hint(error, &error.hint())
 }
 
-/// Writes the layout for people's own data. All arrays are C-contiguous and have the same number of rows.
+/// Writes the custom layout. All arrays are C-contiguous and have the same number of rows.
 #[pyfunction]
 #[expect(clippy::too_many_arguments, reason = "they are the file's arrays")]
 pub fn write_dataset(

@@ -18,7 +18,7 @@ pub struct Episodes {
 }
 
 impl Episodes {
-    /// At the beginning of the episodes of these seeds.
+    /// Begins the episodes of these seeds.
     pub fn new(policy: Arc<dyn Policy>, seeds: &[u64]) -> Self {
         Self { states: begin(&*policy, seeds), policy }
     }

@@ -20,7 +20,7 @@ use crate::metrics::{JobOutcome, Metrics};
 
 /// A learner answers in milliseconds; one that takes this long hangs, and other runs wait meanwhile.
 pub const ANSWER_TIMEOUT: Duration = Duration::from_secs(5);
-/// The same for a snapshot, which has megabytes.
+/// Patience with a learner that sends a snapshot, which has megabytes.
 const WEIGHTS_TIMEOUT: Duration = Duration::from_secs(30);
 /// Limits of the pause that a learner without work may ask for: the learner gets no flood of queries, and loses no evaluator.
 const PAUSE: [Duration; 2] = [Duration::from_millis(20), Duration::from_secs(60)];

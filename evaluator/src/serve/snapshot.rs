@@ -26,7 +26,7 @@ pub fn is_named_by(job: &Job, snapshot: &Snapshot) -> bool {
 /// The newest snapshot of each run, as far as memory allows. Clones share them.
 #[derive(Clone, Default)]
 pub struct Snapshots {
-    /// In the order of arrival.
+    /// Snapshots in the order of arrival.
     kept: Arc<Mutex<VecDeque<Arc<Snapshot>>>>,
     arrived: Arc<Notify>,
 }
@@ -112,7 +112,7 @@ impl Listener {
         Ok(Listener { state, _subscriber: may_block(declare).await? })
     }
 
-    /// From now on, keeps only the snapshots of this incarnation of the learner.
+    /// Keeps only the snapshots of this incarnation of the learner from now on.
     pub fn follow(&self, incarnation: u64) {
         self.state.incarnation.store(incarnation, Relaxed);
     }

@@ -27,7 +27,7 @@ impl Picture {
         &self.rgb[3 * self.width * row..3 * self.width * (row + 1)]
     }
 
-    /// The same picture from the bottom up: OpenGL's order.
+    /// Turns the picture upside down: OpenGL's order of rows.
     pub fn flipped(self) -> Self {
         let rgb = (0..self.height()).rev().flat_map(|row| self.row(row)).copied().collect();
         Self { rgb, ..self }

@@ -28,7 +28,7 @@ pub struct Scored {
     pub choice: Option<Choice>,
     /// Arithmetic of its actions, as in `scores.jsonl`.
     pub precision: String,
-    /// In the order of their seeds.
+    /// Episodes in the order of their seeds.
     pub episodes: Vec<Episode>,
 }
 
