@@ -4,9 +4,6 @@ use std::sync::LazyLock;
 
 use serde::Deserialize;
 
-/// Hexadecimal digits of a SHA-256.
-const SHA256_DIGITS: usize = 64;
-
 /// A file that can be fetched, and what it must be.
 #[derive(Clone, Debug, PartialEq)]
 pub struct NamedDataset {
@@ -18,52 +15,12 @@ pub struct NamedDataset {
     pub file: String,
     /// Size in bytes, if it is known.
     pub bytes: Option<u64>,
-    /// What is known of its checksum.
-    pub sha256: Checksum,
+    /// SHA-256 in lower-case hexadecimal, if it is known.
+    pub sha256: Option<String>,
     /// Licence of the data.
     pub licence: String,
     /// Where it can be had, best first.
     pub addresses: Vec<String>,
-}
-
-/// What is known of a SHA-256: all its digits, the first ones, the first and the last ones, or nothing.
-#[derive(Clone, Debug, Default, PartialEq, Deserialize)]
-#[serde(from = "String")]
-pub struct Checksum {
-    start: String,
-    end: String,
-}
-
-impl From<String> for Checksum {
-    /// Lower-case hexadecimal digits; an ellipsis stands for those between the first and the last ones.
-    fn from(digits: String) -> Self {
-        let (start, end) = digits.split_once('…').unwrap_or((&digits, ""));
-        Self { start: start.to_owned(), end: end.to_owned() }
-    }
-}
-
-impl Checksum {
-    /// Whether a file of this SHA-256 (lower-case hexadecimal) can be the one.
-    pub fn matches(&self, sha256: &str) -> bool {
-        sha256.starts_with(&self.start) && sha256.ends_with(&self.end)
-    }
-
-    /// How much of it is known, for people.
-    pub fn known(&self) -> &'static str {
-        match (self.start.len(), self.end.len()) {
-            (SHA256_DIGITS, _) => "checksum",
-            (0, 0) => "no checksum",
-            (_, 0) => "start of the checksum",
-            _ => "start and end of the checksum",
-        }
-    }
-}
-
-impl std::fmt::Display for Checksum {
-    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
-        f.write_str(&self.start)?;
-        if self.start.len() < SHA256_DIGITS { write!(f, "…{}", self.end) } else { Ok(()) }
-    }
 }
 
 #[derive(Deserialize)]
@@ -86,10 +43,8 @@ struct Entry {
     name: String,
     environment: String,
     file: String,
-    #[serde(default)]
     bytes: Option<u64>,
-    #[serde(default)]
-    sha256: Checksum,
+    sha256: Option<String>,
 }
 
 impl Collection {
@@ -141,10 +96,10 @@ mod tests {
             assert!(name.starts_with(environment.simulation()), "{name}");
             assert!(addresses.iter().all(|address| address.starts_with("http") && address.ends_with(file)), "{name}");
             assert!(!addresses.is_empty() && dataset.licence == "CC BY 4.0", "{name}");
-            let digits = format!("{}{}", sha256.start, sha256.end);
-            assert!(digits.chars().all(|digit| matches!(digit, '0'..='9' | 'a'..='f')), "{name}: {digits}");
-            assert!([0, 8, 17, 18, 64].contains(&digits.len()), "{name}: {} digits", digits.len());
-            assert_eq!(digits.is_empty(), dataset.bytes.is_none(), "{name}");
+            let is_digest =
+                |text: &String| text.len() == 64 && text.chars().all(|digit| matches!(digit, '0'..='9' | 'a'..='f'));
+            assert!(sha256.as_ref().is_none_or(is_digest), "{name}: {sha256:?}");
+            assert!(sha256.is_none() || dataset.bytes.is_some(), "{name}");
         }
     }
 
@@ -158,23 +113,5 @@ mod tests {
         for kind in ["umaze", "umaze-diverse", "medium-play", "medium-diverse", "large-play", "large-diverse"] {
             assert!(find(&format!("antmaze-{kind}-v0")).unwrap().bytes.is_some());
         }
-    }
-
-    #[test]
-    fn a_checksum_matches_as_far_as_it_is_known() {
-        let whole = "c771dd63".to_owned() + &"0".repeat(46) + "1d06e8c932";
-        for (known, what) in [
-            (whole.as_str(), "checksum"),
-            ("c771dd63", "start of the checksum"),
-            ("c771dd63…1d06e8c932", "start and end of the checksum"),
-            ("", "no checksum"),
-        ] {
-            let checksum = Checksum::from(known.to_owned());
-            assert!(checksum.matches(&whole), "{known}");
-            assert_eq!(checksum.known(), what);
-        }
-        assert!(!Checksum::from("c771dd64".to_owned()).matches(&whole));
-        assert!(!Checksum::from("c771dd63…1d06e8c933".to_owned()).matches(&whole));
-        assert_eq!(Checksum::from("c771dd63".to_owned()).to_string(), "c771dd63…");
     }
 }

@@ -65,7 +65,8 @@ impl Fetcher {
             match self.fetch_from(&address, dataset, &mut partial, &progress) {
                 Ok(sha256) => {
                     partial.finish(&path).map_err(local)?;
-                    progress.say(&format!("{}: size and {} verified", path.display(), dataset.sha256.known()));
+                    let checksum = if dataset.sha256.is_some() { " and checksum" } else { "" };
+                    progress.say(&format!("{}: size{checksum} verified", path.display()));
                     return Ok(LocalDataset { path, sha256 });
                 }
                 Err(Failure::Local(error)) => return Err(local(error)),
@@ -94,7 +95,7 @@ impl Fetcher {
         partial: &mut Partial,
         progress: &ProgressBar,
     ) -> Result<String, Failure> {
-        // Only a size and a checksum can tell whether what is here already belongs to the file.
+        // Without its size, nothing tells whether what is here already can be the beginning of the file.
         if dataset.bytes.is_none_or(|bytes| partial.length > bytes) {
             partial.clear()?;
         }

@@ -3,7 +3,7 @@
 use std::collections::BTreeSet;
 
 use quad_algorithms::Variant;
-use quad_dataset::catalogue::{self, Checksum};
+use quad_dataset::catalogue;
 
 use super::published::{self, SEEDS};
 use super::run::RunReport;
@@ -69,8 +69,7 @@ fn without_seed(experiment: &Experiment) -> Settings {
 
 /// Whether a run learnt from the dataset of that name, whatever it was called on the command line.
 fn is_trained_on(run: &RunReport, dataset: Option<&str>) -> bool {
-    let known = dataset.and_then(catalogue::find).filter(|known| known.sha256 != Checksum::default());
-    let same_file =
-        run.config.dataset.sha256.as_ref().zip(known).is_some_and(|(sha256, known)| known.sha256.matches(sha256));
+    let known = dataset.and_then(catalogue::find).and_then(|known| known.sha256.as_ref());
+    let same_file = known.is_some() && run.config.dataset.sha256.as_ref() == known;
     same_file || run.config.experiment.dataset.as_deref() == dataset
 }
