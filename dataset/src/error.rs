@@ -40,6 +40,15 @@ pub enum Problem {
     /// A folder that is no Minari dataset.
     #[error("a folder without main_data.hdf5, so no Minari dataset that is stored as HDF5")]
     UnknownFolder,
+    /// A file or folder of a format that is known, but not read.
+    #[error("{what}, which is none of the formats that are read")]
+    Foreign { what: String, load: &'static str },
+    /// Another program writes the HDF5 file, or the file system has no locks to tell.
+    #[error("locked: another program has it open for writing, or its file system has no locks")]
+    Locked(#[source] hdf5::Error),
+    /// The program that wrote the HDF5 file ended without closing it.
+    #[error("not closed by the program that wrote it")]
+    NotClosed(#[source] hdf5::Error),
     /// An HDF5 file says that it is longer than it is.
     #[error("cut short: {bytes} bytes are there of {expected}")]
     Truncated { bytes: u64, expected: u64 },
@@ -73,6 +82,12 @@ pub enum Problem {
     /// An array claims more elements than a file of that size can hold.
     #[error("array `{array}` claims the shape {found:?}, more than a file of {bytes} bytes can hold")]
     Oversized { array: String, found: Vec<usize>, bytes: u64 },
+    /// An array is compressed by a filter that this program's HDF5 library does not have.
+    #[error("array `{array}` is compressed by HDF5's filter {filter}, which this program cannot read")]
+    Filter { array: String, filter: String },
+    /// A virtual or external array, or a link that leads nowhere.
+    #[error("array `{array}` is not in this file: it leads to numbers that lie elsewhere")]
+    Elsewhere { array: String },
     /// HDF5 fails in the middle of an array.
     #[error("array `{array}` cannot be read")]
     UnreadableHdf5 {
@@ -163,6 +178,11 @@ impl Problem {
     pub fn hint(&self) -> String {
         let hint = match self {
             Self::OtherEnvironment { claimed, expected } => return other_environment(claimed, expected),
+            Self::Foreign { load, .. } => {
+                return format!(
+                    "{load}; then write its numbers to an HDF5 file of your own by the ten lines of h5py in docs/data.md"
+                );
+            }
             Self::Width { .. } => {
                 "choose a dataset of that environment, or a task in the environment it was recorded in"
             }
@@ -178,8 +198,17 @@ impl Problem {
                 "the file was cut off or damaged on its way: fetch or copy it again; \
                  the program that writes one of your own must close it"
             }
-            Self::UnreadableHdf5 { .. } | Self::UnreadableNpz { .. } | Self::Oversized { .. } => {
-                "the file is damaged: fetch or copy it again"
+            Self::Locked(_) => {
+                "close it in that program; if none has it open, set HDF5_USE_FILE_LOCKING=FALSE and try again"
+            }
+            Self::NotClosed(_) => {
+                "let that program close it; if the program is gone, `h5clear --status FILE` (of HDF5's tools) frees what it wrote"
+            }
+            Self::Filter { .. } | Self::Elsewhere { .. } => REWRITE,
+            Self::UnreadableHdf5 { .. } | Self::UnreadableNpz { .. } => "the file is damaged: fetch or copy it again",
+            Self::Oversized { .. } => {
+                "the file is damaged, or most of these rows were never written: fetch or copy it again, or write those alone \
+                 that there are"
             }
             Self::Metadata(_) => "fetch the Minari dataset again; metadata.json is what Minari writes beside the data",
             Self::UnknownLayout { .. } => "see docs/data.md for what the attribute means",
@@ -211,13 +240,20 @@ impl Problem {
             }
             Self::Endless { .. } => "set `timeouts` to 1 at the last row of each episode that did not terminate",
             Self::NoTransitions { .. } => "record more: a transition needs a row and the one that follows it",
-            Self::SameReturns => "choose another reward rule, for example `as-is`",
+            Self::SameReturns => {
+                "unless all rewards are alike, another reward rule learns from them: --set reward=as-is"
+            }
             Self::Write(_) => "check that the disk has room and the folder is writable",
             Self::BadRow { .. } => "each row must have the environment's sizes and finite numbers",
         };
         hint.to_owned()
     }
 }
+
+/// Copies every array, uncompressed, into one file.
+const REWRITE: &str = "pip install h5py hdf5plugin; then write it again, with your names for OLD and NEW: python -c \"import h5py, \
+    hdf5plugin; a, b = h5py.File('OLD'), h5py.File('NEW', 'w'); b.attrs.update(a.attrs); a.visititems(lambda name, x: \
+    b.update({name: x[()]}) if isinstance(x, h5py.Dataset) else None)\"";
 
 fn other_environment(claimed: &str, expected: &str) -> String {
     match environment::find(claimed) {

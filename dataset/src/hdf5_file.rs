@@ -8,11 +8,13 @@ use std::fs::File;
 use std::io::Read;
 use std::path::{Path, PathBuf};
 
+use hdf5::dataset::Layout;
 use hdf5::types::{FixedAscii, FixedUnicode, TypeDescriptor, VarLenAscii, VarLenUnicode};
-use hdf5::{Container, H5Type};
+use hdf5::{Container, H5Type, IndexType, IterationOrder, LinkType};
 
 use crate::array::Array;
 use crate::error::{DatasetError, Problem};
+use crate::formats::foreign;
 
 /// The first bytes of an HDF5 file.
 pub const SIGNATURE: &[u8] = b"\x89HDF\r\n\x1a\n";
@@ -47,16 +49,11 @@ impl Hdf5File {
     pub(crate) fn open(path: &Path) -> Result<Self, DatasetError> {
         let io_error = |source| DatasetError::new(path, Problem::Io(source));
         let mut start = Vec::new();
-        let file = File::open(path).map_err(io_error)?;
-        let bytes = file.metadata().map_err(io_error)?.len();
-        file.take(64).read_to_end(&mut start).map_err(io_error)?;
-        let file = hdf5::File::open(path).map_err(|source| {
-            let problem = match end_of_file(&start) {
-                Some(expected) if expected > bytes => Problem::Truncated { bytes, expected },
-                _ => Problem::DamagedHdf5(source),
-            };
-            DatasetError::new(path, problem)
-        })?;
+        let plain = File::open(path).map_err(io_error)?;
+        let bytes = plain.metadata().map_err(io_error)?.len();
+        (&plain).take(foreign::START).read_to_end(&mut start).map_err(io_error)?;
+        let refused = |source| DatasetError::new(path, refusal(&plain, &start, bytes, source));
+        let file = hdf5::File::open(path).map_err(refused)?;
         Ok(Self { path: path.into(), file, bytes })
     }
 
@@ -141,10 +138,27 @@ impl Hdf5File {
         if !self.has(array) {
             return Err(self.error(Problem::Missing { array: array.to_owned() }));
         }
-        self.file.dataset(array).map_err(|source| match self.file.group(array) {
-            Ok(_) => self.error(Problem::Group { array: array.to_owned() }),
+        let name = || array.to_owned();
+        let dataset = self.file.dataset(array).map_err(|source| match self.file.group(array) {
+            Ok(_) => self.error(Problem::Group { array: name() }),
+            Err(_) if self.is_link(array) => self.error(Problem::Elsewhere { array: name() }),
             Err(_) => self.unreadable(array, source),
-        })
+        })?;
+        let creation = dataset.dcpl().map_err(|source| self.unreadable(array, source))?;
+        if creation.layout() == Layout::Virtual || !creation.external().is_empty() {
+            return Err(self.error(Problem::Elsewhere { array: name() }));
+        }
+        match creation.filters().iter().find(|filter| !filter.is_available()) {
+            Some(filter) => Err(self.error(Problem::Filter { array: name(), filter: filter_name(filter.id()) })),
+            None => Ok(dataset),
+        }
+    }
+
+    /// Whether an array's name leads to an array elsewhere, in this file or in another one.
+    fn is_link(&self, array: &str) -> bool {
+        let (group, name) = array.rsplit_once('/').unwrap_or(("/", array));
+        let links = self.file.group(group).and_then(|group| group.links(IndexType::Name, IterationOrder::Native));
+        links.unwrap_or_default().iter().any(|(link, info)| link == name && info.link_type != LinkType::Hard)
     }
 
     fn descriptor(
@@ -181,6 +195,38 @@ impl Hdf5File {
     fn unreadable(&self, array: &str, source: hdf5::Error) -> DatasetError {
         self.error(Problem::UnreadableHdf5 { array: array.to_owned(), source })
     }
+}
+
+/// Why HDF5 refuses a file of `bytes` bytes that begins like this.
+fn refusal(file: &File, start: &[u8], bytes: u64, source: hdf5::Error) -> Problem {
+    if !start.starts_with(SIGNATURE) {
+        return foreign::of_start(start);
+    }
+    if file.try_lock_shared().is_err() {
+        return Problem::Locked(source);
+    }
+    match end_of_file(start) {
+        Some(expected) if expected > bytes => Problem::Truncated { bytes, expected },
+        // Bit 0 of the consistency flags, which version 3 of the superblock has in byte 11.
+        Some(_) if start[8] == 3 && start[11] & 1 == 1 => Problem::NotClosed(source),
+        _ => Problem::DamagedHdf5(source),
+    }
+}
+
+/// What people call a filter, by its number in HDF5's registry.
+fn filter_name(id: i32) -> String {
+    let name = match id {
+        1 => "gzip",
+        4 => "szip",
+        32001 => "blosc",
+        32004 => "lz4",
+        32008 => "bitshuffle",
+        32013 => "zfp",
+        32015 => "zstd",
+        32026 => "blosc2",
+        _ => return format!("number {id}"),
+    };
+    name.to_owned()
 }
 
 /// The text that an attribute or an array holds, as HDF5's programs write one: of variable or fixed length, ASCII or UTF-8.

@@ -5,8 +5,8 @@
 //! In reading order: [`environment`] is what is known of an environment without simulating it; `task` is one that may
 //! be unknown. `hdf5_file` and `npz_file` read one `array` of a file and check everything about its form; `formats` has a
 //! file for each format, which turns arrays into a `recording`. `transitions` are what is learnt from, unless `checks`
-//! has objections, with `reward`, `scale` and `statistics` beside it; `sampler` draws mini-batches; `inspect` describes a source to
-//! people, whatever is wrong with it. `recorded` is a D4RL file as it was recorded, row by row; `writer` writes such a file, and `arrays`
+//! has objections, with `reward`, `scale` and `statistics` beside it; `doubts` and `resets` are what makes learning from them
+//! doubtful; `sampler` draws mini-batches; `inspect` describes a source to people, whatever is wrong with it. `recorded` is a D4RL file as it was recorded, row by row; `writer` writes such a file, and `arrays`
 //! one of people's own layout, both by `new_file`;
 //! [`catalogue`] lists the files that can be asked for by name; `error` is what can go wrong with any of them.
 //!
@@ -18,6 +18,7 @@ mod array;
 mod arrays;
 pub mod catalogue;
 mod checks;
+mod doubts;
 pub mod environment;
 mod error;
 mod formats;
@@ -27,6 +28,7 @@ mod new_file;
 mod npz_file;
 mod recorded;
 mod recording;
+mod resets;
 mod reward;
 mod sampler;
 mod scale;

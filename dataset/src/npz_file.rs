@@ -4,12 +4,14 @@ use std::fs::File;
 use std::io::{self, BufReader};
 use std::path::{Path, PathBuf};
 
+use npyz::half::f16;
 use npyz::{DType, Deserialize, NpyFile, Order, TypeChar};
 use zip::ZipArchive;
 use zip::result::ZipError;
 
 use crate::array::Array;
 use crate::error::{DatasetError, Problem};
+use crate::formats::foreign;
 
 /// The first bytes of a zip file.
 pub(crate) const SIGNATURE: &[u8] = b"PK";
@@ -25,6 +27,9 @@ impl NpzFile {
         let file = File::open(path).map_err(|source| DatasetError::new(path, Problem::Io(source)))?;
         let archive = ZipArchive::new(BufReader::new(file))
             .map_err(|source| DatasetError::new(path, Problem::DamagedNpz(source)))?;
+        if let Some(problem) = foreign::of_archive(&archive.file_names().filter_map(Result::ok).collect::<Vec<_>>()) {
+            return Err(DatasetError::new(path, problem));
+        }
         Ok(Self { path: path.into(), archive })
     }
 
@@ -98,13 +103,18 @@ fn floats<R: io::Read>(file: NpyFile<R>, array: &str) -> Result<Vec<f32>, Proble
         return Err(wrong_type(array, file.dtype().descr()));
     };
     match (element.type_char(), element.size_field()) {
+        (TypeChar::Float, 2) => convert::<f16, R>(file, array, f32::from),
         (TypeChar::Float, 4) => convert::<f32, R>(file, array, |value| value),
         (TypeChar::Float, 8) => convert::<f64, R>(file, array, |value| value as f32),
         (TypeChar::Bool, 1) => convert::<bool, R>(file, array, |value| f32::from(u8::from(value))),
         (TypeChar::Int, 1) => convert::<i8, R>(file, array, f32::from),
+        (TypeChar::Int, 2) => convert::<i16, R>(file, array, f32::from),
         (TypeChar::Int, 4) => convert::<i32, R>(file, array, |value| value as f32),
         (TypeChar::Int, 8) => convert::<i64, R>(file, array, |value| value as f32),
         (TypeChar::Uint, 1) => convert::<u8, R>(file, array, f32::from),
+        (TypeChar::Uint, 2) => convert::<u16, R>(file, array, f32::from),
+        (TypeChar::Uint, 4) => convert::<u32, R>(file, array, |value| value as f32),
+        (TypeChar::Uint, 8) => convert::<u64, R>(file, array, |value| value as f32),
         _ => Err(wrong_type(array, element.to_string())),
     }
 }

@@ -6,7 +6,6 @@ use std::path::Path;
 use quad_kernels::scaling::Scaling;
 
 use crate::arrays::Arrays;
-use crate::checks;
 use crate::environment::EnvironmentSpec;
 use crate::error::{DatasetError, Problem};
 use crate::formats::Source;
@@ -14,6 +13,7 @@ use crate::recording::Recording;
 use crate::reward::{RewardRule, RewardScaling};
 use crate::scale::{self, Scale};
 use crate::statistics::Statistics;
+use crate::{checks, doubts, resets};
 
 /// Actions are kept this far within ±1, where policies that squash can still reach them.
 const ACTION_LIMIT: f32 = 1.0 - 1e-5;
@@ -83,6 +83,7 @@ pub struct Transitions {
     /// Whether the next row is the next step of the episode; N.
     goes_on: Vec<bool>,
     statistics: Statistics,
+    doubts: Vec<String>,
     scaling: Scaling,
 }
 
@@ -134,6 +135,8 @@ impl Transitions {
         let rows: Vec<u32> = recording.transitions().collect();
         let statistics = Statistics::new(environment, rows.len(), &recording.episodes());
         let goes_on = (0..recording.rows()).map(|row| recording.goes_on(row)).collect();
+        let mut doubts = doubts::doubts(&recording, scaling.observations.is_some());
+        doubts.extend(resets::out_of_step(&recording));
         scale::apply(&scaling, &mut recording);
         let Recording { observation_dim, action_dim, observations, mut actions, mut rewards, .. } = recording;
         actions.iter_mut().for_each(|action| *action = action.clamp(-ACTION_LIMIT, ACTION_LIMIT));
@@ -149,6 +152,7 @@ impl Transitions {
             rows,
             goes_on,
             statistics,
+            doubts,
             scaling,
         }
     }
@@ -177,6 +181,11 @@ impl Transitions {
     /// What the file holds, from the rewards as they were recorded.
     pub fn statistics(&self) -> &Statistics {
         &self.statistics
+    }
+
+    /// What makes it doubtful that anything good is learnt from them, one sentence each.
+    pub fn doubts(&self) -> &[String] {
+        &self.doubts
     }
 
     /// The number of the transition that follows this one (below [`len`](Self::len)) in its episode.

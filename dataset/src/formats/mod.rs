@@ -1,6 +1,7 @@
-//! The formats that are read, each to one [`Recording`].
+//! The formats that are read, each to one [`Recording`]; `foreign` names others.
 
 mod d4rl;
+pub(crate) mod foreign;
 mod minari;
 mod ogbench;
 mod own;
@@ -22,7 +23,7 @@ pub(crate) use own::LAYOUT as OWN_LAYOUT;
 pub fn data_file(path: impl AsRef<Path>) -> Result<PathBuf, DatasetError> {
     let path = path.as_ref();
     match path.is_dir() {
-        true => minari::data_file(path).ok_or_else(|| DatasetError::new(path, Problem::UnknownFolder)),
+        true => minari::data_file(path).ok_or_else(|| DatasetError::new(path, foreign::of_folder(path))),
         false => Ok(path.to_owned()),
     }
 }
@@ -45,11 +46,11 @@ impl Source {
         }
         let mut start = Vec::new();
         let file = File::open(path).map_err(|source| error(Problem::Io(source)))?;
-        file.take(8).read_to_end(&mut start).map_err(|source| error(Problem::Io(source)))?;
+        file.take(foreign::START).read_to_end(&mut start).map_err(|source| error(Problem::Io(source)))?;
         match &start {
             start if start.starts_with(hdf5_file::SIGNATURE) => Self::hdf5(Hdf5File::open(path)?),
             start if start.starts_with(npz_file::SIGNATURE) => Ok(Self::OgBench(NpzFile::open(path)?)),
-            _ => Err(error(Problem::UnknownFormat)),
+            _ => Err(error(foreign::of_start(&start))),
         }
     }
 
@@ -58,6 +59,9 @@ impl Source {
             Some(layout) if layout == own::LAYOUT => return Ok(Self::Own(file)),
             Some(found) => return Err(file.error(Problem::UnknownLayout { found })),
             None => {}
+        }
+        if let Some(problem) = foreign::of_hdf5(&file) {
+            return Err(file.error(problem));
         }
         let is_minari = file.path().ends_with(minari::DATA_FILE) || file.has("episode_0");
         match is_minari {

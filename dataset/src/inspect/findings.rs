@@ -1,10 +1,10 @@
 //! What looks wrong with a dataset, though training puts up with it.
 
-use crate::checks;
 use crate::environment::EnvironmentSpec;
 use crate::error::such_rows;
 use crate::formats::Source;
 use crate::recording::Recording;
+use crate::{checks, doubts, resets};
 
 /// Nothing that walks through a maze comes further in one step of a tenth of a second.
 const LONGEST_STEP: f32 = 1.0;
@@ -21,18 +21,24 @@ pub(super) fn findings(source: &Source, recording: &Recording, environment: Opti
             None => "no array `timeouts`: only a terminal is taken to end an episode".to_owned(),
         });
     }
-    let strays = checks::strays(recording).filter(|(_, refused)| !refused);
-    findings.extend(strays.map(|(problem, _)| format!("{problem}; is a timeout missing?")));
-    let outside = checks::actions_outside(recording);
-    findings.extend(outside.map(|problem| format!("{problem}; `learner train --scale actions` trains on it")));
-    if recording.goal {
+    let out_of_step = resets::out_of_step(recording);
+    if out_of_step.is_empty() {
+        let strays = checks::strays(recording).filter(|(_, refused)| !refused);
+        findings.extend(strays.map(|(problem, _)| format!("{problem}; is a timeout missing?")));
         findings.extend(leaps(recording));
     }
+    findings.extend(out_of_step);
+    let outside = checks::actions_outside(recording);
+    findings.extend(outside.map(|problem| format!("{problem}; `learner train --scale actions` trains on it")));
+    findings.extend(doubts::doubts(recording, false));
     findings
 }
 
 /// Rows inside an episode from which the place, an observation's first two numbers, is too far from the next one.
 fn leaps(recording: &Recording) -> Option<String> {
+    if !recording.goal {
+        return None;
+    }
     let leap = |&row: &usize| {
         let (from, to) = (recording.observation(row), recording.observation(row + 1));
         let apart = from.iter().zip(to).take(2).map(|(from, to)| (to - from).powi(2)).sum::<f32>().sqrt();

@@ -8,6 +8,8 @@ use quad_dataset::{Batch, EnvironmentSpec, ReadOptions, RewardRule, Scale, Trans
 
 mod broken;
 mod d4rl;
+mod doubts;
+mod foreign;
 mod inspect;
 mod minari;
 mod ogbench;

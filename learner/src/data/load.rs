@@ -21,6 +21,9 @@ pub fn load(path: &Path, experiment: &Experiment) -> anyhow::Result<Transitions>
     let result = Transitions::read(path, &options);
     let hint = result.as_ref().err().map(DatasetError::hint).unwrap_or_default();
     let transitions = result.with_context(|| format!("cannot learn from {}", path.display())).hint(hint)?;
+    for doubt in transitions.doubts() {
+        tracing::warn!("{}: {doubt}", path.display());
+    }
     let (there, batch) = (transitions.len(), experiment.batch_size);
     if there < batch as usize {
         return Err(anyhow!("{there} transitions are fewer than a batch of {batch}"))

@@ -61,6 +61,21 @@ fn a_run_by_name_fetches_its_dataset_once_and_records_its_checksum() {
 }
 
 #[test]
+fn a_file_that_another_program_writes_is_not_called_damaged() {
+    let scratch = Scratch::new();
+    let path = scratch.path().join("log.hdf5");
+    fs::copy(scratch.dataset(), &path).unwrap();
+    let writer = fs::File::open(&path).unwrap();
+    writer.lock().unwrap();
+    let mut inspect = Command::new(binary("learner"));
+    inspect.args(["datasets", "inspect"]).arg(&path).env_remove("HDF5_USE_FILE_LOCKING");
+    let text = failure(&inspect.output().unwrap());
+    assert!(text.contains("log.hdf5: locked: another program has it open for writing"), "{text}");
+    writer.unlock().unwrap();
+    assert!(inspect.output().unwrap().status.success());
+}
+
+#[test]
 fn the_list_says_what_there_is_and_what_is_here() {
     let folder = tempfile::tempdir().unwrap();
     fs::write(folder.path().join("hopper_random-v2.hdf5"), "").unwrap();

@@ -1,0 +1,87 @@
+//! Formats that are not read here, named for what they are, and what loads them in Python.
+
+use std::fs;
+use std::path::Path;
+
+use serde_json::Value;
+
+use crate::error::Problem;
+use crate::hdf5_file::Hdf5File;
+
+/// How many bytes of a file tell what it is.
+pub(crate) const START: u64 = 256;
+
+const PICKLE: &str = "load it by pickle.load, if you trust who wrote it: a pickle can run any program";
+
+/// How files begin, what such a file is, and how to load it.
+const STARTS: [(&[u8], &str, &str); 8] = [
+    (b"PAR1", "a Parquet file", "load it by pandas.read_parquet"),
+    (b"ARROW1", "an Arrow file", "load it by pandas.read_feather"),
+    (b"\x80\x02", "a Python pickle", PICKLE),
+    (b"\x80\x03", "a Python pickle", PICKLE),
+    (b"\x80\x04", "a Python pickle", PICKLE),
+    (b"\x80\x05", "a Python pickle", PICKLE),
+    (b"\x93NUMPY", "a single NumPy array", "load it by numpy.load"),
+    (
+        b"MATLAB",
+        "a MATLAB file",
+        "load it by scipy.io.loadmat or, if it is of version 7.3, by h5py, which transposes arrays",
+    ),
+];
+
+fn foreign(what: impl Into<String>, load: &'static str) -> Problem {
+    Problem::Foreign { what: what.into(), load }
+}
+
+/// What a file is that is neither HDF5 nor a zip archive, by its first [`START`] bytes.
+pub(crate) fn of_start(start: &[u8]) -> Problem {
+    if let Some((_, what, load)) = STARTS.iter().find(|(bytes, _, _)| start.starts_with(bytes)) {
+        return foreign(*what, load);
+    }
+    // A character that the last of these bytes cuts in two is left out.
+    let text = start.utf8_chunks().next().filter(|chunk| start.len() - chunk.valid().len() < 4);
+    let text = text.map_or("", |chunk| chunk.valid());
+    let first_line = text.lines().next().unwrap_or_default();
+    match text {
+        text if text.contains(|c: char| c.is_control() && !c.is_whitespace()) => Problem::UnknownFormat,
+        text if text.starts_with(['{', '[']) => foreign("a JSON file", "load it by json.load or pandas.read_json"),
+        _ if first_line.contains([',', ';', '\t']) => foreign("a table as text (CSV)", "load it by pandas.read_csv"),
+        _ => Problem::UnknownFormat,
+    }
+}
+
+/// What a folder is that is no Minari dataset in HDF5.
+pub(super) fn of_folder(folder: &Path) -> Problem {
+    let text = |file: &str, key: &str| {
+        let json: Value = serde_json::from_slice(&fs::read(folder.join(file)).ok()?).ok()?;
+        json[key].as_str().map(str::to_owned)
+    };
+    if let Some(version) = text("meta/info.json", "codebase_version") {
+        let load = "load each Parquet file in its folder data by pandas.read_parquet: an episode's rows share an \
+                    episode_index, and where no next.reward was recorded each step needs a reward of yours";
+        return foreign(format!("a LeRobot dataset of version {version}"), load);
+    }
+    let format = text("data/metadata.json", "data_format").or_else(|| text("metadata.json", "data_format"));
+    match format.filter(|format| format != "hdf5") {
+        Some(format) => foreign(format!("a Minari dataset stored as {format}"), "load it by minari.load_dataset"),
+        None => Problem::UnknownFolder,
+    }
+}
+
+/// What an HDF5 file is that has another layout.
+pub(super) fn of_hdf5(file: &Hdf5File) -> Option<Problem> {
+    let demonstrations = file.members("data")?.iter().any(|name| name.starts_with("demo_"));
+    let load = "load each data/demo_N by h5py: actions, rewards, dones, and from its obs the arrays that the policy is to \
+                see, side by side";
+    demonstrations.then(|| foreign("a robomimic file", load))
+}
+
+/// What a zip archive of these files is, if none of them is a NumPy array.
+pub(crate) fn of_archive(files: &[impl AsRef<str>]) -> Option<Problem> {
+    let has = |ending: &str| files.iter().any(|name| name.as_ref().ends_with(ending));
+    match (has(".npy"), has("data.pkl")) {
+        (true, _) => None,
+        (false, true) => Some(foreign("a PyTorch file", "load it by torch.load")),
+        (false, false) => Some(Problem::UnknownFormat),
+    }
+}
