@@ -1,12 +1,13 @@
-//! What is known of an environment without simulating it: the table `environments.toml`.
+//! All that is known of an environment: the table `environments.toml`.
 
 use std::sync::LazyLock;
 
 use serde::Deserialize;
 
 use crate::reward::RewardRule;
+use crate::simulated::{Collect, Planar};
 
-/// Sizes, limits and reference returns of one environment.
+/// One environment. Sizes and reference returns are what data is read by; the rest is how evaluators simulate it.
 #[derive(Debug, PartialEq, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct EnvironmentSpec {
@@ -14,9 +15,9 @@ pub struct EnvironmentSpec {
     pub name: String,
     #[serde(default)]
     simulation: Option<String>,
-    /// What Gymnasium calls it.
+    /// What Gymnasium calls it, if it has the same simulation.
     #[serde(default)]
-    gymnasium: Vec<String>,
+    pub gymnasium: Vec<String>,
     /// Numbers in an observation.
     pub observation_dim: usize,
     /// Numbers in an action, each within ±1.
@@ -34,6 +35,14 @@ pub struct EnvironmentSpec {
     /// When the goal is drawn, if there is one.
     #[serde(default)]
     pub goal: Option<Goal>,
+    /// The robot, if it is one in a vertical plane.
+    #[serde(default)]
+    pub planar: Option<Planar>,
+    /// The maze, if it is an ant in one: rows of cells along +y, in them cells along +x (1 wall, 0 free, R start, G goal).
+    #[serde(default)]
+    pub maze: Option<Vec<String>>,
+    /// How a dataset is recorded in it, or why none can be.
+    pub collect: Collect,
 }
 
 /// When an environment with a goal draws it anew.
@@ -115,7 +124,29 @@ mod tests {
             let sizes = |spec: &EnvironmentSpec| (spec.observation_dim, spec.action_dim, spec.qpos_dim, spec.qvel_dim);
             assert_eq!(sizes(spec), sizes(physics), "{}", spec.name);
             assert!(spec.reference_returns.1 > spec.reference_returns.0, "{}", spec.name);
+            assert!(physics.planar.is_some() != physics.maze.is_some(), "{}: one kind of simulation", spec.name);
+            assert_eq!(physics.maze.is_some(), spec.goal.is_some(), "{}: a maze has a goal", spec.name);
+            match &spec.collect {
+                Collect::None(reason) => assert!(!reason.is_empty(), "{}: no recipe and no reason", spec.name),
+                Collect::Recipe(recipe) => {
+                    let (bounds, shares): (Vec<f64>, Vec<f64>) = recipe.mixture.iter().copied().unzip();
+                    assert!(bounds.is_sorted() && bounds[0] == f64::NEG_INFINITY, "{}: {bounds:?}", spec.name);
+                    assert!((shares.iter().sum::<f64>() - 1.0).abs() < 1e-9, "{}: {shares:?}", spec.name);
+                    assert!(recipe.searches > 0 && recipe.steps_per_transition > 0, "{}", spec.name);
+                }
+            }
         }
+    }
+
+    #[test]
+    fn a_row_without_a_recipe_or_a_reason_is_refused() {
+        let row = |collect: &str| {
+            let row = "name = 'x'\nobservation_dim = 5\naction_dim = 1\nqpos_dim = 3\nqvel_dim = 3\nmax_episode_steps = 9\n\
+                       reference_returns = [0.0, 1.0]\nreward = 'as-is'\n";
+            toml::from_str::<EnvironmentSpec>(&format!("{row}{collect}")).map_err(|error| error.message().to_owned())
+        };
+        assert_eq!(row("").unwrap_err(), "missing field `collect`");
+        assert_eq!(row("collect.none = 'nobody knows'").unwrap().collect, Collect::None("nobody knows".to_owned()));
     }
 
     #[test]

@@ -2,8 +2,8 @@
 //! and people's own HDF5 written.
 //!
 //! # Layout
-//! In reading order: [`environment`] is what is known of an environment without simulating it; `task` is one that may
-//! be unknown. `hdf5_file` and `npz_file` read one `array` of a file and check everything about its form; `formats` has a
+//! In reading order: [`environment`] is all that is known of an environment, `simulated` that part of it by which evaluators
+//! simulate it; `task` is one that may be unknown. `hdf5_file` and `npz_file` read one `array` of a file and check everything about its form; `formats` has a
 //! file for each format, which turns arrays into a `recording`. `transitions` are what is learnt from, unless `checks`
 //! has objections, with `reward`, `scale` and `statistics` beside it; `doubts` and `resets` are what makes learning from them
 //! doubtful; `sampler` draws mini-batches; `inspect` describes a source to people, whatever is wrong with it. `recorded` is a D4RL file as it was recorded, row by row; `writer` writes such a file, and `arrays`
@@ -32,6 +32,7 @@ mod resets;
 mod reward;
 mod sampler;
 mod scale;
+mod simulated;
 mod statistics;
 mod task;
 mod transitions;
@@ -48,6 +49,7 @@ pub use recorded::{RecordedRows, Row, environments_of_its_sizes};
 pub use reward::RewardRule;
 pub use sampler::BatchSampler;
 pub use scale::{Scale, Scaled};
+pub use simulated::{Collect, Healthy, Noise, Planar, Recipe};
 pub use statistics::Statistics;
 pub use task::Task;
 pub use transitions::{Batch, ReadOptions, Transitions};

@@ -49,7 +49,7 @@ enum Command {
 /// seed makes the same data.
 #[derive(Debug, Args)]
 struct CollectArgs {
-    /// Environment to act in: hopper, halfcheetah or walker2d
+    /// Environment to act in, such as hopper
     #[arg(long, value_name = "NAME", value_parser = collect::environment)]
     env: &'static EnvironmentSpec,
     /// File to write; it appears when it is complete

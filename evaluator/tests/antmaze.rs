@@ -11,7 +11,7 @@ use rand_chacha::ChaCha8Rng;
 const MAZES: [&str; 3] = ["antmaze-umaze", "antmaze-medium", "antmaze-large"];
 const AT_REST: [f64; 14] = [0.0; 14];
 
-fn ant(name: &str) -> Box<dyn Simulation> {
+fn ant(name: &str) -> Simulation {
     make(find(name).unwrap(), 0).unwrap()
 }
 

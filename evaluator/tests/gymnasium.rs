@@ -6,7 +6,7 @@ use std::ops::RangeInclusive;
 use std::path::{Path, PathBuf};
 use std::process::{Command, Stdio};
 
-use quad_dataset::environment::find;
+use quad_dataset::environment::{all, find};
 use quad_evaluator::sim::{make, mjcf};
 use serde::Deserialize;
 use serde::de::DeserializeOwned;
@@ -106,18 +106,11 @@ fn assert_gymnasiums(name: &str, terminated: RangeInclusive<f64>) {
 }
 
 #[test]
-fn hopper_is_gymnasiums() {
-    assert_gymnasiums("hopper", 0.1..=0.9);
-}
-
-#[test]
-fn halfcheetah_is_gymnasiums() {
-    assert_gymnasiums("halfcheetah", 0.0..=0.0);
-}
-
-#[test]
-fn walker2d_is_gymnasiums() {
-    assert_gymnasiums("walker2d", 0.1..=0.9);
+fn planar_robots_are_gymnasiums() {
+    for spec in all().iter().filter(|spec| !spec.gymnasium.is_empty()) {
+        let ends = spec.planar.as_ref().is_some_and(|robot| robot.healthy.is_some());
+        assert_gymnasiums(&spec.name, if ends { 0.1..=0.9 } else { 0.0..=0.0 });
+    }
 }
 
 #[test]

@@ -11,77 +11,49 @@
 //!   continues.
 //! - The goal lies around the corner of cell `G`: on each axis max(0, the cell's centre + U(0, 1) + U(0, 0.5)), drawn when
 //!   the table says ([`Goal`]).
-//!
-//! As in the locomotion tasks, a simulation that diverges and an action that is not a number end the episode, with reward 0.
 
-use quad_dataset::environment::{EnvironmentSpec, Goal};
+use quad_dataset::Noise;
+use quad_dataset::environment::Goal;
 use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 
-use super::environment::{EnvironmentError, Step};
-use super::physics::{self, Noise, Physics};
-use super::simulation::{GOAL_STREAM, Simulation};
+use super::physics::Physics;
+use super::simulation::{Body, GOAL_STREAM, Task};
 
-/// The ant on its floor; [`WALLS`] marks the place of the walls.
-const ANT: &str = include_str!("../../assets/ant.xml");
+/// Where the model of the ant on its floor has the walls.
 const WALLS: &str = "<!-- walls -->";
 /// Side of a maze's cell, metres.
 const CELL: f64 = 4.0;
-/// Model steps a control is held for, of 0.02 s each.
-const FRAME_SKIP: usize = 5;
-const NOISE: Noise = Noise::NormalVelocities(0.1);
 /// Distance in the plane from the torso's centre to the goal at which it is reached, metres.
 const REACH: f64 = 0.5;
+/// Steps of the model that a control is held for, of 0.02 s each.
+pub(super) const FRAME_SKIP: usize = 5;
+/// The ant.
+pub(super) const BODY: Body =
+    Body { noise: Noise::NormalVelocities(0.1), hidden_positions: 0, observed_velocity: f64::INFINITY };
 
-/// A maze.
-pub(super) struct Maze {
-    /// The simulation's name in the table of environments.
-    pub name: &'static str,
-    /// Rows of cells along +y, in them cells along +x: `1` wall, `0` free, `R` start, `G` goal. The world's origin is the
-    /// centre of the cell (1, 1), which is the start.
-    map: &'static [&'static str],
-}
-
-pub(super) static MAZES: [Maze; 3] = [
-    Maze { name: "antmaze-umaze", map: &["11111", "1R001", "11101", "1G001", "11111"] },
-    Maze {
-        name: "antmaze-medium",
-        map: &["11111111", "1R011001", "10010001", "11000111", "10010001", "10100101", "100010G1", "11111111"],
-    },
-    Maze {
-        name: "antmaze-large",
-        map: &[
-            "111111111111",
-            "1R0001000001",
-            "101101010101",
-            "100000010001",
-            "101111011101",
-            "100101000001",
-            "110101010111",
-            "100100010G01",
-            "111111111111",
-        ],
-    },
-];
+/// A maze's map, as its row in the table has it. The world's origin is the centre of the cell (1, 1), which is the start.
+#[derive(Clone, Copy)]
+pub(super) struct Maze(pub &'static [String]);
 
 impl Maze {
     /// The centres (x, y) of the cells of a kind.
-    fn centres(&self, kind: u8) -> impl Iterator<Item = [f64; 2]> {
-        self.map.iter().enumerate().flat_map(move |(i, row)| {
+    fn centres(self, kind: u8) -> impl Iterator<Item = [f64; 2]> {
+        self.0.iter().enumerate().flat_map(move |(i, row)| {
             let cells = row.bytes().enumerate().filter(move |&(_, cell)| cell == kind);
             cells.map(move |(j, _)| [(j as f64 - 1.0) * CELL, (i as f64 - 1.0) * CELL])
         })
     }
 
-    /// The model: the ant, the floor, and a box for each wall, half a cell high.
-    pub fn mjcf(&self) -> String {
+    /// The model: `ant`, which has a floor, and a box for each wall, half a cell high.
+    pub fn mjcf(self, ant: &str) -> String {
         let walls: String =
             self.centres(b'1').map(|[x, y]| format!("<geom class=\"wall\" pos=\"{x} {y} 1\"/>\n    ")).collect();
-        ANT.replacen(WALLS, walls.trim_end(), 1)
+        ant.replacen(WALLS, walls.trim_end(), 1)
     }
 
     /// Draws a goal.
-    fn draw_goal(&self, seed: u64) -> [f64; 2] {
+    fn draw_goal(self, seed: u64) -> [f64; 2] {
         let mut random = ChaCha8Rng::seed_from_u64(seed);
         random.set_stream(GOAL_STREAM);
         let centre = self.centres(b'G').next().unwrap_or_default();
@@ -89,57 +61,31 @@ impl Maze {
     }
 }
 
-/// An ant in a maze.
+/// The way to a goal.
 pub(super) struct AntMaze {
-    maze: &'static Maze,
-    physics: Physics,
-    observation: Vec<f64>,
+    maze: Maze,
     goal: [f64; 2],
     goal_drawn: Goal,
-    steps: usize,
-    max_episode_steps: usize,
 }
 
 impl AntMaze {
-    /// An ant that waits for its first [`reset`](Simulation::reset). `environment_seed` is the seed of a goal that all
-    /// episodes share.
-    pub fn new(maze: &'static Maze, spec: &EnvironmentSpec, environment_seed: u64) -> Result<Self, EnvironmentError> {
-        let model = physics::model(maze.name, || maze.mjcf())?;
-        Ok(Self {
-            maze,
-            physics: Physics::new(model, FRAME_SKIP)?,
-            observation: vec![0.0; spec.observation_dim],
-            goal: maze.draw_goal(environment_seed),
-            goal_drawn: spec.goal.unwrap_or(Goal::EachEpisode),
-            steps: 0,
-            max_episode_steps: spec.max_episode_steps,
-        })
-    }
-
-    fn start(&mut self) {
-        self.steps = 0;
-        self.observe();
-    }
-
-    fn observe(&mut self) {
-        let (positions, velocities) = self.observation.split_at_mut(self.physics.qpos().len());
-        positions.copy_from_slice(self.physics.qpos());
-        velocities.copy_from_slice(self.physics.qvel());
+    /// `environment_seed` is the seed of a goal that all episodes share.
+    pub fn new(maze: Maze, goal_drawn: Goal, environment_seed: u64) -> Self {
+        Self { maze, goal: maze.draw_goal(environment_seed), goal_drawn }
     }
 }
 
-impl Simulation for AntMaze {
-    fn reset(&mut self, seed: u64) {
+impl Task for AntMaze {
+    fn judge(&self, _x: f64, physics: &Physics) -> (f64, bool) {
+        let [dx, dy] = [0, 1].map(|axis| physics.qpos()[axis] - self.goal[axis]);
+        let reached = (dx * dx + dy * dy).sqrt() <= REACH;
+        (f64::from(u8::from(reached)), reached)
+    }
+
+    fn begin(&mut self, seed: u64) {
         if self.goal_drawn == Goal::EachEpisode {
             self.goal = self.maze.draw_goal(seed);
         }
-        self.physics.reset(seed, NOISE);
-        self.start();
-    }
-
-    fn set_state(&mut self, qpos: &[f64], qvel: &[f64]) {
-        self.physics.set_state(qpos, qvel);
-        self.start();
     }
 
     fn set_goal(&mut self, goal: &[f64]) {
@@ -149,55 +95,20 @@ impl Simulation for AntMaze {
     fn goal(&self) -> Option<&[f64]> {
         Some(&self.goal)
     }
-
-    fn step(&mut self, action: &[f32]) -> Step {
-        self.steps += 1;
-        let truncated = self.steps >= self.max_episode_steps;
-        let went_on = self.physics.step(action);
-        self.observe();
-        if !went_on {
-            return Step { reward: 0.0, terminated: true, truncated };
-        }
-        let [dx, dy] = [0, 1].map(|axis| self.physics.qpos()[axis] - self.goal[axis]);
-        let reached = (dx * dx + dy * dy).sqrt() <= REACH;
-        Step { reward: f64::from(u8::from(reached)), terminated: reached, truncated }
-    }
-
-    fn control_period(&self) -> f64 {
-        self.physics.dt()
-    }
-
-    fn observation(&self) -> &[f64] {
-        &self.observation
-    }
-
-    fn qpos(&self) -> &[f64] {
-        self.physics.qpos()
-    }
-
-    fn qvel(&self) -> &[f64] {
-        self.physics.qvel()
-    }
 }
 
 #[cfg(test)]
 mod tests {
     use quad_dataset::environment::find;
 
-    use super::*;
-
-    fn ant(name: &str, environment_seed: u64) -> AntMaze {
-        let spec = find(name).unwrap();
-        let maze = MAZES.iter().find(|maze| maze.name == spec.simulation()).unwrap();
-        AntMaze::new(maze, spec, environment_seed).unwrap()
-    }
+    use crate::sim::make;
 
     /// The goals of some episodes of one ant.
-    fn goals(name: &str, environment_seed: u64, seeds: &[u64]) -> Vec<[f64; 2]> {
-        let mut ant = ant(name, environment_seed);
+    fn goals(name: &str, environment_seed: u64, seeds: &[u64]) -> Vec<Vec<f64>> {
+        let mut ant = make(find(name).unwrap(), environment_seed).unwrap();
         let goal = |&seed: &u64| {
             ant.reset(seed);
-            ant.goal
+            ant.goal().unwrap().to_vec()
         };
         seeds.iter().map(goal).collect()
     }
@@ -206,15 +117,15 @@ mod tests {
     fn a_goal_is_of_the_environment_s_seed_or_drawn_for_the_episode() {
         for size in ["umaze", "medium", "large"] {
             let kept = format!("antmaze-{size}-v0");
-            let [first, second] = goals(&kept, 5, &[1, 2])[..] else { panic!() };
-            assert_eq!(first, second);
-            assert_eq!(goals(&kept, 5, &[3]), [first]);
-            assert_ne!(goals(&kept, 6, &[1]), [first]);
+            let goal = goals(&kept, 5, &[1]);
+            assert_eq!(goals(&kept, 5, &[2, 3]), [goal[0].clone(), goal[0].clone()]);
+            assert_ne!(goals(&kept, 6, &[1]), goal);
 
             let drawn = format!("antmaze-{size}");
-            let [first, second] = goals(&drawn, 5, &[1, 2])[..] else { panic!() };
-            assert_ne!(first, second);
-            assert_eq!(goals(&drawn, 6, &[2, 1]), [second, first]);
+            let mut two = goals(&drawn, 5, &[1, 2]);
+            assert_ne!(two[0], two[1]);
+            two.reverse();
+            assert_eq!(goals(&drawn, 6, &[2, 1]), two);
         }
     }
 

@@ -7,16 +7,16 @@
 //!
 //! In reading order:
 //!
-//! - `environment`: the traits of an environment; `simulation`: an environment that this program simulates.
-//! - `locomotion` (Hopper, HalfCheetah, Walker2d), `antmaze`: the tasks, with the rules that D4RL's scores are defined by;
-//!   `physics`: drives MuJoCo for them.
-//! - `simulations`: makes an environment by its name in the dataset crate's table.
+//! - `environment`: the traits of an environment; `simulation`: an environment that this program simulates; `physics`: drives
+//!   MuJoCo for it.
+//! - `planar` (Hopper, HalfCheetah, Walker2d), `antmaze`: the tasks, with the rules that D4RL's scores are defined by.
+//! - `simulations`: makes an environment by its row in the dataset crate's table.
 //! - `rollout`: many episodes as one batch, one policy call for each step.
 
 mod antmaze;
 mod environment;
-mod locomotion;
 mod physics;
+mod planar;
 mod rollout;
 mod simulation;
 mod simulations;

@@ -7,6 +7,7 @@ use mujoco_rs::logging::set_log_handler;
 use mujoco_rs::wrappers::mj_data::{MjData, MjtWarning};
 use mujoco_rs::wrappers::mj_logging::MjLogMessage;
 use mujoco_rs::wrappers::mj_model::MjModel;
+use quad_dataset::Noise;
 use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 use rand_distr::{Distribution, StandardNormal};
@@ -14,8 +15,11 @@ use rand_distr::{Distribution, StandardNormal};
 use super::environment::EnvironmentError;
 use super::simulation::RESET_STREAM;
 
-/// The compiled model of a simulation. If the process does not have it yet, it is compiled from the text that `mjcf` writes.
-pub(super) fn model(simulation: &'static str, mjcf: impl FnOnce() -> String) -> Result<Arc<MjModel>, EnvironmentError> {
+/// The compiled model of a simulation. If the process does not have it yet, it is compiled from the text that `mjcf` gives.
+pub(super) fn model(
+    simulation: &'static str,
+    mjcf: impl FnOnce() -> Result<String, EnvironmentError>,
+) -> Result<Arc<MjModel>, EnvironmentError> {
     static MODELS: Mutex<BTreeMap<&str, Arc<MjModel>>> = Mutex::new(BTreeMap::new());
     static LOGGING: Once = Once::new();
     let mut models = MODELS.lock().unwrap_or_else(PoisonError::into_inner);
@@ -24,7 +28,7 @@ pub(super) fn model(simulation: &'static str, mjcf: impl FnOnce() -> String) -> 
     }
     // SAFETY: every use of MuJoCo in this program starts with a compiled model, so none runs before this.
     LOGGING.call_once(|| unsafe { set_log_handler(log) });
-    let model = MjModel::from_xml_string(&mjcf())
+    let model = MjModel::from_xml_string(&mjcf()?)
         .map_err(|error| EnvironmentError::Model { simulation, reason: error.to_string() })?;
     Ok(Arc::clone(models.entry(simulation).or_insert(Arc::new(model))))
 }
@@ -32,15 +36,6 @@ pub(super) fn model(simulation: &'static str, mjcf: impl FnOnce() -> String) -> 
 /// Sends MuJoCo's messages to this program's log. MuJoCo's own handler appends to `MUJOCO_LOG.TXT` in the working directory.
 fn log(message: &MjLogMessage) {
     tracing::debug!(target: "mujoco", "{}", message.subject());
-}
-
-/// Noise on the initial state: added to each position and velocity that the model begins with.
-#[derive(Clone, Copy)]
-pub(super) enum Noise {
-    /// Uniform within ± this.
-    Uniform(f64),
-    /// Positions: uniform within ± this; velocities: normal with this standard deviation.
-    NormalVelocities(f64),
 }
 
 /// The state of one simulation; many share a model.

@@ -1,43 +1,150 @@
 //! A task that this program simulates: it cannot fail, and its state can be set and read.
+//!
+//! Gymnasium does not handle two cases, which here end the episode without reward for that step: a simulation that diverges,
+//! and an action that is not a number (which is not applied). So every return is finite.
 
-use super::environment::Step;
+use quad_dataset::{EnvironmentSpec, Noise};
+
+use super::environment::{Environment, EnvironmentError, Step};
+use super::physics::Physics;
 
 /// The stream that initial states are drawn from, among those of an episode's seed.
 pub(super) const RESET_STREAM: u64 = 1;
 /// The stream that a goal is drawn from, among those of an episode's or an environment's seed.
 pub(super) const GOAL_STREAM: u64 = 4;
 
-/// One simulated task, with the semantics of D4RL's files.
-///
-/// Positions `qpos`, velocities `qvel` and observations are MuJoCo's own `f64`; a rollout rounds them to `f32` for the policy.
-pub trait Simulation: Send {
-    /// Starts an episode. The noise on the initial state comes from a stream of `seed`, so an episode is a function of its
-    /// seed and its actions only.
-    fn reset(&mut self, seed: u64);
+/// The rules of a task.
+pub(super) trait Task: Send {
+    /// The reward of the step that has just been taken from `x`, the first position, and whether it terminated the episode.
+    fn judge(&self, x: f64, physics: &Physics) -> (f64, bool);
 
-    /// Starts an episode in a given state (`nq` positions, `nv` velocities).
-    fn set_state(&mut self, qpos: &[f64], qvel: &[f64]);
+    /// Draws what an episode of this seed has of its own.
+    fn begin(&mut self, _seed: u64) {}
 
-    /// Moves the goal (x and y, metres) until it is drawn again; does nothing in a task without a goal.
+    /// Moves the goal.
     fn set_goal(&mut self, _goal: &[f64]) {}
 
-    /// The position of the goal (x and y, metres), in a task that has one.
+    /// Where the goal is, in a task that has one.
     fn goal(&self) -> Option<&[f64]> {
         None
     }
+}
+
+/// How a robot begins, and what a policy observes of it: positions, then velocities.
+pub(super) struct Body {
+    /// Noise on the initial state.
+    pub noise: Noise,
+    /// How many of the first positions are not observed.
+    pub hidden_positions: usize,
+    /// Limit of each observed velocity.
+    pub observed_velocity: f64,
+}
+
+/// One simulated task, with the semantics of D4RL's files.
+///
+/// Positions `qpos`, velocities `qvel` and observations are MuJoCo's own `f64`; a rollout rounds them to `f32` for the policy.
+pub struct Simulation {
+    physics: Physics,
+    body: Body,
+    task: Box<dyn Task>,
+    observation: Vec<f64>,
+    steps: usize,
+    spec: &'static EnvironmentSpec,
+}
+
+impl Simulation {
+    /// A simulation that waits for its first [`reset`](Self::reset).
+    pub(super) fn new(physics: Physics, body: Body, task: Box<dyn Task>, spec: &'static EnvironmentSpec) -> Self {
+        let observation = vec![0.0; spec.observation_dim];
+        Self { physics, body, task, observation, steps: 0, spec }
+    }
+
+    /// Starts an episode. The noise on the initial state comes from a stream of `seed`, so an episode is a function of its
+    /// seed and its actions only.
+    pub fn reset(&mut self, seed: u64) {
+        self.task.begin(seed);
+        self.physics.reset(seed, self.body.noise);
+        self.start();
+    }
+
+    /// Starts an episode in a given state (`nq` positions, `nv` velocities).
+    pub fn set_state(&mut self, qpos: &[f64], qvel: &[f64]) {
+        self.physics.set_state(qpos, qvel);
+        self.start();
+    }
+
+    /// Moves the goal (x and y, metres) until it is drawn again; does nothing in a task without a goal.
+    pub fn set_goal(&mut self, goal: &[f64]) {
+        self.task.set_goal(goal);
+    }
+
+    /// The position of the goal (x and y, metres), in a task that has one.
+    pub fn goal(&self) -> Option<&[f64]> {
+        self.task.goal()
+    }
 
     /// Applies `action` (`action_dim` values, clipped to [-1, 1]) for one control period.
-    fn step(&mut self, action: &[f32]) -> Step;
+    pub fn step(&mut self, action: &[f32]) -> Step {
+        self.steps += 1;
+        let truncated = self.steps >= self.spec.max_episode_steps;
+        let x = self.physics.qpos()[0];
+        let went_on = self.physics.step(action);
+        self.observe();
+        let (reward, terminated) = if went_on { self.task.judge(x, &self.physics) } else { (0.0, true) };
+        Step { reward, terminated, truncated }
+    }
 
     /// Simulated time of a step, seconds.
-    fn control_period(&self) -> f64;
+    pub fn control_period(&self) -> f64 {
+        self.physics.dt()
+    }
 
     /// The current observation, `observation_dim` values.
-    fn observation(&self) -> &[f64];
+    pub fn observation(&self) -> &[f64] {
+        &self.observation
+    }
 
     /// The current generalised positions.
-    fn qpos(&self) -> &[f64];
+    pub fn qpos(&self) -> &[f64] {
+        self.physics.qpos()
+    }
 
     /// The current generalised velocities.
-    fn qvel(&self) -> &[f64];
+    pub fn qvel(&self) -> &[f64] {
+        self.physics.qvel()
+    }
+
+    fn start(&mut self) {
+        self.steps = 0;
+        self.observe();
+    }
+
+    fn observe(&mut self) {
+        let Body { hidden_positions, observed_velocity: limit, .. } = self.body;
+        let (positions, velocities) = self.observation.split_at_mut(self.physics.qpos().len() - hidden_positions);
+        positions.copy_from_slice(&self.physics.qpos()[hidden_positions..]);
+        for (observed, velocity) in velocities.iter_mut().zip(self.physics.qvel()) {
+            *observed = velocity.clamp(-limit, limit);
+        }
+    }
+}
+
+/// With D4RL's normalised score.
+impl Environment for Simulation {
+    fn reset(&mut self, seed: u64) -> Result<(), EnvironmentError> {
+        self.reset(seed);
+        Ok(())
+    }
+
+    fn step(&mut self, action: &[f32]) -> Result<Step, EnvironmentError> {
+        Ok(self.step(action))
+    }
+
+    fn observation(&self) -> &[f64] {
+        self.observation()
+    }
+
+    fn score(&mut self, episode_return: f64) -> Result<f64, EnvironmentError> {
+        Ok(self.spec.normalised_score(episode_return))
+    }
 }

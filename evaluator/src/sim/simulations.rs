@@ -1,25 +1,48 @@
-//! Makes environments by their names in the dataset crate's table
-//! ([`EnvironmentSpec`](quad_dataset::environment::EnvironmentSpec)), which has a task's sizes, time limit and score references.
+//! Makes environments by their rows in the dataset crate's table ([`EnvironmentSpec`]).
 
-use quad_dataset::environment::{self, EnvironmentSpec};
+use quad_dataset::Planar;
+use quad_dataset::environment::{self, EnvironmentSpec, Goal};
 
-use super::antmaze::{AntMaze, MAZES, Maze};
-use super::environment::{Environment, EnvironmentError, Environments, Step};
-use super::locomotion::{Locomotion, ROBOTS, Robot};
+use super::antmaze::{self, AntMaze, Maze};
+use super::environment::{Environment, EnvironmentError, Environments};
+use super::physics::{self, Physics};
+use super::planar;
 use super::simulation::Simulation;
 
-/// What simulates an environment.
-enum Kind {
-    Locomotion(&'static Robot),
-    AntMaze(&'static Maze),
+/// The models in `evaluator/assets` by their names, as MJCF, which the build lists.
+static MODELS: &[(&str, &str)] = include!(concat!(env!("OUT_DIR"), "/models.rs"));
+
+/// What simulates an environment, and the name that its compiled model is kept under.
+struct Kind {
+    name: &'static str,
+    rules: Rules,
+}
+
+enum Rules {
+    Planar(&'static Planar),
+    Maze(Maze),
 }
 
 impl Kind {
     fn of(spec: &EnvironmentSpec) -> Result<Self, EnvironmentError> {
-        let name = spec.simulation();
-        let robot = ROBOTS.iter().find(|robot| robot.name == name).map(Self::Locomotion);
-        let maze = MAZES.iter().find(|maze| maze.name == name).map(Self::AntMaze);
-        robot.or(maze).ok_or_else(|| EnvironmentError::NotSimulated(name.to_owned()))
+        let row = environment::find(spec.simulation()).ok();
+        let planar = row.and_then(|row| row.planar.as_ref()).map(Rules::Planar);
+        let rules = planar.or_else(|| row?.maze.as_deref().map(|map| Rules::Maze(Maze(map))));
+        let not_simulated = || EnvironmentError::NotSimulated(spec.simulation().to_owned());
+        let (row, rules) = row.zip(rules).ok_or_else(not_simulated)?;
+        Ok(Self { name: &row.name, rules })
+    }
+
+    fn mjcf(&self) -> Result<String, EnvironmentError> {
+        let file = |name: &str| {
+            let found = MODELS.iter().find(|(model, _)| *model == name).map(|(_, mjcf)| *mjcf);
+            let reason = || format!("evaluator/assets/{name}.xml is missing");
+            found.ok_or_else(|| EnvironmentError::Model { simulation: self.name, reason: reason() })
+        };
+        match self.rules {
+            Rules::Planar(_) => file(self.name).map(str::to_owned),
+            Rules::Maze(maze) => file("ant").map(|ant| maze.mjcf(ant)),
+        }
     }
 }
 
@@ -35,10 +58,17 @@ pub fn simulated() -> impl Iterator<Item = &'static EnvironmentSpec> {
 /// # Errors
 ///
 /// This program does not simulate the environment, or MuJoCo fails.
-pub fn make(spec: &EnvironmentSpec, environment_seed: u64) -> Result<Box<dyn Simulation>, EnvironmentError> {
-    Ok(match Kind::of(spec)? {
-        Kind::Locomotion(robot) => Box::new(Locomotion::new(robot, spec)?),
-        Kind::AntMaze(maze) => Box::new(AntMaze::new(maze, spec, environment_seed)?),
+pub fn make(spec: &'static EnvironmentSpec, environment_seed: u64) -> Result<Simulation, EnvironmentError> {
+    let kind = Kind::of(spec)?;
+    let model = physics::model(kind.name, || kind.mjcf())?;
+    Ok(match kind.rules {
+        Rules::Planar(robot) => {
+            Simulation::new(Physics::new(model, robot.frame_skip)?, planar::body(robot), Box::new(robot), spec)
+        }
+        Rules::Maze(maze) => {
+            let task = AntMaze::new(maze, spec.goal.unwrap_or(Goal::EachEpisode), environment_seed);
+            Simulation::new(Physics::new(model, antmaze::FRAME_SKIP)?, antmaze::BODY, Box::new(task), spec)
+        }
     })
 }
 
@@ -56,32 +86,7 @@ impl Environments for Simulations {
 
     fn make(&self, name: &str, environment_seed: u64) -> Result<Box<dyn Environment>, EnvironmentError> {
         let spec = environment::find(name).map_err(|_| EnvironmentError::NotSimulated(name.to_owned()))?;
-        Ok(Box::new(Simulated { simulation: make(spec, environment_seed)?, spec }))
-    }
-}
-
-/// A simulation of this program as an environment, with D4RL's normalised score.
-struct Simulated {
-    simulation: Box<dyn Simulation>,
-    spec: &'static EnvironmentSpec,
-}
-
-impl Environment for Simulated {
-    fn reset(&mut self, seed: u64) -> Result<(), EnvironmentError> {
-        self.simulation.reset(seed);
-        Ok(())
-    }
-
-    fn step(&mut self, action: &[f32]) -> Result<Step, EnvironmentError> {
-        Ok(self.simulation.step(action))
-    }
-
-    fn observation(&self) -> &[f64] {
-        self.simulation.observation()
-    }
-
-    fn score(&mut self, episode_return: f64) -> Result<f64, EnvironmentError> {
-        Ok(self.spec.normalised_score(episode_return))
+        Ok(Box::new(make(spec, environment_seed)?))
     }
 }
 
@@ -90,10 +95,7 @@ impl Environment for Simulated {
 /// # Errors
 /// This program does not simulate the environment.
 pub fn mjcf(spec: &EnvironmentSpec) -> Result<String, EnvironmentError> {
-    Ok(match Kind::of(spec)? {
-        Kind::Locomotion(robot) => robot.mjcf.to_owned(),
-        Kind::AntMaze(maze) => maze.mjcf(),
-    })
+    Kind::of(spec)?.mjcf()
 }
 
 #[cfg(test)]
@@ -115,10 +117,10 @@ mod tests {
     fn an_environment_without_simulation_is_refused() {
         let spec: EnvironmentSpec = serde_json::from_value(serde_json::json!({
             "name": "cartpole", "observation_dim": 4, "action_dim": 1, "qpos_dim": 2, "qvel_dim": 2,
-            "max_episode_steps": 200, "reference_returns": [0.0, 1.0], "reward": "locomotion",
+            "max_episode_steps": 200, "reference_returns": [0.0, 1.0], "reward": "locomotion", "collect": {"none": "a test"},
         }))
         .unwrap();
-        let error = make(&spec, 0).err().unwrap();
+        let error = make(Box::leak(Box::new(spec)), 0).err().unwrap();
         assert!(matches!(&error, EnvironmentError::NotSimulated(name) if name == "cartpole"), "{error}");
     }
 }

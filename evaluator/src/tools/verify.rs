@@ -130,7 +130,7 @@ pub fn verify(path: &Path, spec: &'static EnvironmentSpec) -> Result<Report, Ver
         .flat_map_iter(|(thread, environment)| {
             let rows = &rows;
             let own = thread * share..rows.len().min((thread + 1) * share);
-            own.map(move |i| replay(environment.as_mut(), &rows.row(i), rows.goal(i)))
+            own.map(move |i| replay(environment, &rows.row(i), rows.goal(i)))
         })
         .collect();
     summarise(spec, &errors).ok_or_else(|| VerifyError::Empty(path.into()))
@@ -143,7 +143,7 @@ struct RowError {
     terminal_differs: bool,
 }
 
-fn replay(environment: &mut dyn Simulation, row: &Row<'_>, goal: Option<&[f64]>) -> RowError {
+fn replay(environment: &mut Simulation, row: &Row<'_>, goal: Option<&[f64]>) -> RowError {
     if let Some(goal) = goal {
         environment.set_goal(goal);
     }

@@ -3,7 +3,6 @@
 use quad_dataset::DatasetError;
 use thiserror::Error;
 
-use super::recipe::Recipe;
 use crate::sim::EnvironmentError;
 
 /// Why nothing was recorded.
@@ -13,10 +12,12 @@ pub enum CollectError {
     #[error(transparent)]
     Dataset(#[from] DatasetError),
     /// Nothing is recorded in that environment.
-    #[error("nothing can be recorded in {environment}: linear policies learn {} alone", Recipe::environments())]
+    #[error("nothing can be recorded in {environment}: {reason}")]
     NoRecipe {
         /// The environment.
-        environment: String,
+        environment: &'static str,
+        /// Why not.
+        reason: &'static str,
     },
     /// The environment could not be made.
     #[error(transparent)]

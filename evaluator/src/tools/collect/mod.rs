@@ -1,26 +1,24 @@
 //! Records a dataset of mediocre behaviour, so that a new machine needs no download.
 //!
-//! Following an environment's `recipe`, `search` trains `linear` policies, and `record` mixes episodes of all of them, from
+//! Following the recipe in an environment's row, `search` trains `linear` policies, and `record` mixes episodes of all of them, from
 //! the first to the last, into one file in D4RL's layout. The result resembles D4RL's "medium-replay", the replay buffer of a
 //! learning policy. The file is a function of the number of transitions and the seed; the number of threads does not change
 //! it.
 
 mod error;
 mod linear;
-mod recipe;
 mod record;
 mod search;
 
 use std::path::Path;
 use std::time::Instant;
 
-use quad_dataset::environment::find;
-use quad_dataset::{D4rlWriter, EnvironmentSpec, Metadata};
+use quad_dataset::environment::{all, find};
+use quad_dataset::{Collect, D4rlWriter, EnvironmentSpec, Metadata, Recipe};
 use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;
 
 pub use error::CollectError;
-use recipe::Recipe;
 
 /// The streams of the file's seed: one for recording, the next ones for the searches.
 const RECORD_STREAM: u64 = 0;
@@ -47,8 +45,17 @@ pub struct Summary {
 /// # Errors
 /// It cannot; the text lists the possible environments.
 pub fn environment(name: &str) -> Result<&'static EnvironmentSpec, String> {
-    let found = find(name).ok().filter(|spec| Recipe::of(spec).is_some());
-    found.ok_or_else(|| format!("what can be recorded is {}", Recipe::environments()))
+    let found = find(name).map_err(|_| format!("there is no environment `{name}`"));
+    let found = found.and_then(|spec| recipe(spec).map(|_| spec).map_err(|error| error.to_string()));
+    let possible = all().iter().filter(|spec| recipe(spec).is_ok()).map(|spec| spec.name.as_str());
+    found.map_err(|error| format!("{error}; what can be recorded is {}", possible.collect::<Vec<_>>().join(", ")))
+}
+
+fn recipe(spec: &'static EnvironmentSpec) -> Result<&'static Recipe, CollectError> {
+    match &spec.collect {
+        Collect::Recipe(recipe) => Ok(recipe),
+        Collect::None(reason) => Err(CollectError::NoRecipe { environment: &spec.name, reason }),
+    }
 }
 
 /// Trains, then records at least `transitions` transitions, in whole episodes, to `path`.
@@ -59,8 +66,7 @@ pub fn collect(
     seed: u64,
 ) -> Result<Summary, CollectError> {
     let start = Instant::now();
-    let no_recipe = || CollectError::NoRecipe { environment: spec.name.clone() };
-    let recipe = Recipe::of(spec).ok_or_else(no_recipe)?;
+    let recipe = recipe(spec)?;
     let mut writer = D4rlWriter::create(path, spec)?;
 
     let policies = search::train(spec, recipe, transitions, |index| stream(seed, RECORD_STREAM + 1 + index))?;

@@ -1,6 +1,6 @@
 //! Mixes episodes of a search's policies, from the first to the last, into one dataset.
 
-use quad_dataset::{D4rlWriter, EnvironmentSpec, Row};
+use quad_dataset::{D4rlWriter, EnvironmentSpec, Recipe, Row};
 use quad_runtime::ProgressBar;
 use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
@@ -9,7 +9,6 @@ use rayon::prelude::*;
 
 use super::error::CollectError;
 use super::linear::LinearPolicy;
-use super::recipe::Recipe;
 use crate::sim::{self, EnvironmentError, Simulation, Step};
 
 /// Each episode adds Gaussian noise to its actions (which span ±1). Its standard deviation is drawn uniformly from this range:
@@ -37,7 +36,7 @@ pub fn record(
     writer: &mut D4rlWriter,
 ) -> Result<Vec<f64>, CollectError> {
     let mut recorders = (0..ROUND).map(|_| Recorder::new(spec)).collect::<Result<Vec<_>, EnvironmentError>>()?;
-    let mixture = recipe.mixture;
+    let mixture = &recipe.mixture;
     let mut room: Vec<f64> = mixture.iter().map(|(_, share)| share * transitions as f64).collect();
     let mut scores = Vec::new();
     let mut simulated = 0;
@@ -75,7 +74,7 @@ pub fn record(
 /// An environment and its last episode.
 struct Recorder {
     spec: &'static EnvironmentSpec,
-    environment: Box<dyn Simulation>,
+    environment: Simulation,
     /// (steps + 1) × observation_dim, also the next two fields: from the state before the first step to that after the last.
     observations: Vec<f64>,
     qpos: Vec<f64>,

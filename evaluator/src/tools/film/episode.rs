@@ -2,7 +2,6 @@
 
 use std::sync::mpsc::{Sender, channel};
 
-use quad_dataset::EnvironmentSpec;
 use quad_protocol::episode_seeds;
 
 use crate::sim::{self, Environment, EnvironmentError, Simulation, Step};
@@ -42,7 +41,7 @@ impl Episode {
         let (told, poses) = channel();
         let watched = || -> Result<Box<dyn Environment>, EnvironmentError> {
             let simulation = sim::make(subject.spec, environment_seed)?;
-            Ok(Box::new(Watched { simulation, spec: subject.spec, episode_return: 0.0, told: told.clone() }))
+            Ok(Box::new(Watched { simulation, episode_return: 0.0, told: told.clone() }))
         };
         subject.roll_out(watched, &[seed])?;
         let choice = subject.policy.choice().map_or_else(|| "no candidates".to_owned(), |choice| choice.to_string());
@@ -70,8 +69,7 @@ impl Episode {
 
 /// A simulation that reports each of its poses.
 struct Watched {
-    simulation: Box<dyn Simulation>,
-    spec: &'static EnvironmentSpec,
+    simulation: Simulation,
     episode_return: f64,
     told: Sender<Pose>,
 }
@@ -104,7 +102,7 @@ impl Environment for Watched {
     }
 
     fn score(&mut self, episode_return: f64) -> Result<f64, EnvironmentError> {
-        Ok(self.spec.normalised_score(episode_return))
+        self.simulation.score(episode_return)
     }
 }
 

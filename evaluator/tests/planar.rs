@@ -1,16 +1,18 @@
-//! What the locomotion robots do at the edges: limits, clipping, numbers that are none.
+//! What planar robots do at the edges: limits, clipping, numbers that are none.
 #![allow(clippy::unwrap_used)]
 
-use quad_dataset::environment::find;
+use quad_dataset::environment::{all, find};
 use quad_evaluator::sim::{Simulation, Step, make};
 
-const ROBOTS: [&str; 3] = ["hopper", "halfcheetah", "walker2d"];
+fn robots() -> impl Iterator<Item = &'static str> {
+    all().iter().filter(|spec| spec.planar.is_some()).map(|spec| spec.name.as_str())
+}
 
-fn robot(name: &str) -> Box<dyn Simulation> {
+fn robot(name: &str) -> Simulation {
     make(find(name).unwrap(), 0).unwrap()
 }
 
-fn hopper() -> Box<dyn Simulation> {
+fn hopper() -> Simulation {
     robot("hopper")
 }
 
@@ -24,7 +26,7 @@ const AT_REST: [f64; 6] = [0.0; 6];
 
 #[test]
 fn an_episode_is_a_function_of_its_seed() {
-    for name in ROBOTS {
+    for name in robots() {
         let (mut one, mut other) = (robot(name), robot(name));
         one.reset(7);
         one.step(&actions(name, 1.0));
@@ -185,7 +187,7 @@ fn the_time_limit_truncates_and_does_not_terminate() {
 #[test]
 fn what_is_not_a_number_ends_the_episode_without_reward() {
     let end = Step { reward: 0.0, terminated: true, truncated: false };
-    for name in ROBOTS {
+    for name in robots() {
         let mut robot = robot(name);
         robot.reset(0);
         let mut action = actions(name, 0.0);

@@ -1,0 +1,87 @@
+//! The numbers in an environment's row by which evaluators simulate it and record data in it.
+
+use serde::Deserialize;
+
+/// A robot in a vertical plane that is rewarded for running along x. Positions begin with its x, z (metres) and pitch (radians);
+/// a policy observes all but x, then the velocities.
+#[derive(Debug, PartialEq, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Planar {
+    /// Steps of the model that a control is held for.
+    pub frame_skip: usize,
+    /// Noise on the initial state.
+    pub noise: Noise,
+    /// Reward of every step.
+    pub alive_bonus: f64,
+    /// Cost of a squared action.
+    pub control_cost: f64,
+    /// Limit of each observed velocity.
+    #[serde(default = "unlimited")]
+    pub observed_velocity: f64,
+    /// Within which limits an episode goes on; without any it always does.
+    #[serde(default)]
+    pub healthy: Option<Healthy>,
+}
+
+fn unlimited() -> f64 {
+    f64::INFINITY
+}
+
+/// Noise on the initial state: added to each position and velocity that the model begins with.
+#[derive(Clone, Copy, Debug, PartialEq, Deserialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum Noise {
+    /// Uniform within ± this.
+    Uniform(f64),
+    /// Positions: uniform within ± this; velocities: normal with this standard deviation.
+    NormalVelocities(f64),
+}
+
+/// Limits, themselves excluded, within which an episode goes on.
+#[derive(Debug, PartialEq, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Healthy {
+    /// Height of the torso, metres.
+    pub z: (f64, f64),
+    /// Pitch of the torso, radians.
+    pub pitch: (f64, f64),
+    /// Limit of every position but x and z, and of every velocity.
+    #[serde(default)]
+    pub others: Option<f64>,
+}
+
+impl Healthy {
+    /// Whether an episode goes on in a state. False for NaN, because no comparison with NaN holds.
+    pub fn contains(&self, qpos: &[f64], qvel: &[f64]) -> bool {
+        let within = |(least, most): (f64, f64), value: f64| value > least && value < most;
+        let mut others = qpos[2..].iter().chain(qvel);
+        within(self.z, qpos[1])
+            && within(self.pitch, qpos[2])
+            && self.others.is_none_or(|limit| others.all(|value| value.abs() < limit))
+    }
+}
+
+/// Whether a dataset of mediocre behaviour can be recorded in an environment.
+#[derive(Debug, PartialEq, Deserialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum Collect {
+    /// How.
+    Recipe(Recipe),
+    /// Why not.
+    None(String),
+}
+
+/// How a dataset is recorded.
+#[derive(Debug, PartialEq, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Recipe {
+    /// Independent searches. Each finds its own gait, so that the recorded actions in a state differ by more than noise.
+    pub searches: u64,
+    /// Steps that the searches may take for each recorded transition.
+    pub steps_per_transition: u64,
+    /// Bands of normalised score: the lower bound of each, and its share of the transitions.
+    ///
+    /// Without shares, a search's history is mostly long, good episodes, from which offline learning can gain little. The
+    /// shares make a mixture with any seed: good actions exist, among worse ones in the same states.
+    pub mixture: Vec<(f64, f64)>,
+}
