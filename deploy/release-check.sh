@@ -72,11 +72,14 @@ summary=() failed=0
 for name; do
   say "$name: $(command_of "$name" | head -n 1)"
   SECONDS=0
-  if check "$name"; then verdict=passed; else
-    verdict=FAILED failed=1
+  status=0
+  check "$name" || status=$?
+  verdict=passed
+  if [ $status -gt 0 ]; then
     tail -n 15 "$LOGS/$name.log" >&2
+    verdict="FAILED with exit code $status" failed=1
   fi
-  summary+=("$(printf '%-18s %-7s %4d min' "$name" $verdict $(((SECONDS + 59) / 60)))")
+  summary+=("$(printf '%-18s %4d min  %s' "$name" $(((SECONDS + 59) / 60)) "$verdict")")
 done
 printf '%s\n' "${summary[@]}"
 exit $failed
