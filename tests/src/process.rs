@@ -114,11 +114,12 @@ impl Process {
         assert!(status.success(), "{} ended with {status}", self.name);
     }
 
-    /// Tells it to leave; how it ended. Our programs end themselves with exit code 130 if they take longer than nine seconds, so
-    /// another code shows that it left in time, by a clock that begins when the program gets the signal.
+    /// Tells it to leave; how it ended. It must not have taken longer than it may, by the clock that it starts with the signal.
     pub fn terminate(&mut self, patience: Duration) -> ExitStatus {
         self.signal("TERM");
-        self.wait(patience)
+        let status = self.wait(patience);
+        assert!(!self.log().contains("something still hangs"), "{} had to end itself", self.name);
+        status
     }
 }
 

@@ -122,7 +122,9 @@ impl<L: Line> System<L> {
                 self.restart(program, victim);
             }
             Fault::Stop(program) => {
-                self.process(program, victim).terminate(PATIENCE);
+                let process = self.process(program, victim);
+                process.signal("TERM");
+                process.wait(PATIENCE);
                 self.restart(program, victim);
             }
             Fault::Freeze(program) => {

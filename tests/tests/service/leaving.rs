@@ -3,8 +3,10 @@
 use std::io::{PipeReader, Write};
 use std::os::fd::OwnedFd;
 use std::process::{Child, Command, Stdio};
+use std::time::Instant;
 
 use quad_protocol::keys;
+use quad_runtime::LEAVE_WITHIN;
 use quad_tests::made_up::name;
 use quad_tests::process::binary;
 use quad_tests::router::{router, router_without_scores};
@@ -21,11 +23,14 @@ fn full_pipe() -> (OwnedFd, PipeReader) {
     (writer.into(), reader)
 }
 
-/// The exit code of a program that is told to leave. One that takes longer than it may ends itself, with 130.
+/// The exit code of a program that is told to leave, and does so before it has to end itself.
 fn leaves(mut child: Child) -> Option<i32> {
+    let begin = Instant::now();
     let signal = format!("kill -TERM {}", child.id());
     assert!(Command::new("sh").args(["-c", &signal]).status().unwrap().success());
-    eventually("it has left", PATIENCE, || child.try_wait().unwrap()).code()
+    let status = eventually("it has left", PATIENCE, || child.try_wait().unwrap());
+    assert!(begin.elapsed() < LEAVE_WITHIN, "it took {:?}", begin.elapsed());
+    status.code()
 }
 
 #[test]
