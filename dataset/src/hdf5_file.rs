@@ -14,7 +14,7 @@ use hdf5::{Container, H5Type, IndexType, IterationOrder, LinkType};
 
 use crate::array::Array;
 use crate::error::{DatasetError, Problem};
-use crate::formats::foreign;
+use crate::foreign;
 
 /// The first bytes of an HDF5 file.
 pub const SIGNATURE: &[u8] = b"\x89HDF\r\n\x1a\n";

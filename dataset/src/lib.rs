@@ -3,12 +3,13 @@
 //!
 //! # Layout
 //! In reading order: [`environment`] is all that is known of an environment, `simulated` that part of it by which evaluators
-//! simulate it; `task` is one that may be unknown. `hdf5_file` and `npz_file` read one `array` of a file and check everything about its form; `formats` has a
-//! file for each format, which turns arrays into a `recording`. `transitions` are what is learnt from, unless `checks`
-//! has objections, with `reward`, `scale` and `statistics` beside it; `doubts` and `resets` are what makes learning from them
-//! doubtful; `sampler` draws mini-batches; `inspect` describes a source to people, whatever is wrong with it. `recorded` is a D4RL file as it was recorded, row by row; `writer` writes such a file, and `arrays`
-//! one of people's own layout, both by `new_file`;
-//! [`catalogue`] lists the files that can be asked for by name; `error` is what can go wrong with any of them.
+//! simulate it; `task` is one that may be unknown. `hdf5_file` and `npz_file` read one `array` of a file and check everything
+//! about its form; `foreign` names what is not read here. `formats` has a file for each format, which turns arrays into a
+//! `recording`. `transitions` are what is learnt from, unless `checks` has objections, with `reward`, `scale` and `statistics`
+//! beside it; `doubts` and `resets` are what makes learning from them doubtful; `sampler` draws mini-batches; `inspect`
+//! describes a source to people, whatever is wrong with it. `recorded` is a D4RL file as it was recorded, row by row; `writer`
+//! writes such a file, and `arrays` one of people's own layout, both by `new_file`. [`catalogue`] lists the files that can be
+//! asked for by name; `error` is what can go wrong with any of them.
 //!
 //! This crate knows nothing of networks, simulators or the wire.
 
@@ -21,6 +22,7 @@ mod checks;
 mod doubts;
 pub mod environment;
 mod error;
+mod foreign;
 mod formats;
 mod hdf5_file;
 mod inspect;

@@ -11,7 +11,7 @@ use zip::result::ZipError;
 
 use crate::array::Array;
 use crate::error::{DatasetError, Problem};
-use crate::formats::foreign;
+use crate::foreign;
 
 /// The first bytes of a zip file.
 pub(crate) const SIGNATURE: &[u8] = b"PK";

@@ -1,7 +1,6 @@
-//! The formats that are read, each to one [`Recording`]; `foreign` names others.
+//! The formats that are read, each to one [`Recording`].
 
 mod d4rl;
-pub(crate) mod foreign;
 mod minari;
 mod ogbench;
 mod own;
@@ -12,6 +11,7 @@ use std::path::{Path, PathBuf};
 
 use crate::environment::{self, EnvironmentSpec};
 use crate::error::{DatasetError, Problem};
+use crate::foreign;
 use crate::hdf5_file::{self, Hdf5File};
 use crate::npz_file::{self, NpzFile};
 use crate::recording::Recording;
@@ -60,7 +60,7 @@ impl Source {
             Some(found) => return Err(file.error(Problem::UnknownLayout { found })),
             None => {}
         }
-        if let Some(problem) = foreign::of_hdf5(&file) {
+        if let Some(problem) = file.members("data").and_then(|members| foreign::of_group(&members)) {
             return Err(file.error(problem));
         }
         let is_minari = file.path().ends_with(minari::DATA_FILE) || file.has("episode_0");

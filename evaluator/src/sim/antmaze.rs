@@ -18,8 +18,10 @@ use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 
 use super::physics::Physics;
-use super::simulation::{Body, GOAL_STREAM, Task};
+use super::simulation::{Body, Task};
 
+/// The stream that a goal is drawn from, among those of an episode's or an environment's seed.
+const GOAL_STREAM: u64 = 4;
 /// Where the model of the ant on its floor has the walls.
 const WALLS: &str = "<!-- walls -->";
 /// Side of a maze's cell, metres.

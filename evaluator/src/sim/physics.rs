@@ -13,7 +13,9 @@ use rand_chacha::ChaCha8Rng;
 use rand_distr::{Distribution, StandardNormal};
 
 use super::environment::EnvironmentError;
-use super::simulation::RESET_STREAM;
+
+/// The stream that initial states are drawn from, among those of an episode's seed.
+const RESET_STREAM: u64 = 1;
 
 /// The compiled model of a simulation. If the process does not have it yet, it is compiled from the text that `mjcf` gives.
 pub(super) fn model(

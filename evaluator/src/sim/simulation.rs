@@ -8,11 +8,6 @@ use quad_dataset::{EnvironmentSpec, Noise};
 use super::environment::{Environment, EnvironmentError, Step};
 use super::physics::Physics;
 
-/// The stream that initial states are drawn from, among those of an episode's seed.
-pub(super) const RESET_STREAM: u64 = 1;
-/// The stream that a goal is drawn from, among those of an episode's or an environment's seed.
-pub(super) const GOAL_STREAM: u64 = 4;
-
 /// The rules of a task.
 pub(super) trait Task: Send {
     /// The reward of the step that has just been taken from `x`, the first position, and whether it terminated the episode.

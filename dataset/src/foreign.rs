@@ -6,7 +6,6 @@ use std::path::Path;
 use serde_json::Value;
 
 use crate::error::Problem;
-use crate::hdf5_file::Hdf5File;
 
 /// How many bytes of a file tell what it is.
 pub(crate) const START: u64 = 256;
@@ -51,7 +50,7 @@ pub(crate) fn of_start(start: &[u8]) -> Problem {
 }
 
 /// What a folder is that is no Minari dataset in HDF5.
-pub(super) fn of_folder(folder: &Path) -> Problem {
+pub(crate) fn of_folder(folder: &Path) -> Problem {
     let text = |file: &str, key: &str| {
         let json: Value = serde_json::from_slice(&fs::read(folder.join(file)).ok()?).ok()?;
         json[key].as_str().map(str::to_owned)
@@ -68,9 +67,9 @@ pub(super) fn of_folder(folder: &Path) -> Problem {
     }
 }
 
-/// What an HDF5 file is that has another layout.
-pub(super) fn of_hdf5(file: &Hdf5File) -> Option<Problem> {
-    let demonstrations = file.members("data")?.iter().any(|name| name.starts_with("demo_"));
+/// What an HDF5 file is that has another layout, by what its group `data` holds.
+pub(crate) fn of_group(members: &[String]) -> Option<Problem> {
+    let demonstrations = members.iter().any(|name| name.starts_with("demo_"));
     let load = "load each data/demo_N by h5py: actions, rewards, dones, and from its obs the arrays that the policy is to \
                 see, side by side";
     demonstrations.then(|| foreign("a robomimic file", load))
