@@ -1,6 +1,6 @@
 //! Groups runs that differ only in their seed.
 
-use std::collections::BTreeSet;
+use std::collections::{BTreeMap, BTreeSet};
 use std::path::PathBuf;
 
 use quad_dataset::{Goal, environment};
@@ -22,8 +22,8 @@ pub struct GroupReport {
     pub algorithm: String,
     /// The variant of the algorithm: the kind of guidance for QUAD, such as `quad`, `dac` and `none`, or another algorithm's name.
     pub variant: String,
-    /// What tables and figures call these runs: the variant and, of the settings in which other runs of it on the task differ, those
-    /// that are not the task's own.
+    /// What tables and figures call these runs: the variant and, if other runs of it have another value of a setting, on whatever
+    /// task, that setting where it is not the task's own.
     pub method: String,
     /// The hyper-parameters that matter most.
     pub agent: String,
@@ -101,37 +101,60 @@ impl GroupReport {
     }
 }
 
+/// Runs that agree in all but their seed, and have come as far.
+struct Alike<'a> {
+    /// Algorithm and variant.
+    method: [&'a str; 2],
+    /// Without the seed.
+    settings: Settings,
+    /// The task's own values for the method; none for a task that is not known here.
+    given: Settings,
+    runs: Vec<&'a RunReport>,
+}
+
+impl Alike<'_> {
+    /// Whether the value is the task's own, as its data are.
+    fn has_own(&self, key: &str) -> bool {
+        self.given.is_empty() || key.starts_with("dataset.") || self.given.get(key) == self.settings.get(key)
+    }
+}
+
 /// Sorts runs into groups, in the order in which they are given.
 pub fn groups(runs: &[RunReport], select: Select) -> Vec<GroupReport> {
-    let mut groups: Vec<(Settings, Vec<&RunReport>)> = Vec::new();
+    let mut groups: Vec<Alike> = Vec::new();
     for run in runs {
         let mut settings = settings::of_run(&run.config);
         settings.remove("seed");
-        let is_alike = |(known, members): &&mut (Settings, Vec<&RunReport>)| {
-            let has_come_as_far = members[0].reached() == run.reached() || run.reached() == Some(0);
-            members[0].task == run.task && *known == settings && has_come_as_far
+        let is_alike = |Alike { settings: known, runs, .. }: &&mut Alike| {
+            let has_come_as_far = runs[0].reached() == run.reached() || run.reached() == Some(0);
+            runs[0].task == run.task && *known == settings && has_come_as_far
         };
         match groups.iter_mut().find(is_alike) {
-            Some((_, members)) => members.push(run),
-            None => groups.push((settings, vec![run])),
+            Some(group) => group.runs.push(run),
+            None => {
+                let given = as_given(run, true).map(|given| settings::of_experiment(&given)).unwrap_or_default();
+                groups.push(Alike { method: [&run.algorithm, &run.variant], settings, given, runs: vec![run] });
+            }
         }
     }
-    // The keys in which a group differs from others of its task.
-    let differs = |index: usize, is_other: &dyn Fn(&RunReport) -> bool| {
-        let (own, members) = &groups[index];
-        let others = groups.iter().filter(|(_, others)| others[0].task == members[0].task && is_other(others[0]));
-        others.flat_map(|(other, _)| differences(own, other)).collect::<BTreeSet<&String>>()
-    };
-    let all = groups.iter().enumerate().map(|(index, (own, runs))| {
+    let mut told: BTreeMap<[&str; 2], BTreeSet<&String>> = BTreeMap::new();
+    for (index, one) in groups.iter().enumerate() {
+        for other in groups[..index].iter().filter(|other| other.method == one.method) {
+            // Two tasks have values of their own, by which runs are of one method; any other value is a method of its own.
+            let are_own = |key: &str| one.runs[0].task != other.runs[0].task && one.has_own(key) && other.has_own(key);
+            let apart = differences(&one.settings, &other.settings).filter(|key| !are_own(key));
+            told.entry(one.method).or_default().extend(apart);
+        }
+    }
+    let all = groups.iter().map(|Alike { method, settings: own, given, runs }| {
         let value = |key: &String| own.get(key).map_or_else(|| format!("no {key}"), |value| format!("{key} = {value}"));
-        let RunReport { algorithm, variant, called, .. } = runs[0];
-        let of_variant = differs(index, &|other| (&other.algorithm, &other.variant) == (algorithm, variant));
-        // Values that the task prescribes are not part of the name.
-        let given = as_given(runs[0], true).map(|given| settings::of_experiment(&given)).unwrap_or_default();
-        let changed = of_variant.into_iter().filter(|key| given.get(*key) != own.get(*key)).map(value);
-        let method = Vec::from_iter(std::iter::once(called.clone()).chain(changed)).join(", ");
-        let differs = differs(index, &|other| other.algorithm == *algorithm).into_iter().map(value).collect();
-        group(runs, method, differs, select)
+        let changed = told.get(method).into_iter().flatten().filter(|key| given.get(**key) != own.get(**key));
+        let called = std::iter::once(runs[0].called.clone());
+        let name = Vec::from_iter(called.chain(changed.map(|key| value(key))));
+        let is_beside = |other: &&Alike| other.runs[0].task == runs[0].task && other.method[0] == method[0];
+        let beside = groups.iter().filter(is_beside).flat_map(|other| differences(own, &other.settings));
+        let differs = BTreeSet::from_iter(beside).into_iter().map(value).collect();
+        group(runs, name.join(", "), differs, select)
     });
     all.collect()
 }
