@@ -5,9 +5,19 @@ import { chart, element, keep, number } from "./charts.js";
 const EVERY = 2000;
 const RATE_OVER = 15000;
 const $ = (id) => document.getElementById(id);
-const shown = new Set(JSON.parse(decodeURIComponent(location.hash.slice(1)) || "[]"));
+const shown = new Set(asked());
 const samples = [];
 let list = "";
+
+// The runs that the address names as a JSON list; any other end of an address names none.
+function asked() {
+  try {
+    const names = JSON.parse(decodeURIComponent(location.hash.slice(1)));
+    return Array.isArray(names) ? names : [];
+  } catch {
+    return [];
+  }
+}
 
 // The answer, or nothing where there is none.
 async function ask(path) {
@@ -60,7 +70,7 @@ function showRuns(runs) {
     });
     const [box, name] = [element("td"), element("td")];
     box.append(tick);
-    const local = run.page && ["localhost", "127.0.0.1"].includes(location.hostname);
+    const local = run.page?.startsWith("http://") && ["localhost", "127.0.0.1"].includes(location.hostname);
     name.append(local ? element("a", run.name, { href: run.page }) : run.name);
     const score = run.score === null ? "–" : `${run.score.toFixed(1)} @${run.score_step}`;
     return row(box, name, run.task, run.method, run.state + (run.at_work ? ", at work" : ""), right(score));

@@ -113,18 +113,24 @@ impl Reader {
 /// What the page shows of a run.
 struct RunPage {
     dir: PathBuf,
+    /// When the run began whose history this is.
+    started: u64,
     history: History,
 }
 
 impl RunPage {
     fn of(dir: &Path) -> Self {
-        Self { dir: dir.to_owned(), history: History::of(dir.join("metrics.jsonl")) }
+        Self { dir: dir.to_owned(), started: 0, history: History::of(dir.join("metrics.jsonl")) }
     }
 
     fn read(&mut self) -> anyhow::Result<Value> {
-        self.history.refresh()?;
         let (report, scores) = RunReport::with_scores(&self.dir)?;
         let config = &report.config;
+        // By --fresh, another run takes the folder of one that was looked at.
+        if self.started != config.run.started {
+            *self = Self { started: config.run.started, ..Self::of(&self.dir) };
+        }
+        self.history.refresh()?;
         let metric = |metric: &Metric| json!({ "name": metric.name, "help": metric.help });
         let metrics: Value = config.experiment.definition()?.metrics.iter().map(metric).collect();
         let evaluations = report.evaluations.iter().map(|evaluation| {
@@ -154,3 +160,6 @@ impl RunPage {
         }))
     }
 }
+
+#[cfg(test)]
+mod tests;
