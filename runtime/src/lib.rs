@@ -36,7 +36,7 @@ pub use endpoints::{DEFAULT_PORT, Endpoints, SessionError, default_endpoint, par
 pub use exit::{ENDED_AT_ONCE, Hint, UNFINISHED, error_in, hinted, hints, json, print, run_main, unfinished};
 pub use health::{Beat, Health};
 pub use logging::{Logging, init_logging};
-pub use metrics_server::{BindError, MetricsServer, serve_metrics};
+pub use metrics_server::{MetricsServer, serve_metrics};
 pub use progress_bar::ProgressBar;
 pub use router::open_router;
 pub use session::{open_session, reachable_at};

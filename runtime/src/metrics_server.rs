@@ -1,14 +1,17 @@
 //! Serves `/metrics`, `/healthz` and the pages of a program.
 
 use std::collections::VecDeque;
-use std::io;
-use std::net::SocketAddr;
+use std::net::{IpAddr, SocketAddr};
+use std::sync::Arc;
 use std::time::Duration;
 
+use anyhow::Context;
 use axum::Router;
-use axum::extract::State;
+use axum::extract::{Request, State};
+use axum::http::uri::Authority;
 use axum::http::{StatusCode, header};
-use axum::response::IntoResponse;
+use axum::middleware::{self, Next};
+use axum::response::{IntoResponse, Response};
 use axum::routing::get;
 use hyper::server::conn::http1;
 use hyper_util::rt::{TokioIo, TokioTimer};
@@ -19,6 +22,7 @@ use tokio::task::{AbortHandle, JoinHandle, JoinSet};
 use tokio::time::timeout;
 use tracing::{debug, warn};
 
+use crate::exit::Hint;
 use crate::health::Health;
 
 /// A request is a few lines in one packet. The server closes a connection whose request is incomplete after this time.
@@ -40,25 +44,10 @@ pub struct MetricsServer {
     task: JoinHandle<()>,
 }
 
-/// The server cannot listen at the address.
-#[derive(Debug, thiserror::Error)]
-#[error("cannot serve metrics at {address}")]
-pub struct BindError {
-    /// The address.
-    pub address: SocketAddr,
-    /// The cause.
-    pub source: io::Error,
-}
-
-impl BindError {
-    /// What to do about it.
-    pub fn hint(&self) -> &'static str {
-        "choose another address or port for --http, or port 0 for a free one"
-    }
-}
-
 /// Serves over HTTP at `address`: `/metrics` with the metrics of `registry` in Prometheus's text format; `/healthz` with `ok`,
 /// or with status 503 and a line for each problem; and the program's own `pages`.
+///
+/// A request must name this machine by an address, as `localhost` or, if other machines can ask, by its own name.
 ///
 /// The server cuts off clients that send or read slowly, or hold idle connections; they cost a bounded amount of memory.
 ///
@@ -69,13 +58,19 @@ pub async fn serve_metrics(
     registry: Registry,
     health: Health,
     pages: Router,
-) -> Result<MetricsServer, BindError> {
-    let bind_error = |source| BindError { address, source };
-    let listener = TcpListener::bind(address).await.map_err(bind_error)?;
-    let address = listener.local_addr().map_err(bind_error)?;
+) -> anyhow::Result<MetricsServer> {
+    let listener = TcpListener::bind(address).await.with_context(|| format!("cannot listen at {address}"));
+    let listener =
+        listener.hint("another program may listen there: choose another address, or port 0 for a free one")?;
+    let address = listener.local_addr()?;
     let metrics = get(metrics).with_state(registry);
-    let router =
-        Router::new().route("/metrics", metrics).route("/healthz", get(healthz).with_state(health)).merge(pages);
+    let own_name = std::fs::read_to_string("/proc/sys/kernel/hostname").ok().filter(|_| !address.ip().is_loopback());
+    let own_name: Option<Arc<str>> = own_name.map(|name| name.trim().into());
+    let router = Router::new()
+        .route("/metrics", metrics)
+        .route("/healthz", get(healthz).with_state(health))
+        .merge(pages)
+        .layer(middleware::from_fn_with_state(own_name, refuse_other_names));
     let task = tokio::spawn(accept(listener, router));
     Ok(MetricsServer { address, task })
 }
@@ -116,6 +111,26 @@ async fn answer(stream: TcpStream, router: Router) {
     }
 }
 
+/// The owner of a web page may let its name lead to this machine (DNS rebinding). The browser of somebody who reads that page
+/// would then give it our answers, but it tells us the page's name.
+async fn refuse_other_names(State(own_name): State<Option<Arc<str>>>, request: Request, next: Next) -> Response {
+    let is_ours = |name: &[u8]| std::str::from_utf8(name).is_ok_and(|name| names_us(name, own_name.as_deref()));
+    if request.headers().get(header::HOST).is_none_or(|name| is_ours(name.as_bytes())) {
+        return next.run(request).await;
+    }
+    let hint = "ask for this machine by its address, or as localhost on the machine itself\n";
+    (StatusCode::FORBIDDEN, hint).into_response()
+}
+
+/// Whether `host` is an address, `localhost`, or our own name, whichever domain follows it.
+fn names_us(host: &str, own_name: Option<&str>) -> bool {
+    let Ok(authority) = host.parse::<Authority>() else { return false };
+    let name = authority.host().trim_matches(['[', ']']);
+    let is_own =
+        |own: &str| own.split('.').next().zip(name.split('.').next()).is_some_and(|(a, b)| a.eq_ignore_ascii_case(b));
+    name.parse::<IpAddr>().is_ok() || name.eq_ignore_ascii_case("localhost") || own_name.is_some_and(is_own)
+}
+
 async fn metrics(State(registry): State<Registry>) -> impl IntoResponse {
     match TextEncoder::new().encode_to_string(&registry.gather()) {
         Ok(text) => Ok(([(header::CONTENT_TYPE, TEXT_FORMAT)], text)),
@@ -133,5 +148,25 @@ async fn healthz(State(health): State<Health>) -> (StatusCode, String) {
 impl Drop for MetricsServer {
     fn drop(&mut self) {
         self.task.abort();
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::names_us;
+
+    #[test]
+    fn by_which_names_a_request_may_ask() {
+        for host in ["127.0.0.1:8080", "[::1]:8080", "192.0.2.1", "localhost", "LocalHost:9600"] {
+            assert!(names_us(host, None), "{host}");
+        }
+        for host in ["box7", "box7:9600", "Box7.example.org:9600"] {
+            assert!(names_us(host, Some("box7.lan")) && !names_us(host, None), "{host}");
+        }
+        for host in
+            ["evil.example", "localhost.evil.example", "127.0.0.1.evil.example:80", "user@evil.example", "", "a b"]
+        {
+            assert!(!names_us(host, Some("box7")), "{host}");
+        }
     }
 }

@@ -26,10 +26,15 @@ async fn server_with(health: Health) -> (MetricsServer, IntGauge) {
 
 /// Head and body of the response.
 async fn get(address: SocketAddr, path: &'static str) -> (String, String) {
+    get_as(address, address.to_string(), path).await
+}
+
+/// The response to a client that knows this machine by the name `host`.
+async fn get_as(address: SocketAddr, host: String, path: &'static str) -> (String, String) {
     let exchange = move || {
         let mut stream = TcpStream::connect(address).unwrap();
         stream.set_read_timeout(Some(PATIENCE)).unwrap();
-        write!(stream, "GET {path} HTTP/1.1\r\nHost: {address}\r\nConnection: close\r\n\r\n").unwrap();
+        write!(stream, "GET {path} HTTP/1.1\r\nHost: {host}\r\nConnection: close\r\n\r\n").unwrap();
         let mut response = String::new();
         stream.read_to_string(&mut response).unwrap();
         let (head, body) = response.split_once("\r\n\r\n").unwrap();
@@ -62,6 +67,17 @@ async fn health_and_nothing_else() {
 }
 
 #[tokio::test]
+async fn a_strangers_name_that_leads_here_is_told_nothing() {
+    let (server, _) = server().await;
+    for path in ["/metrics", "/healthz", "/secret"] {
+        let (head, body) = get_as(server.address, "evil.example".to_owned(), path).await;
+        assert!(head.starts_with("http/1.1 403") && body.starts_with("ask for this machine"), "{head}{body}");
+    }
+    let host = format!("localhost:{}", server.address.port());
+    assert_eq!(get_as(server.address, host, "/healthz").await.1, "ok\n");
+}
+
+#[tokio::test]
 async fn ill_health_is_told_line_by_line() {
     let health = Health::default();
     let (server, _) = server_with(health.clone()).await;
@@ -80,7 +96,7 @@ async fn server_that_bears() -> (MetricsServer, impl Fn() -> TcpStream) {
     let never = Router::new().route("/never", routing::get(std::future::pending::<()>));
     let server = serve_metrics(ANY_PORT, Registry::new(), Health::default(), never).await.unwrap();
     let address = server.address;
-    (server, move || sends(address, "GET /never HTTP/1.1\r\nHost: x\r\n\r\n"))
+    (server, move || sends(address, "GET /never HTTP/1.1\r\nHost: localhost\r\n\r\n"))
 }
 
 /// A connection on which `sent` is all that the server ever gets.
@@ -109,7 +125,7 @@ fn assert_is_open(mut stream: &TcpStream) {
 async fn half_a_request_and_silence_are_cut_off_long_before_one_that_waits_for_its_answer() {
     let (server, bear) = server_that_bears().await;
     let whole = bear();
-    let halves = ["GET /metrics HTTP/1.1\r\nHost: x", "GET /met", ""].map(|sent| sends(server.address, sent));
+    let halves = ["GET /metrics HTTP/1.1\r\nHost: localhost", "GET /met", ""].map(|sent| sends(server.address, sent));
     tokio::task::spawn_blocking(move || halves.iter().for_each(|half| drop(ended(half)))).await.unwrap();
     assert_is_open(&whole);
 }
@@ -117,7 +133,7 @@ async fn half_a_request_and_silence_are_cut_off_long_before_one_that_waits_for_i
 #[tokio::test(flavor = "multi_thread")]
 async fn connections_are_not_kept_for_a_second_request() {
     let (server, _) = server().await;
-    let asked = sends(server.address, "GET /healthz HTTP/1.1\r\nHost: x\r\n\r\n");
+    let asked = sends(server.address, "GET /healthz HTTP/1.1\r\nHost: localhost\r\n\r\n");
     let answer = tokio::task::spawn_blocking(move || ended(&asked)).await.unwrap();
     assert!(answer.contains("\r\nconnection: close\r\n"), "{answer}");
 }
@@ -138,8 +154,9 @@ async fn an_address_in_use_is_an_error_and_free_again_afterwards() {
     let (server, _) = server().await;
     let address = server.address;
     let error = serve_metrics(address, Registry::new(), Health::default(), Router::new()).await.unwrap_err();
-    assert_eq!(error.to_string(), format!("cannot serve metrics at {address}"));
-    assert_eq!(error.source.kind(), std::io::ErrorKind::AddrInUse);
+    assert_eq!(error.to_string(), format!("cannot listen at {address}"));
+    let cause = error.root_cause().downcast_ref::<std::io::Error>().unwrap();
+    assert_eq!(cause.kind(), std::io::ErrorKind::AddrInUse);
     drop(server);
     for _ in 0..100 {
         if serve_metrics(address, Registry::new(), Health::default(), Router::new()).await.is_ok() {

@@ -38,8 +38,8 @@ use clap::Args;
 use quad_policy::Precision;
 use quad_protocol::Name;
 use quad_runtime::{
-    BindError, Certificates, CertificatesError, DEFAULT_PORT, Endpoints, Health, Hint, Role, SessionError,
-    default_endpoint, parse_endpoint,
+    Certificates, CertificatesError, DEFAULT_PORT, Endpoints, Health, Hint, Role, SessionError, default_endpoint,
+    parse_endpoint,
 };
 use rand::Rng;
 use tracing::{info, warn};
@@ -120,10 +120,8 @@ async fn serve_until_stopped(args: ServeArgs, environments: Arc<dyn Environments
     // Serves as long as this value lives.
     let _server = match args.http {
         Some(address) => {
-            let server =
-                quad_runtime::serve_metrics(address, metrics.registry.clone(), health.clone(), Default::default())
-                    .await
-                    .hint_of(BindError::hint)?;
+            let (registry, health) = (metrics.registry.clone(), health.clone());
+            let server = quad_runtime::serve_metrics(address, registry, health, Default::default()).await?;
             info!("metrics at http://{}/metrics", server.address);
             Some(server)
         }

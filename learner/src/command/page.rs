@@ -1,7 +1,7 @@
 //! `learner page`: serves the page of all runs until it is told to stop.
 
 use anyhow::anyhow;
-use quad_runtime::{Health, Hint, LEAVE_WITHIN, hinted, serve_metrics, shutdown_signal};
+use quad_runtime::{Health, LEAVE_WITHIN, hinted, serve_metrics, shutdown_signal};
 use tracing::info;
 
 use crate::cli::PageArgs;
@@ -15,8 +15,7 @@ pub fn show(args: &PageArgs) -> anyhow::Result<()> {
     let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build()?;
     runtime.block_on(async {
         let page = routes(args.runs.clone(), None)?;
-        let served = serve_metrics(args.http, Default::default(), Health::default(), page).await;
-        let server = served.hint("another program may listen there; --http 127.0.0.1:0 takes a free port")?;
+        let server = serve_metrics(args.http, Default::default(), Health::default(), page).await?;
         info!("page: http://{}/ shows the runs in {folder}; Ctrl-C ends it", server.address);
         shutdown_signal(LEAVE_WITHIN).await;
         Ok(())

@@ -29,7 +29,7 @@ async fn get(root: &std::path::Path, live: Option<Live>, paths: &[&str]) -> Vec<
     let mut answers = Vec::new();
     for path in paths {
         let mut connection = TcpStream::connect(server.address).await.unwrap();
-        connection.write_all(format!("GET {path} HTTP/1.1\r\nHost: x\r\n\r\n").as_bytes()).await.unwrap();
+        connection.write_all(format!("GET {path} HTTP/1.1\r\nHost: localhost\r\n\r\n").as_bytes()).await.unwrap();
         let mut answer = String::new();
         tokio::time::timeout(Duration::from_secs(60), connection.read_to_string(&mut answer)).await.unwrap().unwrap();
         let (head, body) = answer.split_once("\r\n\r\n").unwrap();

@@ -63,7 +63,7 @@ fn a_port_that_is_taken() {
     let taken = TcpListener::bind("127.0.0.1:0").unwrap().local_addr().unwrap();
     let _taken = TcpListener::bind(taken).unwrap();
     let output = train(&scratch, &scratch.dataset(), &run_dir, &["--http", &taken.to_string()]);
-    assert_refused(&output, &format!("cannot serve metrics at {taken}"), "port 0");
+    assert_refused(&output, &format!("cannot listen at {taken}"), "port 0");
     assert!(!run_dir.exists());
 }
 
