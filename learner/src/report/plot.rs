@@ -16,6 +16,8 @@ const SIZE: (u32, u32) = (900, 540);
 const FINER: u32 = 2;
 /// Points of a line that are shown as such.
 const MOST_POINTS: usize = 40;
+/// What is farther from 0 is not drawn, nor what is no number: an axis to there would have no end.
+const FARTHEST: f64 = 1e300;
 const REFERENCE: RGBColor = RGBColor(110, 110, 110);
 /// Colours that stay apart for most colour-blind readers (Okabe and Ito).
 const COLOURS: [RGBColor; 7] = [
@@ -62,7 +64,7 @@ impl Picture {
     /// It cannot be drawn.
     pub fn svg(&self) -> anyhow::Result<String> {
         let mut svg = String::new();
-        let drawn = self.draw(SVGBackend::with_string(&mut svg, SIZE).into_drawing_area(), 1);
+        let drawn = self.drawable().draw(SVGBackend::with_string(&mut svg, SIZE).into_drawing_area(), 1);
         drawn.map_err(|error| anyhow!("cannot draw {}: {error}", self.title))?;
         Ok(svg)
     }
@@ -82,13 +84,28 @@ impl Picture {
     pub fn write_png(&self, path: &Path) -> anyhow::Result<()> {
         let (width, height) = (SIZE.0 * FINER, SIZE.1 * FINER);
         let mut pixels = vec![0; (width * height * 3) as usize];
-        let drawn = self.draw(BitMapBackend::with_buffer(&mut pixels, (width, height)).into_drawing_area(), FINER);
+        let drawn =
+            self.drawable().draw(BitMapBackend::with_buffer(&mut pixels, (width, height)).into_drawing_area(), FINER);
         drawn.map_err(|error| anyhow!("cannot draw {}: {error}", path.display()))?;
         let mut file = Vec::new();
         let mut encoder = png::Encoder::new(&mut file, width, height);
         encoder.set_color(png::ColorType::Rgb);
         encoder.write_header()?.write_image_data(&pixels)?;
         replace(path, &file)
+    }
+
+    /// Without what cannot be drawn.
+    fn drawable(&self) -> Self {
+        let is_near = |value: &f64| value.abs() < FARTHEST;
+        let mut picture = self.clone();
+        picture.references.retain(|(_, y)| is_near(y));
+        for line in &mut picture.lines {
+            line.points.retain(|(x, y)| is_near(x) && is_near(&y.value));
+            for (_, y) in &mut line.points {
+                (y.low, y.high) = (y.low.filter(is_near), y.high.filter(is_near));
+            }
+        }
+        picture
     }
 
     /// Draws with lengths `by` times as long as usual.
@@ -191,5 +208,9 @@ pub(super) fn replace(path: &Path, content: &[u8]) -> anyhow::Result<()> {
     let file = path.file_name().ok_or_else(|| anyhow!("{} is no file name", path.display()))?;
     let partial = path.with_file_name(format!("{}.partial", file.display()));
     let written = std::fs::write(&partial, content).and_then(|()| std::fs::rename(&partial, path));
+    let written = written.inspect_err(|_| drop(std::fs::remove_file(&partial)));
     written.with_context(|| format!("cannot write {}", path.display()))
 }
+
+#[cfg(test)]
+mod tests;

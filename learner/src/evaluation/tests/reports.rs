@@ -99,6 +99,8 @@ fn a_report_that_fits_no_evaluation_is_refused() {
         (with_episode(EpisodeScore { score: 99.0, ..score(1, 0.0) }), Refusal::Episode(1)),
         (with_episode(score(1, f64::NAN)), Refusal::Episode(1)),
         (with_episode(score(1, f64::INFINITY)), Refusal::Episode(1)),
+        (with_episode(score(1, 2e12)), Refusal::Episode(1)),
+        (with_episode(score(1, -1e200)), Refusal::Episode(1)),
     ];
     for (report, refusal) in cases {
         assert_eq!(bench.board.validate(&report), Err(refusal));
