@@ -6,11 +6,13 @@ use bincode::de::Decoder;
 use bincode::enc::Encoder;
 use bincode::error::{DecodeError, EncodeError};
 use bincode::{Decode, Encode};
+use serde::{Deserialize, Serialize};
 
-/// Name of a run or of an evaluator: 1 to 64 ASCII letters, digits, dots, dashes and underscores.
+/// Name of a run or of an evaluator: 1 to 64 ASCII letters, digits, dots, dashes and underscores, and neither `.` nor `..`.
 ///
 /// It fits into a Zenoh key, a file name and a metric's label without quoting.
-#[derive(Clone, Debug, PartialEq, Eq, PartialOrd, Ord, Hash)]
+#[derive(Clone, Debug, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize)]
+#[serde(try_from = "String")]
 pub struct Name(String);
 
 /// The text cannot be a [`Name`].
@@ -22,6 +24,9 @@ pub enum InvalidName {
     /// It has a character that is not allowed.
     #[error("a name has only letters, digits, '.', '-' and '_', not {0:?}")]
     Character(char),
+    /// A folder by this name is the one that it is in, or the one above.
+    #[error("{0:?} is not a name")]
+    Folder(String),
 }
 
 impl Name {
@@ -38,12 +43,23 @@ impl Name {
         if !(1..=Self::MAX_LENGTH).contains(&text.len()) {
             return Err(InvalidName::Length(text.len()));
         }
+        if text == "." || text == ".." {
+            return Err(InvalidName::Folder(text));
+        }
         Ok(Name(text))
     }
 
     /// The name as text.
     pub fn as_str(&self) -> &str {
         &self.0
+    }
+}
+
+impl TryFrom<String> for Name {
+    type Error = InvalidName;
+
+    fn try_from(text: String) -> Result<Name, InvalidName> {
+        Name::new(text)
     }
 }
 
@@ -73,11 +89,14 @@ mod tests {
 
     #[test]
     fn what_a_name_may_be() {
-        for text in ["a", "hopper-medium-replay-v2", "Run_1.b", &"x".repeat(64)] {
+        for text in ["a", "hopper-medium-replay-v2", "Run_1.b", "...", &"x".repeat(64)] {
             assert_eq!(Name::new(text).unwrap().as_str(), text);
         }
         assert_eq!(Name::new(""), Err(InvalidName::Length(0)));
         assert_eq!(Name::new("x".repeat(65)), Err(InvalidName::Length(65)));
+        for text in [".", ".."] {
+            assert_eq!(Name::new(text), Err(InvalidName::Folder(text.to_owned())));
+        }
         for character in ['/', '*', '$', ' ', '#', '?', '@', 'é', '\n', '\0'] {
             assert_eq!(Name::new(format!("a{character}b")), Err(InvalidName::Character(character)));
         }

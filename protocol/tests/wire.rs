@@ -13,7 +13,7 @@ fn name() -> impl Strategy<Value = Name> {
     // Without proptest's regular expressions, which are a large dependency.
     let alphabet: Vec<char> = ('a'..='z').chain('A'..='Z').chain('0'..='9').chain(['.', '-', '_']).collect();
     vec(proptest::sample::select(alphabet), 1..=Name::MAX_LENGTH)
-        .prop_map(|characters| Name::new(String::from_iter(characters)).unwrap())
+        .prop_filter_map("a folder", |characters| Name::new(String::from_iter(characters)).ok())
 }
 
 fn text() -> impl Strategy<Value = String> {

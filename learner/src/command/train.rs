@@ -12,7 +12,7 @@ use quad_protocol::Name;
 use quad_run::config::{DatasetInfo, Experiment, Preset, RunConfig, RunInfo, hyperparameters};
 use quad_run::results::RunReport;
 use quad_run::run::{self, Begun, Log, Past, RunDir};
-use quad_runtime::{BindError, Health, Hint, hinted, print, stay_in_background, unfinished};
+use quad_runtime::{Health, Hint, hinted, print, stay_in_background, unfinished};
 use tokio::sync::mpsc;
 use tracing::{debug, info, warn};
 
@@ -118,8 +118,7 @@ async fn run_to_its_end(
     let live = Live::new(name.clone(), steps, metrics.clone(), health.clone());
     let telling = live.clone();
     let page = page::routes(path.to_owned(), Some(Arc::new(move || telling.tell())))?;
-    let server = quad_runtime::serve_metrics(args.http, registry, health.clone(), page).await;
-    let server = server.hint_of(BindError::hint)?;
+    let server = quad_runtime::serve_metrics(args.http, registry, health.clone(), page).await?;
     info!("page: http://{}/", server.address);
     let Experiment { environment, .. } = &config.experiment;
     let task = Task::new(environment, transitions.observation_dim(), transitions.action_dim());
@@ -203,7 +202,7 @@ fn conclude(run_dir: &RunDir, config: &RunConfig, ending: Ending) -> anyhow::Res
 
 /// Checks that no episode was given up.
 fn all_scored(report: RunReport) -> anyhow::Result<()> {
-    let missing: usize = report.missing.iter().map(|missing| missing.episodes).sum();
+    let missing = report.episodes_missing;
     if missing == 0 {
         return Ok(());
     }
@@ -266,7 +265,7 @@ fn run_config(
     let statistics = transitions.statistics();
     Ok(RunConfig {
         run: RunInfo {
-            name: name.to_string(),
+            name: name.clone(),
             started: now()?,
             task: task.to_owned(),
             version: env!("CARGO_PKG_VERSION").to_owned(),

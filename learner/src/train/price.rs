@@ -40,7 +40,7 @@ impl Price {
 
     /// Bytes on disk of a whole run: its snapshots, and the checkpoints that are kept.
     pub fn bytes(&self, experiment: &Experiment) -> u64 {
-        let snapshots = experiment.schedule().evaluated_steps().count().max(1) as u64;
+        let snapshots = experiment.schedule().evaluations().max(1);
         snapshots * self.snapshot + Checkpoint::KEPT as u64 * self.checkpoint
     }
 }

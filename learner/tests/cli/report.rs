@@ -103,7 +103,7 @@ fn a_run_is_summarised_by_its_complete_evaluations_and_says_how_many_there_are()
     let run = &reported.json["runs"][0];
     assert_eq!((&run["variant"], &run["seed"], &run["dataset_score"]), (&json!("quad"), &json!(3), &json!(10.7)));
     assert_eq!((&run["mean_last_3"], &run["mean_last_5"]), (&json!(8.0), &json!(6.0)));
-    assert_eq!(run["missing"], json!([{ "step": 6000, "episodes": 1 }]));
+    assert_eq!(run["episodes_missing"], json!(1));
     let fifth = &run["evaluations"][4];
     assert_eq!((&fifth["score"]["mean"], &fifth["mean_return"]), (&json!(10.0), &json!(100.0)));
     for words in [

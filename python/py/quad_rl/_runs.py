@@ -58,7 +58,7 @@ def metrics(folder: str | PathLike[str]) -> list[dict[str, float]]:
 
 def _rows(folder: str | PathLike[str]) -> list[dict[str, Any]]:
     run, config = map(json.loads, _quad_rl.read_run(folder))
-    of_run = _flat("", {name: value for name, value in run.items() if name not in ("evaluations", "missing")})
+    of_run = _flat("", {name: value for name, value in run.items() if name not in ("evaluations", "episodes_missing")})
     of_run |= _flat("", config)
     evaluations = [
         {

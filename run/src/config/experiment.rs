@@ -1,6 +1,6 @@
 //! One experiment, every value of which is checked.
 
-use anyhow::{Context, ensure};
+use anyhow::{Context, anyhow, ensure};
 use quad_algorithms::{Definition, Reporting, Variant};
 use quad_dataset::{RewardRule, Scale};
 use quad_policy::Precision;
@@ -15,6 +15,8 @@ use super::schedule::Schedule;
 const MOST_EPISODES: u64 = 10_000;
 /// Most transitions in a batch: far above any use, too.
 const MOST_BATCH: u64 = 1 << 20;
+/// Most evaluations in a run: far above any use. Each keeps a snapshot.
+const MOST_EVALUATIONS: u64 = 1_000_000;
 /// TOML's integers are 64 bits with a sign, so larger ones could not be saved with the run.
 const MOST: u64 = i64::MAX as u64;
 
@@ -118,7 +120,11 @@ impl Experiment {
         Ok(format!("{}; seed {seed}, {steps} steps of batch {batch_size}; {evaluations}", self.method()?))
     }
 
-    pub(super) fn validate(&self) -> anyhow::Result<()> {
+    /// Checks the numbers that are no hyper-parameters.
+    ///
+    /// # Errors
+    /// One of them is not in its range.
+    pub(crate) fn check_ranges(&self) -> anyhow::Result<()> {
         for (field, value, least, most) in [
             ("steps", self.steps, 1, MOST),
             ("eval_interval", self.eval_interval, 0, MOST),
@@ -127,6 +133,16 @@ impl Experiment {
             ("batch_size", self.batch_size.into(), 1, MOST_BATCH),
         ] {
             ensure!((least..=most).contains(&value), "{field} is {value}, but must be from {least} to {most}");
+        }
+        Ok(())
+    }
+
+    pub(super) fn validate(&self) -> anyhow::Result<()> {
+        self.check_ranges()?;
+        let (Self { steps, eval_interval, .. }, evaluations) = (self, self.schedule().evaluations());
+        if evaluations > MOST_EVALUATIONS {
+            let error = anyhow!("{steps} steps with an evaluation every {eval_interval} are {evaluations} evaluations");
+            return Err(error).hint(format!("choose a larger eval_interval, for at most {MOST_EVALUATIONS}"));
         }
         let check = (self.definition()?.check)(&self.agent);
         check.with_context(|| format!("algorithm {}", self.algorithm)).hint(KEYS)

@@ -2,6 +2,7 @@
 
 use std::path::PathBuf;
 
+use quad_protocol::Name;
 use serde::{Deserialize, Serialize};
 
 use super::device::Device;
@@ -24,7 +25,7 @@ pub struct RunConfig {
 #[serde(deny_unknown_fields)]
 pub struct RunInfo {
     /// Name of the run: its folder's name, and its place in Zenoh's key space.
-    pub name: String,
+    pub name: Name,
     /// When the run was first started, in milliseconds since 1970. In the file it is called `incarnation`, as it always was;
     /// it is not the number of a learner's start on the wire, which has that name, too.
     #[serde(rename = "incarnation")]

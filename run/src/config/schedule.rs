@@ -12,7 +12,13 @@ pub struct Schedule {
 impl Schedule {
     /// Whether the policy after that gradient step is evaluated.
     pub fn is_evaluated(&self, step: u64) -> bool {
-        self.eval_interval > 0 && (step == self.steps || step.is_multiple_of(self.eval_interval))
+        let is_due = step == self.steps || step.is_multiple_of(self.eval_interval);
+        self.eval_interval > 0 && (1..=self.steps).contains(&step) && is_due
+    }
+
+    /// How many policies are evaluated.
+    pub fn evaluations(self) -> u64 {
+        if self.eval_interval == 0 { 0 } else { self.steps.div_ceil(self.eval_interval) }
     }
 
     /// The steps whose policies are evaluated, in ascending order.

@@ -3,8 +3,7 @@
 use std::collections::{BTreeMap, BTreeSet};
 use std::fmt::Alignment::Right;
 use std::fmt::Write;
-use std::fs;
-use std::io::ErrorKind;
+use std::io::{self, ErrorKind};
 use std::path::{Path, PathBuf};
 
 use anyhow::Context;
@@ -14,7 +13,7 @@ use serde::Serialize;
 
 use super::spread::Spread;
 use crate::config::RunConfig;
-use crate::run::{RunDir, ScoreLine};
+use crate::run::{RunDir, ScoreLine, open_file};
 use crate::table::{Style, Table};
 
 /// Gradient steps at the end of a run over which the paper's appendix B takes the mean.
@@ -35,15 +34,6 @@ pub struct EvaluationReport {
     pub mean_return: f64,
     /// Mean length in environment steps.
     pub mean_length: f64,
-}
-
-/// Episodes of an evaluation that have no score.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize)]
-pub struct Missing {
-    /// Gradient step of the snapshot.
-    pub step: u64,
-    /// How many.
-    pub episodes: usize,
 }
 
 /// One run.
@@ -73,8 +63,8 @@ pub struct RunReport {
     pub dataset_score: f64,
     /// Its evaluations by step.
     pub evaluations: Vec<EvaluationReport>,
-    /// What has no score, or not yet, by step.
-    pub missing: Vec<Missing>,
+    /// Episodes of all planned evaluations that have no score, or not yet.
+    pub episodes_missing: u64,
     /// Mean score of the last 3 complete evaluations; absent if they are fewer.
     pub mean_last_3: Option<f64>,
     /// Mean score of the last 5 complete evaluations; absent if they are fewer.
@@ -140,10 +130,10 @@ impl RunReport {
         for line in lines {
             by_step.entry(line.step).or_default().insert(line.seed, line);
         }
-        let scored = |step| by_step.get(&step).map_or(0, BTreeMap::len);
-        let missing = |step| Missing { step, episodes: (experiment.episodes as usize).saturating_sub(scored(step)) };
-        let missing = experiment.schedule().evaluated_steps().map(missing);
-        let missing = missing.filter(|missing| missing.episodes > 0).collect();
+        let (schedule, episodes) = (experiment.schedule(), u64::from(experiment.episodes));
+        let planned = by_step.iter().filter(|(step, _)| schedule.is_evaluated(**step));
+        let scored: u64 = planned.map(|(_, scored)| episodes.min(scored.len() as u64)).sum();
+        let episodes_missing = schedule.evaluations().saturating_mul(episodes).saturating_sub(scored);
         let evaluations: Vec<_> = by_step
             .into_iter()
             .filter_map(|(step, episodes)| {
@@ -162,7 +152,7 @@ impl RunReport {
         let precisions: BTreeSet<String> = lines.iter().map(precision).collect();
         Self {
             dir: path.to_owned(),
-            run: config.run.name.clone(),
+            run: config.run.name.to_string(),
             task: config.run.task.clone(),
             algorithm: experiment.algorithm.clone(),
             variant,
@@ -177,7 +167,7 @@ impl RunReport {
             mean_last_5: last(5),
             mean_last_50000_steps: final_steps.and_then(in_final_steps),
             evaluations,
-            missing,
+            episodes_missing,
             summary: None,
             called,
             precisions,
@@ -187,7 +177,7 @@ impl RunReport {
 
     /// Whether every episode of every evaluation has its score.
     pub fn is_complete(&self) -> bool {
-        self.missing.is_empty()
+        self.episodes_missing == 0
     }
 
     /// Its complete evaluation with the largest score.
@@ -208,11 +198,11 @@ impl RunReport {
 
     /// How many of the planned evaluations have all their scores.
     pub fn evaluations_complete(&self) -> usize {
-        self.evaluations_planned() - self.missing.len()
-    }
-
-    fn evaluations_planned(&self) -> usize {
-        self.config.experiment.schedule().evaluated_steps().count()
+        let schedule = self.config.experiment.schedule();
+        self.evaluations
+            .iter()
+            .filter(|evaluation| evaluation.complete && schedule.is_evaluated(evaluation.step))
+            .count()
     }
 
     /// The step of the last complete evaluation of a run that is not complete.
@@ -225,7 +215,7 @@ impl RunReport {
         format!(
             "{} of {} evaluations are complete, the last of them after {} of {} steps",
             self.evaluations_complete(),
-            self.evaluations_planned(),
+            self.config.experiment.schedule().evaluations(),
             self.reached().unwrap_or(self.steps),
             self.steps
         )
@@ -262,8 +252,7 @@ impl RunReport {
         }
         // Writing to a string cannot fail.
         if !self.is_complete() {
-            let episodes: usize = self.missing.iter().map(|missing| missing.episodes).sum();
-            writeln!(text, "{episodes} episodes have no score: {}", self.how_complete()).ok();
+            writeln!(text, "{} episodes have no score: {}", self.episodes_missing, self.how_complete()).ok();
         }
         text.push('\n');
         for (name, mean) in [
@@ -283,7 +272,7 @@ impl RunReport {
 /// The lines of `metrics.jsonl` in a run folder; none if there is no such file. The last one may not be complete.
 fn metrics(folder: &Path) -> anyhow::Result<Vec<MetricsLine>> {
     let path = folder.join("metrics.jsonl");
-    match fs::read_to_string(&path) {
+    match open_file(&path).and_then(io::read_to_string) {
         Ok(text) => Ok(text.lines().filter_map(|line| serde_json::from_str(line).ok()).collect()),
         Err(error) if error.kind() == ErrorKind::NotFound => Ok(Vec::new()),
         Err(error) => Err(error).with_context(|| format!("cannot read {}", path.display())),

@@ -30,12 +30,18 @@ fn partial(target: &Path) -> PathBuf {
     target.with_file_name(name)
 }
 
-/// Removes the half files that killed processes have left in a folder. One that stays does no harm but to take room.
+/// Opens a file for reading. In a folder that somebody else made, a pipe or a device in its place would have no end.
+pub(crate) fn open_file(path: &Path) -> io::Result<File> {
+    if fs::metadata(path)?.is_file() { File::open(path) } else { Err(io::Error::other("it is no file")) }
+}
+
+/// Removes the half files that killed processes have left in a folder, and links in their place, which writing would follow.
+/// One that stays does no harm but to take room.
 pub(super) fn remove_partial_files(folder: &Path) {
     let Ok(entries) = fs::read_dir(folder) else { return };
     for entry in entries.flatten() {
         let is_partial = entry.file_name().to_string_lossy().ends_with(PARTIAL);
-        if is_partial && entry.file_type().is_ok_and(|kind| kind.is_file()) {
+        if is_partial && entry.file_type().is_ok_and(|kind| !kind.is_dir()) {
             fs::remove_file(entry.path()).ok();
         }
     }

@@ -17,7 +17,7 @@ use std::path::{Path, PathBuf};
 use serde::{Deserialize, Serialize};
 
 use super::checkpoints::{Checkpoint, Checkpoints};
-use super::durable::{self, replace};
+use super::durable::{self, open_file, replace};
 use super::error::{CREATE, RunDirError, content, io_error};
 use super::lines::{RunEndpoints, ScoreLine};
 use super::lock::Lock;
@@ -57,6 +57,7 @@ impl RunDir {
         if Self::is_occupied(path) || !scores.is_empty() {
             return Err(occupied());
         }
+        run.mark_failed(false)?;
         let target = path.join("config.toml");
         let text = toml::to_string(config).map_err(|error| content(&target, None, &error))?;
         replace(&target, text.as_bytes())?;
@@ -75,15 +76,10 @@ impl RunDir {
     }
 
     /// Remembers that a run of a sweep has failed, or forgets it.
-    pub fn mark_failed(&self, failed: bool) -> io::Result<()> {
+    pub fn mark_failed(&self, failed: bool) -> Result<(), RunDirError> {
         let path = self.path.join(FAILED);
-        match failed {
-            true => fs::write(path, ""),
-            false => fs::remove_file(path).or_else(|error| match error.kind() {
-                io::ErrorKind::NotFound => Ok(()),
-                _ => Err(error),
-            }),
-        }
+        let marked = if failed { fs::write(&path, "") } else { remove_if_there(&path) };
+        marked.map_err(io_error("write", &path))
     }
 
     /// Whether it is remembered that it has.
@@ -116,11 +112,13 @@ impl RunDir {
     /// The configuration that the run began with.
     pub fn read_config(&self) -> Result<RunConfig, RunDirError> {
         let source = self.path.join("config.toml");
-        let text = fs::read_to_string(&source).map_err(io_error("read", &source))?;
-        toml::from_str(&text).map_err(|error: toml::de::Error| {
+        let text = open_file(&source).and_then(io::read_to_string).map_err(io_error("read", &source))?;
+        let config: RunConfig = toml::from_str(&text).map_err(|error: toml::de::Error| {
             let line = error.span().and_then(|at| text.get(..at.start)).map(|before| before.matches('\n').count() + 1);
             content(&source, line, &error.message())
-        })
+        })?;
+        config.experiment.check_ranges().map_err(|error| content(&source, None, &error))?;
+        Ok(config)
     }
 
     /// The folder's path.
@@ -141,17 +139,14 @@ impl RunDir {
     /// Where the learner can be reached that wrote so last, at work or not.
     pub fn read_endpoints(&self) -> Result<RunEndpoints, RunDirError> {
         let path = self.path.join("endpoints.json");
-        let text = fs::read_to_string(&path).map_err(io_error("read", &path))?;
+        let text = open_file(&path).and_then(io::read_to_string).map_err(io_error("read", &path))?;
         serde_json::from_str(&text).map_err(|error| content(&path, None, &error))
     }
 
     /// Forgets where an earlier learner could be reached.
     pub fn remove_endpoints(&self) -> Result<(), RunDirError> {
         let path = self.path.join("endpoints.json");
-        match fs::remove_file(&path) {
-            Err(error) if error.kind() == io::ErrorKind::NotFound => Ok(()),
-            removed => removed.map_err(io_error("remove", &path)),
-        }
+        remove_if_there(&path).map_err(io_error("remove", &path))
     }
 
     /// Writes a value as indented JSON; a reader sees the old file or the new one, never half of it.
@@ -264,7 +259,7 @@ impl RunDir {
     /// The lines of `scores.jsonl`; none if nothing was scored yet. A last line that is not complete yet is left out.
     pub fn read_scores(&self) -> Result<Vec<ScoreLine>, RunDirError> {
         let path = self.path.join(SCORES);
-        let text = match fs::read_to_string(&path) {
+        let text = match open_file(&path).and_then(io::read_to_string) {
             Err(error) if error.kind() == io::ErrorKind::NotFound => return Ok(Vec::new()),
             other => other.map_err(io_error("read", &path))?,
         };
@@ -279,4 +274,8 @@ impl RunDir {
     pub fn broken_scores(&self, reason: String) -> RunDirError {
         content(&self.path.join(SCORES), None, &reason)
     }
+}
+
+fn remove_if_there(path: &Path) -> io::Result<()> {
+    fs::remove_file(path).or_else(|error| if error.kind() == io::ErrorKind::NotFound { Ok(()) } else { Err(error) })
 }

@@ -2,11 +2,13 @@
 
 use std::fs::{File, OpenOptions};
 use std::io::{self, Read, Seek, SeekFrom, Write};
+use std::os::unix::fs::OpenOptionsExt;
 use std::path::{Path, PathBuf};
 
+use rustix::fs::OFlags;
 use serde::Serialize;
 
-use super::durable::synchronise_folder;
+use super::durable::{open_file, synchronise_folder};
 use super::error::{RunDirError, content, io_error};
 use super::lock::Lock;
 
@@ -30,7 +32,9 @@ impl Log {
     /// # Errors
     /// The file cannot be opened or changed.
     pub(super) fn open(path: PathBuf, lock: Option<Lock>) -> Result<Self, RunDirError> {
-        let opened = OpenOptions::new().create(true).read(true).append(true).open(&path);
+        // No link: in a folder that somebody else made, it may lead to any file of its reader's, which would be cut.
+        let no_link = OFlags::NOFOLLOW.bits() as i32;
+        let opened = OpenOptions::new().create(true).read(true).append(true).custom_flags(no_link).open(&path);
         let mut file = opened.map_err(io_error("open", &path))?;
         let whole = whole_lines(&mut file).map_err(io_error("read", &path))?;
         let mut log = Self { path, file, length: whole, torn: true, lock };
@@ -113,7 +117,7 @@ impl Log {
 /// The whole lines that a file has beyond its first `read` bytes, which then count as read; none if it is not there. A file
 /// that has become shorter is read from its beginning.
 pub fn new_lines(path: &Path, read: &mut u64) -> io::Result<Vec<u8>> {
-    let mut file = match File::open(path) {
+    let mut file = match open_file(path) {
         Err(error) if error.kind() == io::ErrorKind::NotFound => return Ok(Vec::new()),
         opened => opened?,
     };

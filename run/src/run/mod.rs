@@ -21,8 +21,9 @@ mod tests;
 pub mod verify;
 
 pub use checkpoints::Checkpoint;
+pub(crate) use durable::open_file;
 pub use error::RunDirError;
-pub use find::{runs_in, walk};
+pub use find::walk;
 pub use folder::RunDir;
 pub use lines::{RunEndpoints, ScoreLine};
 pub use lock::Lock;

@@ -100,6 +100,7 @@ impl Begun {
     pub fn go_on(self, experiment: &Experiment) -> anyhow::Result<(RunDir, Log, Past)> {
         let Self { dir, scores, .. } = self;
         dir.remove_endpoints()?;
+        dir.mark_failed(false)?;
         dir.remove_partial_files();
         let past = Past::read(&dir, experiment)?;
         info!("{}", past.summary(&dir));

@@ -1,5 +1,8 @@
 //! A run folder as the learner writes it.
 
+use std::os::unix::fs::symlink;
+
+use quad_protocol::Name;
 use toml::Table;
 
 use super::{RunDir, RunDirError, ScoreLine};
@@ -11,7 +14,7 @@ fn config(name: &str, seed: u64) -> RunConfig {
     (experiment.seed, experiment.episodes) = (seed, 2);
     RunConfig {
         run: RunInfo {
-            name: name.into(),
+            name: Name::new(name).unwrap(),
             started: 1,
             task: "hopper-demo".into(),
             version: "0.1.0".into(),
@@ -99,6 +102,21 @@ fn one_learner_at_a_time_works_in_a_folder() {
     run.score_log().unwrap();
 }
 
+/// A sweep leaves the mark. Whoever gives the run's command, it has not failed while a learner is at work.
+#[test]
+fn a_run_that_begins_or_goes_on_is_no_longer_called_failed() {
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("a");
+    std::fs::create_dir(&path).unwrap();
+    RunDir::at(&path).mark_failed(true).unwrap();
+    let (run, log) = RunDir::create(&path, &config("a", 0)).unwrap();
+    assert!(!run.has_failed());
+    drop(log);
+    run.mark_failed(true).unwrap();
+    super::open(&path, false).unwrap().unwrap().go_on(&config("a", 0).experiment).unwrap();
+    assert!(!run.has_failed());
+}
+
 #[test]
 fn metrics_of_steps_that_come_again_are_cut_off() {
     let folder = tempfile::tempdir().unwrap();
@@ -139,6 +157,24 @@ fn scores_survive_a_reopened_log_and_an_unfinished_line_is_left_out() {
     std::fs::write(&path, text + "\n").unwrap();
     let error = run.read_scores().unwrap_err().to_string();
     assert!(error.contains("scores.jsonl, line 3"), "{error}");
+}
+
+/// In a folder that somebody else made, they may lead to any file of whoever trains there.
+#[test]
+fn no_link_is_written_through() {
+    let folder = tempfile::tempdir().unwrap();
+    let [path, precious] = ["a", "precious"].map(|name| folder.path().join(name));
+    std::fs::write(&precious, "no line of a log").unwrap();
+    let (run, log) = RunDir::create(&path, &config("a", 0)).unwrap();
+    drop(log);
+    for name in ["endpoints.json.partial", "metrics.jsonl", "scores.jsonl"] {
+        std::fs::remove_file(path.join(name)).ok();
+        symlink(&precious, path.join(name)).unwrap();
+    }
+    assert!(run.score_log().is_err() && run.metrics_log(0).is_err());
+    run.remove_partial_files();
+    run.write_json("endpoints.json", &1).unwrap();
+    assert_eq!(std::fs::read_to_string(precious).unwrap(), "no line of a log");
 }
 
 #[test]

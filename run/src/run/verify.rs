@@ -11,7 +11,7 @@ use super::folder::RunDir;
 use super::lines::ScoreLine;
 use crate::config::settings;
 
-/// Findings of one kind that are listed one by one; the rest is counted.
+/// Findings of one kind that are listed one by one; the others are counted.
 const LISTED: usize = 5;
 
 /// Evaluators compute in f32 or bf16, by the fastest instructions of their CPU, and each of these rounds in its own way.
@@ -24,11 +24,11 @@ pub struct Findings {
     /// What was looked for: `scored` or `compared`.
     pub what: &'static str,
     /// Episodes that are.
-    pub found: usize,
+    pub found: u64,
     /// Episodes that should be.
-    pub expected: usize,
-    /// What is wrong, kind by kind.
-    pub wrong: BTreeMap<&'static str, Vec<String>>,
+    pub expected: u64,
+    /// What is wrong, kind by kind: how often, and the first cases.
+    pub wrong: BTreeMap<&'static str, (u64, Vec<String>)>,
 }
 
 impl Findings {
@@ -38,17 +38,20 @@ impl Findings {
     }
 
     fn add(&mut self, kind: &'static str, what: String) {
-        self.wrong.entry(kind).or_default().push(what);
+        let (count, listed) = self.wrong.entry(kind).or_default();
+        *count += 1;
+        if listed.len() < LISTED {
+            listed.push(what);
+        }
     }
 }
 
 impl fmt::Display for Findings {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         write!(f, "{} of {} episodes are {}", self.found, self.expected, self.what)?;
-        for (kind, found) in &self.wrong {
-            let listed = found.iter().take(LISTED).cloned().collect::<Vec<_>>().join("; ");
-            let more = if found.len() > LISTED { "; …" } else { "" };
-            write!(f, "\n{kind} ({}): {listed}{more}", found.len())?;
+        for (kind, (count, listed)) in &self.wrong {
+            let more = if *count > listed.len() as u64 { "; …" } else { "" };
+            write!(f, "\n{kind} ({count}): {}{more}", listed.join("; "))?;
         }
         Ok(())
     }
@@ -61,14 +64,15 @@ impl fmt::Display for Findings {
 pub fn verify(path: &Path) -> Result<Findings, RunDirError> {
     let (dir, config) = RunDir::open(path)?;
     let experiment = &config.experiment;
-    let mut planned: BTreeMap<u64, BTreeSet<u64>> = experiment
-        .schedule()
-        .evaluated_steps()
-        .map(|step| (step, BTreeSet::from_iter(episode_seeds(experiment.seed, step, experiment.episodes))))
-        .collect();
-    let expected = planned.values().map(BTreeSet::len).sum();
+    let schedule = experiment.schedule();
+    let expected = schedule.evaluations().saturating_mul(experiment.episodes.into());
     let mut found = Findings { what: "scored", expected, ..Findings::default() };
     let mut hashes: BTreeMap<u64, Option<String>> = BTreeMap::new();
+    let planned = |step| match schedule.is_evaluated(step) {
+        true => episode_seeds(experiment.seed, step, experiment.episodes),
+        false => Vec::new(),
+    };
+    let mut left: BTreeMap<u64, BTreeSet<u64>> = BTreeMap::new();
     let mut seen = BTreeSet::new();
     for ScoreLine { step, seed, weights, episode_return, score, .. } in dir.read_scores()? {
         let name = format!("step {step}, seed {seed}");
@@ -83,18 +87,22 @@ pub fn verify(path: &Path) -> Result<Findings, RunDirError> {
         if !(episode_return.is_finite() && score.is_finite()) {
             found.add("not a number", name.clone());
         }
+        let left = left.entry(step).or_insert_with(|| BTreeSet::from_iter(planned(step)));
         if !seen.insert((step, seed)) {
             found.add("scored twice", name);
-        } else if planned.get_mut(&step).is_some_and(|seeds| seeds.remove(&seed)) {
+        } else if left.remove(&seed) {
             found.found += 1;
         } else {
             found.add("no episode of this run", name);
         }
     }
-    for (step, seeds) in planned {
-        for seed in seeds {
-            found.add("without a score", format!("step {step}, seed {seed}"));
-        }
+    let missing = found.expected - found.found;
+    if missing > 0 {
+        // Counted, and only the first ones made: a run that has no end plans more than memory holds.
+        let unscored = |(step, seed): &(u64, u64)| !seen.contains(&(*step, *seed));
+        let all = schedule.evaluated_steps().flat_map(|step| planned(step).into_iter().map(move |seed| (step, seed)));
+        let first = all.filter(unscored).take(LISTED).map(|(step, seed)| format!("step {step}, seed {seed}"));
+        found.wrong.insert("without a score", (missing, first.collect()));
     }
     Ok(found)
 }
@@ -114,7 +122,7 @@ pub fn compare(path: &Path, other: &Path) -> Result<Findings, RunDirError> {
         lines.into_iter().map(|line| ((line.step, line.seed), line)).collect()
     };
     let [ours, theirs] = [by_key(dir.read_scores()?), by_key(other_dir.read_scores()?)];
-    found.expected = ours.len();
+    found.expected = ours.len() as u64;
     for (key @ (step, seed), line) in &ours {
         let name = format!("step {step}, seed {seed}");
         let Some(same) = theirs.get(key) else {
