@@ -1,4 +1,4 @@
-//! Tables and sentences for people: aligned for a terminal, as Markdown, LaTeX or CSV.
+//! Tables and sentences for people: aligned for a terminal, as Markdown or LaTeX.
 
 use std::fmt::Alignment::{self, Right};
 
@@ -13,8 +13,6 @@ pub enum Style {
     Markdown,
     /// For a paper; tables need its package booktabs.
     Latex,
-    /// For a spreadsheet; sentences are comments.
-    Csv,
 }
 
 /// A part of a report.
@@ -34,7 +32,6 @@ impl Part {
             (Self::Table(table), _) => table.render(style),
             (Self::Words(text), Style::Text | Style::Markdown) => text.clone(),
             (Self::Words(text), Style::Latex) => text.lines().map(|line| format!("{}\n\n", latex(line))).collect(),
-            (Self::Words(text), Style::Csv) => text.lines().map(|line| format!("# {line}\n")).collect(),
         }
     }
 }
@@ -53,9 +50,9 @@ impl Table {
         Self { right, rows: vec![header.iter().map(|(name, _)| name.as_ref().to_owned()).collect()] }
     }
 
-    /// A row has a cell for each column.
+    /// A row has a cell for each column. A cell may be from somebody else's file: it has no line ends, and commands no terminal.
     pub fn push(&mut self, row: impl Into<Vec<String>>) {
-        self.rows.push(row.into());
+        self.rows.push(row.into().iter().map(|cell| cell.replace(char::is_control, " ")).collect());
     }
 
     /// The table as text.
@@ -63,14 +60,19 @@ impl Table {
         match style {
             Style::Text => self.lines(|cells| format!("{}\n", cells.join("  ").trim_end())).concat(),
             Style::Markdown => {
-                let mut lines = self.lines(|cells| format!("| {} |\n", cells.join(" | ")));
+                let rows = self.rows.iter().map(|row| row.iter().map(|cell| markdown(cell)).collect());
+                let escaped = Self { right: self.right.clone(), rows: rows.collect() };
+                let mut lines = escaped.lines(|cells| format!("| {} |\n", cells.join(" | ")));
                 let rule = self.right.iter().map(|right| if *right { "---:" } else { "---" });
                 lines.insert(1, format!("| {} |\n", Vec::from_iter(rule).join(" | ")));
                 lines.concat()
             }
             Style::Latex => {
                 let line = |row: &Vec<String>| {
-                    format!("{} \\\\\n", row.iter().map(|cell| latex(cell)).collect::<Vec<_>>().join(" & "))
+                    let cells = row.iter().map(|cell| latex(cell)).collect::<Vec<_>>().join(" & ");
+                    // After the \\ of another row, these would be its options.
+                    let guard = if cells.trim_start().starts_with(['[', '*']) { "{}" } else { "" };
+                    format!("{guard}{cells} \\\\\n")
                 };
                 let mut lines: Vec<String> = self.rows.iter().map(line).collect();
                 lines.insert(1, "\\midrule\n".to_owned());
@@ -80,10 +82,6 @@ impl Table {
                     "\\begin{{tabular}}{{{columns}}}\n\\toprule\n{}\\bottomrule\n\\end{{tabular}}\n",
                     lines.concat()
                 )
-            }
-            Style::Csv => {
-                let line = |row: &Vec<String>| row.iter().map(|cell| csv(cell)).collect::<Vec<_>>().join(",") + "\n";
-                self.rows.iter().map(line).collect()
             }
         }
     }
@@ -119,9 +117,9 @@ fn latex(text: &str) -> String {
     text.chars().map(escaped).collect()
 }
 
-/// A cell as RFC 4180 has it.
-fn csv(cell: &str) -> String {
-    if cell.contains([',', '"', '\n']) { format!("\"{}\"", cell.replace('"', "\"\"")) } else { cell.to_owned() }
+/// A cell of a Markdown table, of which nothing is taken for another cell or for HTML.
+fn markdown(cell: &str) -> String {
+    cell.replace('\\', "\\\\").replace('|', "\\|").replace('<', "\\<")
 }
 
 #[cfg(test)]

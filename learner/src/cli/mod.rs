@@ -6,10 +6,12 @@ mod train;
 use std::net::SocketAddr;
 use std::path::PathBuf;
 
+use clap::builder::PossibleValuesParser;
 use clap::{Args, Parser, Subcommand};
 use clap_complete::Shell;
+use quad_algorithms::ALGORITHMS;
 use quad_dataset::{EnvironmentSpec, environment};
-use quad_run::config::{hyperparameters, presets, tasks};
+use quad_run::config::{presets, tasks};
 use quad_run::results::Select;
 use quad_runtime::parse_endpoint;
 
@@ -75,7 +77,7 @@ pub struct PresetsArgs {
     #[arg(long, group = "what")]
     pub metrics: bool,
     /// Algorithm [default: quad, or the one in the file; with --metrics all]
-    #[arg(long, value_name = "NAME", value_parser = parse_algorithm, requires = "what")]
+    #[arg(long, value_name = "NAME", value_parser = algorithm_names(), hide_possible_values = true, requires = "what")]
     pub algorithm: Option<String>,
 }
 
@@ -177,9 +179,6 @@ pub struct ReportArgs {
     /// Print the tables as LaTeX, which needs the package booktabs
     #[arg(long, group = "style")]
     pub latex: bool,
-    /// Print the tables as CSV, one after another, with notes as comments
-    #[arg(long, group = "style")]
-    pub csv: bool,
     /// Which evaluations make a run's score
     #[arg(long, value_enum, default_value = "last")]
     pub select: Select,
@@ -192,17 +191,21 @@ pub struct ReportArgs {
     pub figures: Option<PathBuf>,
 }
 
-fn parse_task(text: &str) -> Result<String, String> {
-    tasks::named(text).map(|task| task.name.clone()).map_err(|_| tasks::unknown_hint(text))
+/// The names of tasks, which clap checks and shells complete.
+fn task_names() -> PossibleValuesParser {
+    tasks::all().iter().map(|task| &*task.name).into()
+}
+
+/// The same of algorithms.
+fn algorithm_names() -> PossibleValuesParser {
+    ALGORITHMS.map(|known| known.name).into()
 }
 
 fn parse_preset(text: &str) -> Result<String, String> {
-    if presets::is_path(text) { Ok(text.to_owned()) } else { parse_task(text) }
-        .map_err(|hint| hint + "; a file of your own must end in .toml")
-}
-
-fn parse_algorithm(text: &str) -> Result<String, String> {
-    hyperparameters::algorithm(text).map(|known| known.name.to_owned()).map_err(|_| hyperparameters::unknown_hint(text))
+    if presets::is_path(text) || tasks::named(text).is_ok() {
+        return Ok(text.to_owned());
+    }
+    Err(tasks::unknown_hint(text) + "; a file of your own must end in .toml")
 }
 
 #[cfg(test)]

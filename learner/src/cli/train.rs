@@ -11,7 +11,7 @@ use quad_run::config::tables::{self, parse_assignment};
 use quad_runtime::parse_endpoint;
 use toml::{Table, Value};
 
-use super::{parse_algorithm, parse_preset, parse_task};
+use super::{algorithm_names, parse_preset, task_names};
 
 pub(super) const EXAMPLES: &str = "\
 Examples:
@@ -37,10 +37,10 @@ weights, bit for bit, as a run without interruption.";
 #[derive(Debug, Args)]
 pub struct TrainArgs {
     /// The task: an environment, a dataset, and the algorithm's values for them (`learner presets` lists tasks)
-    #[arg(long, value_name = "NAME", value_parser = parse_task, required_unless_present = "preset")]
+    #[arg(long, value_name = "NAME", value_parser = task_names(), hide_possible_values = true, required_unless_present = "preset")]
     task: Option<String>,
     /// The algorithm (`learner presets` lists algorithms) [default: quad]
-    #[arg(long, value_name = "NAME", value_parser = parse_algorithm)]
+    #[arg(long, value_name = "NAME", value_parser = algorithm_names(), hide_possible_values = true)]
     algorithm: Option<String>,
     /// A task, as --task NAME; or a file of your own with `task`, `algorithm` and the values to change
     #[arg(long, value_name = "NAME|FILE.toml", value_parser = parse_preset, conflicts_with = "task")]

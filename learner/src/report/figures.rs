@@ -28,23 +28,29 @@ pub fn draw_all(folder: &Path, report: &Report) -> anyhow::Result<()> {
     Ok(())
 }
 
+/// A picture's name for its file. What a task is called may come from somebody else's run, so it names no other folder.
+fn of_task(kind: &str, task: &str) -> String {
+    let is_plain = |c: char| c.is_alphanumeric() || "-_.".contains(c);
+    format!("{kind}-{}", task.replace(|c: char| !is_plain(c), "-"))
+}
+
 /// All pictures of a report, each with a name for its file: the learning curves of each task, and its scores over the
 /// hyper-parameter that an algorithm names, such as τ, where runs differ in it; the performance profiles of all tasks.
 pub fn all(report: &Report) -> Vec<(String, Picture)> {
     if let [run] = &report.runs[..] {
-        return vec![(format!("curve-{}", run.task), of_run(run))];
+        return vec![(of_task("curve", &run.task), of_run(run))];
     }
-    let mut of_task: BTreeMap<&str, Vec<&GroupReport>> = BTreeMap::new();
+    let mut by_task: BTreeMap<&str, Vec<&GroupReport>> = BTreeMap::new();
     for group in report.groups.iter().filter(|group| !group.runs.is_empty()) {
-        of_task.entry(&group.task).or_default().push(group);
+        by_task.entry(&group.task).or_default().push(group);
     }
     let mut pictures = vec![("profile".to_owned(), profiles(report))];
-    for (task, groups) in of_task {
-        pictures.push((format!("curve-{task}"), curves(task, &groups)));
+    for (task, groups) in by_task {
+        pictures.push((of_task("curve", task), curves(task, &groups)));
         for Definition { name, report, .. } in ALGORITHMS {
             if let Some(axis) = report.axis {
                 let of_algorithm = Vec::from_iter(groups.iter().copied().filter(|group| group.algorithm == name));
-                pictures.push((format!("{}-{task}", axis.key), over(axis, task, &of_algorithm)));
+                pictures.push((of_task(axis.key, task), over(axis, task, &of_algorithm)));
             }
         }
     }

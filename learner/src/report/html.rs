@@ -1,6 +1,8 @@
 //! The report as one HTML file that needs no other file: to send to a colleague, or to print.
 
 use std::collections::BTreeSet;
+use std::fs;
+use std::io::{self, ErrorKind};
 use std::path::Path;
 
 use anyhow::Context;
@@ -10,6 +12,7 @@ use minijinja::value::Serde;
 use quad_run::results::RunReport;
 use quad_run::table::Part;
 use serde::Serialize;
+use tracing::warn;
 
 use super::figures;
 use super::plot;
@@ -17,8 +20,12 @@ use super::remake;
 use super::seeds::GroupReport;
 use super::summary::Report;
 
-/// Pictures of an episode that a run's folder may hold, with their media types: `evaluator film RUN --out RUN/film.gif`.
-const FILMS: [(&str, &str); 2] = [("film.png", "image/png"), ("film.gif", "image/gif")];
+/// Pictures of an episode that a run's folder may hold, with their media types and what such a file begins with:
+/// `evaluator film RUN --out RUN/film.gif`.
+const FILMS: [(&str, &str, &[u8]); 2] =
+    [("film.png", "image/png", b"\x89PNG\r\n\x1a\n"), ("film.gif", "image/gif", b"GIF8")];
+/// Largest film, bytes: many times as large as any of ours.
+const LARGEST: u64 = 1 << 25;
 
 /// What the template is filled with.
 #[derive(Serialize)]
@@ -64,7 +71,7 @@ struct Fact {
 /// Writes the report.
 ///
 /// # Errors
-/// The file cannot be written, or a film of a run not be read.
+/// The file cannot be written.
 pub fn write(path: &Path, report: &Report) -> anyhow::Result<()> {
     let mut templates = Environment::new();
     // By its name all that is filled in is escaped, and nothing of a run's name is taken for HTML.
@@ -87,24 +94,38 @@ fn page(report: &Report) -> anyhow::Result<Page> {
         version: env!("CARGO_PKG_VERSION"),
         parts: report.summaries(true),
         figures: figures.collect::<anyhow::Result<_>>()?,
-        films: films(&report.runs)?,
+        films: films(&report.runs),
         groups: report.groups.iter().map(|group| of_group(group, &report.runs)).collect::<anyhow::Result<_>>()?,
         commands: commands(&report.runs),
     })
 }
 
-fn films(runs: &[RunReport]) -> anyhow::Result<Vec<Film>> {
+fn films(runs: &[RunReport]) -> Vec<Film> {
     let mut films = Vec::new();
     for run in runs {
-        for (path, kind) in FILMS.map(|(name, kind)| (run.dir.join(name), kind)) {
-            if path.exists() {
-                let bytes = std::fs::read(&path).with_context(|| format!("cannot read {}", path.display()))?;
-                let data = format!("data:{kind};base64,{}", BASE64_STANDARD.encode(bytes));
-                films.push(Film { run: run.run.clone(), data });
+        for (path, kind, begin) in FILMS.map(|(name, kind, begin)| (run.dir.join(name), kind, begin)) {
+            match film(&path, begin) {
+                Ok(bytes) => {
+                    let data = format!("data:{kind};base64,{}", BASE64_STANDARD.encode(bytes));
+                    films.push(Film { run: run.run.clone(), data });
+                }
+                Err(error) if error.kind() == ErrorKind::NotFound => {}
+                Err(error) => warn!("{} is not in the report: {error}", path.display()),
             }
         }
     }
-    Ok(films)
+    films
+}
+
+/// Reads a film. The folder may be somebody else's, and the report is made to be sent: no other file gets into it by a link or
+/// another name.
+fn film(path: &Path, begin: &[u8]) -> io::Result<Vec<u8>> {
+    let found = fs::symlink_metadata(path)?;
+    if !found.is_file() || found.len() > LARGEST {
+        return Err(io::Error::other("it is a link or too large"));
+    }
+    let bytes = fs::read(path)?;
+    if bytes.starts_with(begin) { Ok(bytes) } else { Err(io::Error::other("it is no such picture")) }
 }
 
 fn of_group(group: &GroupReport, runs: &[RunReport]) -> anyhow::Result<Group> {
@@ -144,10 +165,8 @@ fn of_group(group: &GroupReport, runs: &[RunReport]) -> anyhow::Result<Group> {
 fn commands(runs: &[RunReport]) -> String {
     let command = |run: &RunReport| {
         remake::command(run).unwrap_or_else(|| {
-            format!(
-                "# {}: save the settings below as FILE.toml, and learner train --preset FILE.toml",
-                run.dir.display()
-            )
+            // Quoted: a folder's name may have two lines.
+            format!("# {:?}: save the settings below as FILE.toml, and learner train --preset FILE.toml", run.dir)
         })
     };
     let dirs: Vec<String> = runs.iter().map(|run| remake::quoted(&run.dir.to_string_lossy())).collect();

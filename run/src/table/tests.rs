@@ -20,8 +20,30 @@ fn what_a_format_would_take_for_its_own_is_escaped() {
     table.push(["50 %, & more".to_owned(), "1 ± 2 \"x\"".to_owned()]);
     let latex = "\\begin{tabular}{lr}\n\\toprule\na\\_b & b \\\\\n\\midrule\n50 \\%, \\& more & 1 $\\pm$ 2 \"x\" \\\\\n\\bottomrule\n\\end{tabular}\n";
     assert_eq!(table.render(Style::Latex), latex);
-    assert_eq!(table.render(Style::Csv), "a_b,b\n\"50 %, & more\",\"1 ± 2 \"\"x\"\"\"\n");
     let words = Part::Words("±1 of a_b\nand\n".to_owned());
     assert_eq!(words.render(Style::Latex), "$\\pm$1 of a\\_b\n\nand\n\n");
-    assert_eq!(words.render(Style::Csv), "# ±1 of a_b\n# and\n");
+}
+
+/// Tasks are called what their users' files are called, and runs may be somebody else's.
+#[test]
+fn a_name_changes_no_table() {
+    for (name, text, markdown, latex) in [
+        ("[2cm]", "[2cm]", "[2cm]", "{}[2cm]"),
+        ("*", "*", "*", "{}*"),
+        ("a|b", "a|b", "a\\|b", "a|b"),
+        ("a\\|b", "a\\|b", "a\\\\\\|b", "a\\textbackslash{}|b"),
+        ("<b>", "<b>", "\\<b>", "$<$b$>$"),
+        ("a\nb\u{1b}[2J", "a b [2J", "a b [2J", "a b [2J"),
+    ] {
+        let mut table = Table::new(&[("task", Left)]);
+        table.push([name.to_owned()]);
+        for (style, cell) in [
+            (Style::Text, text.to_owned()),
+            (Style::Markdown, format!("| {markdown:4} |")),
+            (Style::Latex, format!("{latex} \\\\")),
+        ] {
+            let rendered = table.render(style);
+            assert!(rendered.lines().any(|line| line == cell), "{cell:?} is missing in {rendered:?}");
+        }
+    }
 }

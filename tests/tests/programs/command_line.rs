@@ -70,7 +70,7 @@ fn a_wrong_name_is_answered_with_the_right_ones() {
     for (arguments, code, words) in [
         (&["--task", "walker2d-medium-reply-v2"][..], 2, &["walker2d-medium-replay-v2"][..]),
         (&["--preset", "hopper-demo-iql"], 2, &["did you mean hopper-demo"]),
-        (&["--task", "hopper-demo", "--algorithm", "quads"], 2, &["did you mean quad"]),
+        (&["--task", "hopper-demo", "--algorithm", "quads"], 2, &["a similar value exists: 'quad'"]),
         (&["--task", "hopper-demo", "--agent", "tua=0.5"], 1, &["`tua`", "`tau`", "hint:"]),
         (&["--task", "hopper-demo", "--set", "tau=0.5"], 1, &["`tau`", "hint:", "--agent KEY=VALUE"]),
         (&["--preset", own.to_str().unwrap()], 1, &["`batchsize`", "`batch_size`", "hint:"]),
@@ -101,6 +101,8 @@ fn bash_completes_commands_and_arguments() {
         ("learner", "rep", "report"),
         ("learner", "train --dr", "--dry-run"),
         ("learner", "report --select la", "last"),
+        ("learner", "train --algorithm one", "onestep"),
+        ("learner", "train --task walker2d-d", "walker2d-demo"),
         ("evaluator", "film --comp", "--compare"),
     ] {
         // As bash calls it: the command, the word that is completed, and the one before it.
