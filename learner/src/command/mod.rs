@@ -9,13 +9,14 @@ mod train;
 
 use std::fmt::Alignment::{Left, Right};
 
+use anyhow::anyhow;
 use clap::CommandFactory;
 use clap_complete::Shell;
 use quad_algorithms::{ALGORITHMS, Definition, Values};
 use quad_dataset::{DatasetError, environment};
 use quad_run::config::hyperparameters;
 use quad_run::config::{Preset, tasks};
-use quad_run::run::{RunDirError, runs_in, verify};
+use quad_run::run::{RunDirError, verify};
 use quad_run::status::list;
 use quad_run::table::{Style, Table};
 use quad_runtime::{Hint, hinted, json, print, unfinished};
@@ -101,10 +102,7 @@ fn print_preset(preset: &Preset, algorithm: Option<&str>) -> anyhow::Result<()> 
 
 fn report(args: &ReportArgs) -> anyhow::Result<()> {
     let report = Report::read(&args.dirs, args.select)?;
-    // Other files beside runs, which `runs/*` includes, do not prevent the report.
-    for other in args.dirs.iter().filter(|dir| runs_in(dir).is_empty()) {
-        warn!("there is no run in {}", other.display());
-    }
+    report.unreadable.iter().for_each(|error| warn!("not in this report: {error}"));
     if let Some(folder) = &args.figures {
         draw_all(folder, &report)?;
         info!("figures: {}", folder.display());
@@ -113,13 +111,20 @@ fn report(args: &ReportArgs) -> anyhow::Result<()> {
         write_html(path, &report)?;
         info!("report: {}", path.display());
     }
-    let style = match (args.markdown, args.latex, args.csv) {
-        (true, ..) => Style::Markdown,
-        (_, true, _) => Style::Latex,
-        (.., true) => Style::Csv,
+    let style = match (args.markdown, args.latex) {
+        (true, _) => Style::Markdown,
+        (_, true) => Style::Latex,
         _ => Style::Text,
     };
-    print(&if args.json { json(&report)? } else { report.render(style) })
+    print(&if args.json { json(&report)? } else { report.render(style) })?;
+    all_readable(report.unreadable.len())
+}
+
+/// An error if that many folders could not be read, after all else was done.
+fn all_readable(unreadable: usize) -> anyhow::Result<()> {
+    let hint = "put a copy of the damaged file in its place; a line of scores.jsonl may also be taken out: its episode is \
+                scored again";
+    if unreadable == 0 { Ok(()) } else { Err(anyhow!("{unreadable} folders cannot be read")).hint(hint) }
 }
 
 fn check_runs(args: &VerifyArgs) -> anyhow::Result<()> {

@@ -13,6 +13,7 @@ use quad_run::table::{Style, Table};
 use quad_runtime::{Hint, SessionError, hinted, open_router, print, stay_in_background, threads_asked, unfinished};
 use tracing::info;
 
+use super::all_readable;
 use super::train::record_hint;
 use crate::cli::SweepArgs;
 use crate::local_evaluators::LocalEvaluators;
@@ -27,14 +28,18 @@ pub fn sweep(args: &SweepArgs) -> anyhow::Result<()> {
     let folder = args.runs.join(&study.name);
     let runs = chosen(&study, args, &folder)?;
     if args.list {
-        return print(&list(&runs));
+        print(&list(&runs))?;
+        return all_readable(runs.iter().filter(|(_, state)| *state == State::Unreadable).count());
     }
     info!("{}: {}", study.name, study.about);
     let count = runs.len();
     let left: Runs = runs.into_iter().filter(|(_, state)| *state != State::Complete).collect();
+    let complete = count - left.len();
+    let (unreadable, left): (Runs, Runs) = left.into_iter().partition(|(_, state)| *state == State::Unreadable);
     let begun = left.iter().filter(|(_, state)| *state != State::NotBegun).count();
-    info!("{count} runs: {} complete, {} to do, of which {begun} have begun", count - left.len(), left.len());
-    let ended = if left.is_empty() { Ended::default() } else { work(args, &study.name, &folder, left)? };
+    info!("{count} runs: {complete} complete, {} to do, of which {begun} have begun", left.len());
+    let mut ended = if left.is_empty() { Ended::default() } else { work(args, &study.name, &folder, left)? };
+    ended.failed.extend(unreadable.iter().map(|(run, _)| format!("{}: its folder cannot be read", run.name)));
     conclude(&folder, count, ended)
 }
 

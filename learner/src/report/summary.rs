@@ -2,12 +2,14 @@
 
 use std::collections::BTreeSet;
 use std::fmt::Alignment::{Left, Right};
-use std::path::PathBuf;
+use std::io;
+use std::path::{Path, PathBuf};
 
 use quad_run::results::{RunReport, Select, Spread};
-use quad_run::run::runs_in;
+use quad_run::run::walk;
 use quad_run::table::{Part, Style, Table};
 use serde::Serialize;
+use tracing::warn;
 
 use super::paper;
 use super::seeds::{self, GroupReport};
@@ -26,29 +28,44 @@ pub struct Report {
     pub study: Vec<MethodReport>,
     /// Each method against the first.
     pub comparisons: Vec<Comparison>,
+    /// The folders that cannot be read, each with the reason.
+    pub unreadable: Vec<String>,
     /// Folders of runs that were named themselves.
     #[serde(skip)]
     in_full: BTreeSet<PathBuf>,
 }
 
 impl Report {
-    /// Reads run folders, and those below other folders.
+    /// Reads run folders, and those below other folders. One that cannot be read keeps no other from being reported.
     ///
     /// # Errors
-    /// There is no run in any of them, or one has a file that no learner writes.
+    /// None of them holds a run that can be read.
     pub fn read(paths: &[PathBuf], select: Select) -> anyhow::Result<Self> {
-        let mut found: Vec<PathBuf> = Vec::new();
-        for path in paths.iter().flat_map(|path| runs_in(path)) {
-            if !found.contains(&path) {
-                found.push(path);
+        let mut unreadable = Vec::new();
+        let mut note = |dir: &Path, error: io::Error| {
+            // A pattern like `runs/*` has other files, too.
+            if !matches!(error.kind(), io::ErrorKind::NotADirectory | io::ErrorKind::NotFound) {
+                unreadable.push(format!("cannot read {}: {error}", dir.display()));
             }
+        };
+        let (mut found, mut seen) = (Vec::new(), BTreeSet::new());
+        for path in paths {
+            let dirs = walk(path, &mut note);
+            if dirs.is_empty() && paths.len() > 1 {
+                warn!("there is no run in {}", path.display());
+            }
+            found.extend(dirs.into_iter().filter(|dir| seen.insert(dir.clone())));
         }
-        // Where there is none, the first path's error says so.
-        let dirs = if found.is_empty() { &paths[..1] } else { &found };
-        let runs: Vec<_> = dirs.iter().map(|path| RunReport::read(path)).collect::<anyhow::Result<_>>()?;
+        let read = |dir: &PathBuf| RunReport::read(dir).map_err(|error| unreadable.push(format!("{error:#}"))).ok();
+        let runs: Vec<_> = found.iter().filter_map(read).collect();
+        if runs.is_empty() {
+            // What is wrong with the first, or that there is none.
+            RunReport::read(found.first().unwrap_or(&paths[0]))?;
+        }
         let groups = seeds::groups(&runs, select);
         let (study, comparisons) = study::study(&groups);
-        Ok(Self { select, runs, groups, study, comparisons, in_full: paths.iter().cloned().collect() })
+        let in_full = paths.iter().cloned().collect();
+        Ok(Self { select, runs, groups, study, comparisons, unreadable, in_full })
     }
 
     /// Every part: a table of each run that was named itself, the summaries over seeds, methods and tasks if there are several
@@ -56,7 +73,7 @@ impl Report {
     pub fn render(&self, style: Style) -> String {
         let mut parts = Vec::new();
         if style == Style::Text {
-            let in_full = self.runs.iter().filter(|run| self.in_full.contains(&run.dir));
+            let in_full = self.runs.iter().filter(|run| self.runs.len() == 1 || self.in_full.contains(&run.dir));
             parts.extend(in_full.map(|run| Part::Words(self.table(run))));
         }
         parts.extend(self.summaries(style != Style::Text));
@@ -72,6 +89,8 @@ impl Report {
         if self.runs.len() > 1 && !self.study.is_empty() {
             parts.extend(study::tables(&self.study, &self.comparisons));
         }
+        let unreadable = self.unreadable.iter().map(|error| format!("Not in this report: {error}.\n"));
+        parts.extend((!self.unreadable.is_empty()).then(|| Part::Words(unreadable.collect())));
         parts.extend([1, 2].into_iter().flat_map(|number| paper::table(number, &self.groups, self.select)));
         parts
     }

@@ -12,6 +12,7 @@ use quad_run::status::State;
 use quad_runtime::{Hint, hinted, hints};
 use serde::Deserialize;
 use toml::{Table, Value};
+use tracing::warn;
 
 use super::axes::{Combination, axes, combinations};
 use super::names;
@@ -89,12 +90,13 @@ impl PlannedRun {
     /// How far the run in a folder is.
     ///
     /// # Errors
-    /// A run with other settings is there, or a file is not what a learner writes.
+    /// A run with other settings is there.
     pub fn state(&self, dir: &Path) -> anyhow::Result<State> {
         if !RunDir::is_occupied(dir) {
             return Ok(if RunDir::at(dir).has_failed() { State::Failed(0) } else { State::NotBegun });
         }
-        let report = RunReport::scored(dir)?;
+        let read = RunReport::scored(dir).inspect_err(|error| warn!("{error:#}"));
+        let Ok(report) = read else { return Ok(State::Unreadable) };
         let (there, planned) = (&report.config.experiment, &self.experiment);
         let (old, new) = (settings::of_experiment(there), settings::of_experiment(planned));
         let mut differences: Vec<_> = settings::differences(&old, &new).map(String::as_str).collect();

@@ -1,7 +1,10 @@
 //! `learner presets`, `list`, `report`, `verify` and `train --dry-run`, as a user calls them on files that a test has made up.
 #![allow(clippy::unwrap_used, clippy::expect_used)]
 
+mod damaged;
 mod dry_run;
+mod endless;
+mod foreign;
 mod list;
 mod online;
 mod presets;

@@ -9,6 +9,7 @@ use std::path::{Path, PathBuf};
 use std::thread::sleep;
 use std::time::Duration;
 
+use super::durable::open_file;
 use super::error::{RunDirError, io_error};
 
 /// A lock that another process has is tried again after this time: `learner list` takes one for microseconds.
@@ -69,7 +70,7 @@ impl Lock {
     /// Whether another process has the lock of the file alone. Where files have no locks, one that was killed may still seem
     /// to have it.
     pub fn is_taken(path: &Path) -> bool {
-        let Ok(file) = File::open(path) else { return false };
+        let Ok(file) = open_file(path) else { return false };
         match file.try_lock_shared() {
             Ok(()) => false,
             Err(TryLockError::WouldBlock) => true,

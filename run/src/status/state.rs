@@ -1,14 +1,13 @@
 //! How far a run is, by its folder alone.
 
 use std::fmt;
-use std::fs::File;
 use std::io::{self, Read, Seek, SeekFrom};
 use std::path::Path;
 
 use serde::Deserialize;
 
 use crate::results::RunReport;
-use crate::run::{RunDir, RunDirError};
+use crate::run::{RunDir, RunDirError, open_file};
 
 /// The last two lines of `metrics.jsonl` are in its last bytes, so many.
 const TAIL: u64 = 8192;
@@ -24,6 +23,8 @@ pub enum State {
     Failed(u64),
     /// All steps are done and all episodes scored.
     Complete,
+    /// A file in its folder is not what a learner writes.
+    Unreadable,
 }
 
 impl State {
@@ -45,7 +46,7 @@ impl State {
     /// Steps that are done, of a run of so many.
     pub fn step(self, steps: u64) -> u64 {
         match self {
-            Self::NotBegun => 0,
+            Self::NotBegun | Self::Unreadable => 0,
             Self::Begun(step) | Self::Failed(step) => step,
             Self::Complete => steps,
         }
@@ -59,6 +60,7 @@ impl State {
             Self::Begun(step) => format!("{step} of {steps} steps"),
             Self::Failed(step) => format!("failed after {step} of {steps} steps"),
             Self::Complete => "complete".to_owned(),
+            Self::Unreadable => "cannot be read".to_owned(),
         }
     }
 }
@@ -107,7 +109,7 @@ struct Row {
 /// The last lines of `metrics.jsonl`; those that are half written or half read are none.
 fn rows(dir: &Path) -> Vec<Row> {
     let read = || -> io::Result<Vec<u8>> {
-        let mut file = File::open(dir.join("metrics.jsonl"))?;
+        let mut file = open_file(&dir.join("metrics.jsonl"))?;
         let length = file.metadata()?.len();
         file.seek(SeekFrom::Start(length.saturating_sub(TAIL)))?;
         let mut bytes = Vec::new();
