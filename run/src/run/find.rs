@@ -6,12 +6,8 @@ use std::path::{Path, PathBuf};
 
 use super::folder::RunDir;
 
-/// A folder that holds a run, or those of such folders at any depth below it, in alphabetical order.
-pub fn runs_in(path: &Path) -> Vec<PathBuf> {
-    walk(path, &mut |_, _| {})
-}
-
-/// Finds all runs below a path; folders that cannot be read are handed to `unreadable`.
+/// A folder that holds a run, or those of such folders at any depth below it, in alphabetical order. Folders that cannot be
+/// read are handed to `unreadable`.
 pub fn walk(path: &Path, unreadable: &mut impl FnMut(&Path, io::Error)) -> Vec<PathBuf> {
     if RunDir::is_occupied(path) {
         return vec![path.to_owned()];
