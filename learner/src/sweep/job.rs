@@ -79,7 +79,6 @@ impl Prepared {
         command.env("RAYON_NUM_THREADS", with.threads.to_string());
         not_encrypted(&mut command, &with.endpoint);
         fs::create_dir_all(&dir)
-            .and_then(|()| RunDir::at(&dir).mark_failed(false))
             .and_then(|()| run_beside(&mut command, &log(&dir)))
             .with_context(|| format!("{}: cannot write to {}", run.name, dir.display()))?;
         let logged = fs::metadata(log(&dir)).map_or(0, |log| log.len());
