@@ -1,4 +1,4 @@
-//! Transitions that a program has in memory, and the file that it writes of them: the layout for people's own data.
+//! Transitions that a program has in memory, and the file that it writes of them: the custom layout.
 
 use std::path::Path;
 use std::str::FromStr;
@@ -33,7 +33,7 @@ pub struct Arrays {
 }
 
 impl Arrays {
-    /// The same as rows of a recording, not judged yet.
+    /// Turns the arrays into rows of a recording, not judged yet.
     pub(crate) fn into_recording(self) -> Result<Recording, Problem> {
         let (rows, o, a) = (self.rewards.len(), self.observation_dim, self.action_dim);
         for (array, width, found) in [
@@ -68,7 +68,7 @@ impl Arrays {
     }
 }
 
-/// Writes the layout for people's own data (docs/data.md) in float32, compressed. The file appears under its name when it is
+/// Writes the custom layout (docs/data.md) in float32, compressed. The file appears under its name when it is
 /// whole; one that was there is replaced. The folder is made if need be.
 ///
 /// # Errors

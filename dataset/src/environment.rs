@@ -51,7 +51,7 @@ pub struct EnvironmentSpec {
 pub enum Goal {
     /// Once, when the environment is made (D4RL's AntMaze v0 and v1).
     EachInstance,
-    /// At each reset (D4RL's AntMaze v2).
+    /// The goal is drawn at each reset (D4RL's AntMaze v2).
     EachEpisode,
 }
 
@@ -99,7 +99,7 @@ pub(crate) fn find_gymnasium(id: &str) -> Option<&'static EnvironmentSpec> {
 }
 
 impl EnvironmentSpec {
-    /// Whose physics it has: a name that several environments may share.
+    /// Name of the physics, which several environments may share.
     pub fn simulation(&self) -> &str {
         self.simulation.as_deref().unwrap_or(&self.name)
     }

@@ -55,7 +55,7 @@ pub enum Problem {
     /// HDF5 does not recognise the file as a whole one of its own.
     #[error("not an HDF5 file, or a damaged or incomplete one")]
     DamagedHdf5(#[source] hdf5::Error),
-    /// Not a whole npz archive.
+    /// The npz archive is not whole.
     #[error("a damaged or incomplete npz archive")]
     DamagedNpz(#[source] zip::result::ZipError),
     /// Minari's metadata is not what Minari writes.
@@ -140,7 +140,7 @@ pub enum Problem {
     DiscreteActions { array: String },
     /// A D4RL file whose rows do not follow one another.
     #[error(
-        "array `next_observations`, row {row}: not the observation of the row that follows, though the episode goes on there{}",
+        "array `next_observations`, row {row}: not the observation of the row that follows, though the episode continues there{}",
         such_rows(*.rows)
     )]
     Stray {

@@ -1,5 +1,5 @@
-//! What the files mean: D4RL, Minari, OGBench and people's own logs in, transitions and mini-batches out; D4RL's
-//! and people's own HDF5 written.
+//! Reads D4RL, Minari, OGBench and custom HDF5, yields transitions and mini-batches, and writes D4RL's and custom
+//! HDF5.
 //!
 //! # Layout
 //! In reading order: [`environment`] is all that is known of an environment, `simulated` that part of it by which evaluators
@@ -8,7 +8,7 @@
 //! `recording`. `transitions` are what is learnt from, unless `checks` has objections, with `reward`, `scale` and `statistics`
 //! beside it; `doubts` and `resets` are what makes learning from them doubtful; `sampler` draws mini-batches; `inspect`
 //! describes a source to people, whatever is wrong with it. `recorded` is a D4RL file as it was recorded, row by row; `writer`
-//! writes such a file, and `arrays` one of people's own layout, both by `new_file`. [`catalogue`] lists the files that can be
+//! writes such a file, and `arrays` one of the custom layout, both by `new_file`. [`catalogue`] lists the files that can be
 //! asked for by name; `error` is what can go wrong with any of them.
 //!
 //! This crate knows nothing of networks, simulators or the wire.

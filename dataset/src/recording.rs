@@ -41,7 +41,7 @@ pub(crate) struct Recording {
     pub timeouts: Vec<bool>,
     /// Whether a row is the last step of its episode; N.
     pub ends: Vec<bool>,
-    /// Whether the task is to reach a goal, after which the recording goes on.
+    /// Whether the task is to reach a goal, after which the recording continues.
     pub goal: bool,
     /// Where the file has several arrays of each kind: the first row of each, and the path of the group it is in.
     pub parts: Vec<(usize, String)>,
@@ -103,7 +103,7 @@ impl Recording {
         !ends && is_step && !self.next_observations.as_ref().is_some_and(|next| self.jumps(next, row))
     }
 
-    /// Whether `following`, the next row to learn from after `row`, goes on where that one led to.
+    /// Whether `following`, the next row to learn from after `row`, continues where that one led to.
     fn continues(&self, row: usize, following: usize) -> bool {
         following == row + 1 || !differ(self.observation(following), self.observation(row + 1))
     }

@@ -7,14 +7,14 @@
 
 use crate::recording::{Recording, RowKind};
 
-/// For each end of an episode, so many of the longest steps can be resets.
+/// Longest steps that may be resets, for each end of an episode.
 const CANDIDATES: usize = 4;
-/// At most one step in so many can be a reset.
+/// Steps of which at most one can be a reset.
 const STEPS_BETWEEN_RESETS: usize = 20;
 /// Fewer resets beside the flags prove nothing, nor does a smaller share of the flags, as a crash may be a long step, too.
 const FEWEST: usize = 5;
 const SMALLEST_SHARE: usize = 4;
-/// Of so many resets beside the flags, one may be at a flag.
+/// One in this many resets beside the flags may be at a flag.
 const EXCEPTION: usize = 10;
 
 /// One sentence for each kind of flag that is a row out of step with the resets.

@@ -18,7 +18,7 @@ pub struct Planar {
     /// Limit of each observed velocity.
     #[serde(default = "unlimited")]
     pub observed_velocity: f64,
-    /// Within which limits an episode goes on; without any it always does.
+    /// Limits within which an episode continues; without any it always does.
     #[serde(default)]
     pub healthy: Option<Healthy>,
 }
@@ -37,7 +37,7 @@ pub enum Noise {
     NormalVelocities(f64),
 }
 
-/// Limits, themselves excluded, within which an episode goes on.
+/// Limits, themselves excluded, within which an episode continues.
 #[derive(Debug, PartialEq, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Healthy {
@@ -51,7 +51,7 @@ pub struct Healthy {
 }
 
 impl Healthy {
-    /// Whether an episode goes on in a state. False for NaN, because no comparison with NaN holds.
+    /// Whether an episode continues in a state. False for NaN, because no comparison with NaN holds.
     pub fn contains(&self, qpos: &[f64], qvel: &[f64]) -> bool {
         let within = |(least, most): (f64, f64), value: f64| value > least && value < most;
         let mut others = qpos[2..].iter().chain(qvel);

@@ -62,9 +62,9 @@ pub struct ReadOptions {
 /// The source's rows stay as they are; a transition is the number i of a row, and its next observation is row i + 1's,
 /// unless the format stores next observations of their own.
 ///
-/// A transition is followed by the next one if its episode goes on there. An episode ends at a terminal, also at a goal after
-/// which the recording goes on; at a timeout; and where the next row does not start where the transition led to. A row
-/// that makes no transition (D4RL's timeouts) is no part of an episode, but its action is known as the last next action.
+/// A transition is followed by the next one if its episode continues there. An episode ends at a terminal, also at a goal after
+/// which the recording continues; at a timeout; and where the next row does not start where the transition led to. A row
+/// that makes no transition (D4RL's timeouts) is no part of an episode, but its action serves as the previous row's next action.
 pub struct Transitions {
     observation_dim: usize,
     action_dim: usize,
@@ -88,7 +88,7 @@ pub struct Transitions {
 }
 
 impl Transitions {
-    /// Reads a D4RL file, a Minari dataset, an OGBench file or one of people's own layout; docs/data.md has the rules of
+    /// Reads a D4RL file, a Minari dataset, an OGBench file or one of the custom layout; docs/data.md has the rules of
     /// each. Data that would spoil training is refused: numbers that are not finite, actions outside [-1, 1] that are not to be
     /// scaled, other sizes than the environment's or another environment, a file that is one endless episode or makes no
     /// transition.

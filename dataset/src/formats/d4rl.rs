@@ -21,7 +21,7 @@ pub(super) fn read(file: &Hdf5File, environment: Option<&EnvironmentSpec>) -> Re
         (false, Some(environment)) => derive_timeouts(&terminals, environment.max_episode_steps),
         (false, None) => vec![false; rows],
     };
-    // A recording goes on after the goal: only its timeouts end an episode.
+    // A recording continues after the goal: only its timeouts end an episode.
     let goal = environment.is_some_and(|environment| environment.goal.is_some()) || file.has("infos/goal");
     let until_timeout = goal && timeouts.contains(&true);
     let ends = terminals.iter().zip(&timeouts).map(|(&terminal, &timeout)| timeout || (terminal && !until_timeout));

@@ -1,4 +1,4 @@
-//! The layout for people's own data: HDF5, one row a transition.
+//! The custom layout: HDF5, one row a transition.
 
 use crate::error::DatasetError;
 use crate::hdf5_file::Hdf5File;

@@ -48,7 +48,7 @@ fn leaps(recording: &Recording) -> Option<String> {
     let (row, rows) = (leaps.next()?, 1 + leaps.count());
     let (array, row) = recording.place("observations", row);
     Some(format!(
-        "array `{array}`, row {row}: the next place is more than {LONGEST_STEP} m away, though the episode goes on \
+        "array `{array}`, row {row}: the next place is more than {LONGEST_STEP} m away, though the episode continues \
          there{}; are the timeouts out of step with the resets?",
         such_rows(rows)
     ))

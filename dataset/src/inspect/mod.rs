@@ -25,7 +25,7 @@ pub use histogram::Histogram;
 pub struct Inspection {
     /// The file or folder.
     pub path: PathBuf,
-    /// The format it was read as: `D4RL`, `Minari`, `OGBench` or `transitions`, which is people's own.
+    /// The format it was read as: `D4RL`, `Minari`, `OGBench` or `transitions`, the custom layout.
     pub format: &'static str,
     /// The environment that it was inspected as: the one that was asked for, or else the one that it says it is from.
     pub environment: Option<String>,
@@ -56,11 +56,11 @@ pub struct Inspection {
     pub reward_range: Range,
     /// Smallest and largest number in an action.
     pub action_range: Range,
-    /// The same of each of an action's numbers.
+    /// Smallest and largest value of each of an action's numbers.
     pub action_ranges: Vec<Range>,
     /// Smallest and largest number in an observation.
     pub observation_range: Range,
-    /// The same of each of an observation's numbers.
+    /// Smallest and largest value of each of an observation's numbers.
     pub observation_ranges: Vec<Range>,
     /// Share of the steps that are terminal.
     pub terminals: f64,
@@ -102,7 +102,7 @@ impl Range {
         Self { min, max }
     }
 
-    /// Of each of the `width` numbers of the rows that are asked for.
+    /// Finds the range of each of a row's `width` numbers, over the rows that are asked for.
     fn of_columns(values: &[f32], width: usize, rows: impl Fn(usize) -> bool) -> Vec<Self> {
         let column = |column: usize| {
             let values = values.iter().skip(column).step_by(width).enumerate();

@@ -70,7 +70,7 @@ fn rows_that_do_not_follow_one_another_are_refused() {
         let error = Transitions::read(&path, &options).err().unwrap();
         // Of 600 rows two end an episode, and after the last one there is nothing to compare it with.
         let expected = "array `next_observations`, row 0: not the observation of the row that follows, though the episode \
-                        goes on there (597 such rows)";
+                        continues there (597 such rows)";
         assert!(error.to_string().ends_with(expected), "{error}");
         assert!(error.hint().contains("`layout`") && error.hint().contains("timeouts"), "{}", error.hint());
     }

@@ -56,7 +56,7 @@ impl Cart {
         self.rewards.len()
     }
 
-    /// Writes it in D4RL's layout, or in people's own.
+    /// Writes it in D4RL's layout, or in the custom one.
     fn write(&self, path: &Path, own: bool) {
         fn put<T: H5Type>(file: &hdf5::File, array: &str, rows: usize, values: &[T]) {
             let view = ArrayViewD::from_shape(vec![rows, values.len() / rows], values).unwrap();

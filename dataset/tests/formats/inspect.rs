@@ -121,7 +121,7 @@ fn missing_timeouts_and_stored_observations_that_do_not_follow() {
     let Some((_folder, path)) = generated("v1") else { return };
     let problems = inspect(&path, Some(hopper())).unwrap().problems;
     let expected = "array `next_observations`, row 100: not the observation of the row that follows, though the episode \
-                    goes on there; is a timeout missing?";
+                    continues there; is a timeout missing?";
     assert_eq!(problems, [expected]);
 }
 

@@ -302,7 +302,7 @@ LAYOUTS = {
 
 
 def write_own(out, layout="text", action="float32"):
-    """Three episodes of three rows in the layout for people's own data, without timeouts and without terminals."""
+    """Three episodes of three rows in the custom layout, without timeouts and without terminals."""
     steps = np.arange(9) + 10.0 * (np.arange(9) // 3)
     with h5py.File(out, "w") as file:
         file.attrs["layout"] = LAYOUTS[layout]

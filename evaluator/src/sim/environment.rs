@@ -78,7 +78,7 @@ pub enum EnvironmentError {
     /// MuJoCo refused the embedded model: the library is not the version that this program was built for.
     #[error("MuJoCo could not compile the model of \"{simulation}\": {reason}")]
     Model {
-        /// Whose model.
+        /// Name of the simulation whose model it is.
         simulation: &'static str,
         /// MuJoCo's error message.
         reason: String,
