@@ -35,8 +35,9 @@ class Worker:
             command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, env=environment, start_new_session=True
         )
         assert self.process.stdin and self.process.stdout
+        self._out = self.process.stdout
         # A process that the worker's environment has forked holds the pipe, too: it may never end.
-        os.set_blocking(self.process.stdout.fileno(), False)
+        os.set_blocking(self._out.fileno(), False)
         try:
             with self.process.stdin as pipe:
                 for part in self._payload:
@@ -69,7 +70,7 @@ class Worker:
             self._again = now + pause
             print(f"quad_rl: a worker ended ({self._end()}); it is started again in {pause} s", file=sys.stderr)
         if now >= self._again:
-            self._close()
+            self._out.close()
             self.start()
 
     def end(self) -> None:
@@ -83,16 +84,11 @@ class Worker:
         except subprocess.TimeoutExpired:
             self.process.kill()
             self.process.wait()
-        self._close()
+        self._out.close()
 
     def _said(self) -> bytes:
         """What it has said since it was asked last."""
-        assert self.process.stdout
-        return self.process.stdout.read() or b""
-
-    def _close(self) -> None:
-        assert self.process.stdout
-        self.process.stdout.close()
+        return self._out.read() or b""
 
     def _end(self) -> str:
         """How it ended, e.g. "Killed"."""
