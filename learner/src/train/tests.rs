@@ -25,7 +25,6 @@ struct Result {
     outcome: std::result::Result<Outcome, TrainError>,
     /// Step, whether it is to be evaluated.
     snapshots: Vec<(u64, bool)>,
-    /// The newest one.
     checkpoint: Option<Checkpoint>,
     rows: Vec<results::Row>,
     metrics: TrainingMetrics,
@@ -297,6 +296,5 @@ fn the_estimate_of_a_step_is_the_mean_over_all_phases() {
     };
     let mut agent = Agent::new(definition, &toml::Table::new(), context(100)).unwrap();
     let mut sampler = BatchSampler::new(agent.items(), 4, 0, 0);
-    let seconds = mean_step(&mut agent, &mut sampler, 100).unwrap();
-    assert!(seconds >= 0.01, "{seconds}: the second phase is not in it");
+    assert!(mean_step(&mut agent, &mut sampler, 100).unwrap() >= 0.01, "the second phase is not in it");
 }

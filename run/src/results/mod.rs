@@ -1,9 +1,10 @@
 //! The results of a run: its scores, summarised; the statistics of many runs; and the paper's own figures.
 //!
-//! In reading order: `run` reads a run; `statistics` has the definitions; `published` has the paper's figures, `departures` the
+//! In reading order: `run` reads a run, `evaluation` summarises one of its evaluations; `statistics` has the definitions; `published` has the paper's figures, `departures` the
 //! differences between a run and the paper's. `selection` and `spread` are small parts of these.
 
 pub mod departures;
+pub mod evaluation;
 pub mod published;
 pub mod run;
 pub mod selection;

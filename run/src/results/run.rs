@@ -11,6 +11,7 @@ use quad_algorithms::{MetricsLine, Summary};
 use quad_dataset::environment;
 use serde::Serialize;
 
+use super::evaluation::EvaluationReport;
 use super::spread::Spread;
 use crate::config::RunConfig;
 use crate::run::{RunDir, ScoreLine, open_file};
@@ -18,23 +19,6 @@ use crate::table::{Style, Table};
 
 /// Gradient steps at the end of a run over which the paper's appendix B takes the mean.
 const FINAL_STEPS: u64 = 50_000;
-
-/// One snapshot's episodes.
-#[derive(Clone, Debug, PartialEq, Serialize)]
-pub struct EvaluationReport {
-    /// Gradient step of the snapshot.
-    pub step: u64,
-    /// Episodes scored.
-    pub episodes: usize,
-    /// Whether these are all of them.
-    pub complete: bool,
-    /// Score over the episodes: D4RL-normalised, or the return where the environment has no reference returns.
-    pub score: Spread,
-    /// Mean undiscounted return.
-    pub mean_return: f64,
-    /// Mean length in environment steps.
-    pub mean_length: f64,
-}
 
 /// One run.
 #[derive(Clone, Debug, PartialEq, Serialize)]
@@ -137,7 +121,7 @@ impl RunReport {
         let evaluations: Vec<_> = by_step
             .into_iter()
             .filter_map(|(step, episodes)| {
-                evaluation(step, &Vec::from_iter(episodes.into_values()), experiment.episodes)
+                EvaluationReport::of(step, &Vec::from_iter(episodes.into_values()), experiment.episodes)
             })
             .collect();
         let complete: Vec<_> = evaluations.iter().filter(|e| e.complete).map(|e| (e.step, e.score.mean)).collect();
@@ -277,20 +261,6 @@ fn metrics(folder: &Path) -> anyhow::Result<Vec<MetricsLine>> {
         Err(error) if error.kind() == ErrorKind::NotFound => Ok(Vec::new()),
         Err(error) => Err(error).with_context(|| format!("cannot read {}", path.display())),
     }
-}
-
-fn evaluation(step: u64, episodes: &[&ScoreLine], expected: u32) -> Option<EvaluationReport> {
-    let mean =
-        |value: fn(&ScoreLine) -> f64| episodes.iter().map(|line| value(line)).sum::<f64>() / episodes.len() as f64;
-    let scores: Vec<_> = episodes.iter().map(|line| line.score).collect();
-    Some(EvaluationReport {
-        step,
-        episodes: episodes.len(),
-        complete: episodes.len() == expected as usize,
-        score: Spread::of(&scores)?,
-        mean_return: mean(|line| line.episode_return),
-        mean_length: mean(|line| line.length.into()),
-    })
 }
 
 /// The precision of a score, whatever instructions it was computed by.
