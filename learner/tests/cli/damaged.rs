@@ -39,7 +39,7 @@ fn a_damaged_run_is_named_and_keeps_no_other_of_its_study_from_being_listed() {
     fs::create_dir_all(&damaged).unwrap();
     fs::write(damaged.join("config.toml"), "[run\n").unwrap();
     let runs = folder.path().join("runs");
-    let output = learner(&["sweep", study.to_str().unwrap(), "--runs", runs.to_str().unwrap(), "--list"]);
+    let output = learner(&["sweep", study.to_str().unwrap(), runs.to_str().unwrap(), "--list"]);
     let [text, said] = [output.stdout, output.stderr].map(|text| String::from_utf8(text).unwrap());
     assert_eq!(output.status.code(), Some(1), "{said}");
     let states: Vec<_> = text.lines().skip(1).map(|line| line.split_once("seed").unwrap().1[1..].trim()).collect();
