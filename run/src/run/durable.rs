@@ -41,7 +41,7 @@ pub(super) fn remove_partial_files(folder: &Path) {
     let Ok(entries) = fs::read_dir(folder) else { return };
     for entry in entries.flatten() {
         let is_partial = entry.file_name().to_string_lossy().ends_with(PARTIAL);
-        if is_partial && entry.file_type().is_ok_and(|kind| !kind.is_dir()) {
+        if is_partial && entry.file_type().is_ok_and(|kind| kind.is_file() || kind.is_symlink()) {
             fs::remove_file(entry.path()).ok();
         }
     }
