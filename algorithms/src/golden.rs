@@ -16,7 +16,33 @@ use quad_policy::{
     Choice, Ensemble, Header, Layout, NoisePredictor, PolicyConfig, Precision, Tensors, Weights, load_policy,
     read_tensors,
 };
-pub(super) use reader::{Golden, MAKE, fresh, goldens, run};
+pub(super) use reader::{Golden, MAKE, goldens, run};
+
+/// Tests an update against the folders of an algorithm, on each device; and against one of a fresh seed of each of its variants.
+macro_rules! golden_tests {
+    ($algorithm:literal, $check:expr) => {
+        #[test]
+        fn golden_update() {
+            crate::golden::check_all(crate::golden::goldens($algorithm), $check);
+        }
+
+        #[test]
+        fn golden_update_of_a_fresh_seed() {
+            crate::golden::check_all(crate::golden::fresh_ones($algorithm), $check);
+        }
+    };
+}
+pub(super) use golden_tests;
+
+pub(super) fn check_all(goldens: Vec<Golden>, check: impl Fn(&Golden, &Device)) {
+    goldens.iter().for_each(|golden| devices().iter().for_each(|device| check(golden, device)));
+}
+
+/// Folders of a fresh seed, one for each committed one; fewer where make.py cannot run.
+pub(super) fn fresh_ones(algorithm: &str) -> Vec<Golden> {
+    let name = |golden: &Golden| golden.folder.file_name().unwrap().to_str().unwrap().to_owned();
+    reader::committed(algorithm).iter().filter_map(|golden| reader::fresh(&name(golden))).collect()
+}
 
 /// Where updates are tested: on the CPU, and on a GPU with the feature `cuda`. Without a GPU that share is skipped,
 /// unless QUAD_REQUIRE_PEERS=1 asks for one.
@@ -109,16 +135,13 @@ pub(super) fn items(golden: &Golden) -> Vec<u32> {
     (0..golden.count("/batch_size") as u32).collect()
 }
 
-/// Tests an update without random numbers of an algorithm against its golden folders.
-pub(super) fn check_definition(definition: &Definition, goldens: Vec<Golden>) {
-    for (golden, device) in goldens.iter().flat_map(|golden| devices().into_iter().map(move |device| (golden, device)))
-    {
-        let mut algorithm = (definition.start)(&table(golden), context(golden, &device)).unwrap();
-        load(golden, algorithm.parts());
-        check_actions(golden, &*algorithm);
-        let measured = algorithm.update(golden.count("/step") as u64, &items(golden)).unwrap();
-        check_update(golden, definition.metrics, &measured, algorithm.parts().save().unwrap());
-    }
+/// Checks an update without random numbers.
+pub(super) fn check_definition(definition: &Definition, golden: &Golden, device: &Device) {
+    let mut algorithm = (definition.start)(&table(golden), context(golden, device)).unwrap();
+    load(golden, algorithm.parts());
+    check_actions(golden, &*algorithm);
+    let measured = algorithm.update(golden.count("/step") as u64, &items(golden)).unwrap();
+    check_update(golden, definition.metrics, &measured, algorithm.parts().save().unwrap());
 }
 
 /// Checks that a policy that draws nothing acts as a golden folder expects.

@@ -14,8 +14,6 @@ use rand_chacha::ChaCha8Rng;
 const DIMS: (usize, usize) = (11, 3);
 /// A whole run, with each phase of those that have some.
 const STEPS: u64 = 10;
-/// A step from which on all networks of every golden folder move.
-const FIRST: u64 = 1000;
 /// More than a tile of rows, and no multiple of it.
 const BATCH: usize = 150;
 
@@ -75,19 +73,26 @@ fn a_saved_state_goes_on_bit_for_bit() {
     for (device, (definition, table)) in
         devices().iter().flat_map(|device| variants().into_iter().map(move |v| (device, v)))
     {
-        let context = Context { total_steps: 2000, ..context(3, device) };
-        let mut straight = agent(definition, &table, &context);
-        // From here on, all networks move.
-        straight.skip_to(FIRST);
-        train(&mut straight, 7);
-        let saved = straight.save().unwrap();
-        assert_eq!(saved, straight.save().unwrap(), "saving is repeatable");
-        let expected = train(&mut straight, 6);
-        let mut resumed = agent(definition, &table, &context);
-        resumed.load(&saved).unwrap();
-        assert_eq!((resumed.step(), resumed.save().unwrap() == saved), (FIRST + 7, true));
-        assert_eq!(train(&mut resumed, 6), expected, "{}", definition.name);
-        assert!(resumed.save().unwrap() == straight.save().unwrap(), "{}: another state", definition.name);
+        // A whole run, with all its phases; and steps after those from which on all networks move.
+        for (first, total_steps) in [(0, STEPS), (1000, 2000)] {
+            let context = Context { total_steps, ..context(3, device) };
+            let mut straight = agent(definition, &table, &context);
+            straight.skip_to(first);
+            let (mut saved, mut expected) = (Vec::new(), Vec::new());
+            for _ in 0..STEPS {
+                saved.push(straight.save().unwrap());
+                expected.extend(train(&mut straight, 1));
+            }
+            let end = straight.save().unwrap();
+            assert!(end == straight.save().unwrap(), "saving is repeatable");
+            for (done, saved) in saved.iter().enumerate() {
+                let mut resumed = agent(definition, &table, &context);
+                resumed.load(saved).unwrap();
+                assert_eq!((resumed.step(), resumed.save().unwrap() == *saved), (first + done as u64, true));
+                assert_eq!(train(&mut resumed, STEPS - done as u64), expected[done..], "{}", definition.name);
+                assert!(resumed.save().unwrap() == end, "{}: another state", definition.name);
+            }
+        }
     }
 }
 

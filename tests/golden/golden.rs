@@ -51,7 +51,7 @@ pub fn run(script: &str, arguments: &[&str]) -> bool {
     true
 }
 
-/// A folder of a variant that is not a committed one, of the seed that GOLDEN_SEED names; `None` where make.py cannot run.
+/// A folder of a variant, as committed folders are called, of the seed that GOLDEN_SEED names; `None` where make.py cannot run.
 #[allow(dead_code)] // not every crate makes some
 pub fn fresh(variant: &str) -> Option<Golden> {
     let seed = std::env::var("GOLDEN_SEED").unwrap_or_else(|_| FRESH_SEED.to_owned());
@@ -72,6 +72,11 @@ pub fn goldens(algorithm: &str) -> Vec<Golden> {
         assert_eq!(found, algorithm, "{place} is of another algorithm; see tests/golden/README.md");
         return vec![golden];
     }
+    committed(algorithm)
+}
+
+/// The committed folders of one algorithm.
+pub fn committed(algorithm: &str) -> Vec<Golden> {
     let of_algorithm = |golden: &Golden| golden.config["algorithm"] == algorithm;
     let home = Path::new(env!("CARGO_MANIFEST_DIR")).join("../tests/golden");
     let mut folders: Vec<_> = std::fs::read_dir(&home).unwrap().map(|entry| entry.unwrap().path()).collect();

@@ -2,9 +2,7 @@
 
 use super::*;
 use crate::algorithm::Algorithm;
-use crate::golden::{
-    Golden, batch, check_candidates, check_update, context, denoising, devices, fresh, goldens, load, table,
-};
+use crate::golden::{Golden, batch, check_candidates, check_update, context, denoising, golden_tests, load, table};
 use candle_core::Device;
 
 fn start(golden: &Golden, device: &Device) -> Diffusion<AlignIql> {
@@ -37,28 +35,4 @@ fn check_choice(golden: &Golden, align_iql: &Diffusion<AlignIql>) {
     golden.close("select.actions", &drawn.candidates.index_select(&rows, 0).unwrap());
 }
 
-#[test]
-fn golden_update() {
-    for golden in goldens("align-iql") {
-        devices().iter().for_each(|device| check(&golden, device));
-    }
-}
-
-#[test]
-fn golden_update_of_a_fresh_seed() {
-    let Some(golden) = fresh("align-iql") else { return };
-    devices().iter().for_each(|device| check(&golden, device));
-}
-
-#[test]
-fn the_noise_of_a_step_is_repeatable_and_no_other_steps() {
-    let golden = goldens("align-iql").remove(0);
-    let align_iql = start(&golden, &Device::Cpu);
-    let numbers = |step: u64| {
-        let Denoising { t, epsilon } = align_iql.noise(step).unwrap();
-        (t, epsilon.flatten_all().unwrap().to_vec1::<f32>().unwrap())
-    };
-    assert_eq!(numbers(0), numbers(0));
-    let (first, other) = (numbers(0), numbers(1));
-    assert!(first.0 != other.0 && first.1 != other.1);
-}
+golden_tests!("align-iql", check);

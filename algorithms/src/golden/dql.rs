@@ -3,8 +3,7 @@
 use super::*;
 use crate::algorithm::Algorithm;
 use crate::golden::{
-    Golden, batch, chain_noise, check_candidates, check_update, context, denoising, devices, fresh, goldens, load,
-    table,
+    Golden, batch, chain_noise, check_candidates, check_update, context, denoising, golden_tests, goldens, load, table,
 };
 use candle_core::Device;
 
@@ -42,20 +41,7 @@ fn check(golden: &Golden, device: &Device) {
     assert_eq!(choice, Choice { candidates, value: Reduce::Min, rule: Rule::Softmax { temperature } });
 }
 
-#[test]
-fn golden_update() {
-    for golden in goldens("dql") {
-        devices().iter().for_each(|device| check(&golden, device));
-    }
-}
-
-#[test]
-fn golden_update_of_a_fresh_seed() {
-    for variant in ["dql", "dql-max-backup"] {
-        let Some(golden) = fresh(variant) else { return };
-        devices().iter().for_each(|device| check(&golden, device));
-    }
-}
+golden_tests!("dql", check);
 
 /// The coin of Eq. 3 falls on either side, and the chains of next actions and of the actor's own are not the same.
 #[test]

@@ -2,7 +2,7 @@
 //! from.
 
 use super::*;
-use crate::golden::{Golden, batch, check_actions, check_update, context, devices, fresh, goldens, load, table};
+use crate::golden::{Golden, batch, check_actions, check_update, context, golden_tests, goldens, load, table};
 use candle_core::Device;
 use quad_dataset::{Arrays, Transitions};
 use std::sync::Arc;
@@ -13,7 +13,7 @@ fn start(golden: &Golden, device: &Device) -> Onestep {
     onestep
 }
 
-fn check_golden(golden: &Golden, device: &Device) {
+fn check(golden: &Golden, device: &Device) {
     let (mut onestep, step) = (start(golden, device), golden.count("/step") as u64);
     check_actions(golden, &onestep);
     let batch = batch(golden, &onestep.context);
@@ -28,19 +28,7 @@ fn check_golden(golden: &Golden, device: &Device) {
     check_update(golden, METRICS, &measured.unwrap(), onestep.parts().save().unwrap());
 }
 
-#[test]
-fn golden_update() {
-    for golden in goldens("onestep") {
-        devices().iter().for_each(|device| check_golden(&golden, device));
-    }
-}
-
-#[test]
-fn golden_update_of_a_fresh_seed() {
-    for golden in ["onestep-behavior", "onestep-critic", "onestep-policy"].into_iter().filter_map(fresh) {
-        devices().iter().for_each(|device| check_golden(&golden, device));
-    }
-}
+golden_tests!("onestep", check);
 
 /// Three episodes of two steps: the first terminates, the second is cut off, the third, of one step more, continues to the end.
 fn small_context(golden: &Golden) -> Context {
@@ -81,26 +69,6 @@ fn state(onestep: &mut Onestep) -> Tensors {
 
 fn numbers(x: &Tensor) -> Vec<f32> {
     x.flatten_all().unwrap().to_vec1().unwrap()
-}
-
-#[test]
-fn a_run_that_is_cut_in_any_phase_ends_as_one_that_is_not() {
-    let golden = goldens("onestep").remove(0);
-    let train = |onestep: &mut Onestep, steps: std::ops::Range<u64>| {
-        steps.for_each(|step| drop(onestep.update(step, &[0, 1]).unwrap()));
-    };
-    let mut straight = short(&golden);
-    train(&mut straight, 0..5);
-    let expected = state(&mut straight);
-    for cut in 0..5 {
-        let (mut first, mut second) = (short(&golden), short(&golden));
-        train(&mut first, 0..cut);
-        second.parts().load(&mut state(&mut first)).unwrap();
-        train(&mut second, cut..5);
-        for (name, tensor) in state(&mut second) {
-            assert_eq!(numbers(&tensor), numbers(&expected[&name]), "cut at {cut}: {name}");
-        }
-    }
 }
 
 #[test]

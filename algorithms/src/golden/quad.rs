@@ -3,7 +3,7 @@
 use super::*;
 use crate::algorithm::Algorithm;
 use crate::golden::{
-    Golden, batch, chain_noise, check_update, context, denoising, devices, fresh, goldens, load, run, table, value,
+    Golden, batch, chain_noise, check_update, context, denoising, golden_tests, goldens, load, run, table, value,
 };
 use crate::hyperparameters::{NotNegative, Positive};
 use candle_core::{DType, Device};
@@ -38,12 +38,7 @@ fn check(golden: &Golden, device: &Device) {
     assert!((guidance_loss - expected).abs() < 1e-4 * size, "{guidance_loss} for {expected}");
 }
 
-#[test]
-fn golden_update() {
-    for golden in goldens("quad") {
-        devices().iter().for_each(|device| check(&golden, device));
-    }
-}
+golden_tests!("quad", check);
 
 /// Whatever the algorithm holds beside them: what is published are the EMAs of actor and critics.
 #[test]
@@ -109,14 +104,6 @@ fn every_denoising_step_is_drawn_equally_often() {
     // Six standard deviations of a binomial count.
     let room = 6.0 * (expected as f64).sqrt();
     assert!(counts.iter().all(|count| (f64::from(*count) - expected as f64).abs() < room), "{counts:?}");
-}
-
-#[test]
-fn golden_update_of_a_fresh_seed() {
-    for variant in ["quad", "dac", "maxq", "none", "one-sample", "ten-critics", "constant", "mean", "shuffled"] {
-        let Some(golden) = fresh(variant) else { return };
-        devices().iter().for_each(|device| check(&golden, device));
-    }
 }
 
 #[test]

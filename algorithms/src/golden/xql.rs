@@ -2,7 +2,7 @@
 
 use super::*;
 use crate::algorithm::Algorithm;
-use crate::golden::{Golden, batch, check_actions, check_update, context, devices, fresh, goldens, load, table};
+use crate::golden::{Golden, batch, check_actions, check_update, context, golden_tests, goldens, load, table};
 use candle_core::Device;
 
 fn check(golden: &Golden, device: &Device) {
@@ -18,19 +18,7 @@ fn check(golden: &Golden, device: &Device) {
     check_update(golden, METRICS, &measured, xql.parts().save().unwrap());
 }
 
-#[test]
-fn golden_update() {
-    for golden in goldens("xql") {
-        devices().iter().for_each(|device| check(&golden, device));
-    }
-}
-
-#[test]
-fn golden_update_of_a_fresh_seed() {
-    for golden in ["xql", "xql-extras"].into_iter().filter_map(fresh) {
-        devices().iter().for_each(|device| check(&golden, device));
-    }
-}
+golden_tests!("xql", check);
 
 /// Without extras V is fitted to the batch itself; with them the random numbers are the step's own.
 #[test]
