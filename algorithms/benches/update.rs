@@ -10,7 +10,9 @@ use quad_algorithms::{ALGORITHMS, Agent, Context, Definition, Values};
 use quad_dataset::{Arrays, Transitions};
 use quad_kernels::activation::{Activation, activate, activate_with_slope};
 use quad_kernels::product::{Matrix::RowMajor, by_gemm};
-use quad_policy::{Adam, AdamStep, DiffusionShape, Ensemble, Gradients, Layout, NoisePredictor, Precision, Weights};
+use quad_policy::{
+    Adam, AdamStep, DiffusionShape, Ensemble, Gradients, Layout, NoisePredictor, Precision, Weighted, Weights,
+};
 use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 use rayon::prelude::*;

@@ -20,7 +20,7 @@ use super::trained::{Trained, ensemble};
 use candle_core::{Device, Result};
 use quad_policy::{
     AdamStep, Choice, DiffusionPolicy, DiffusionShape, Ensemble, EnsembleShape, MlpConfig, Reduce, Reverse, Rule,
-    Tensors, cosine_decay,
+    Tensors, Weighted, cosine_decay,
 };
 use rand_chacha::ChaCha8Rng;
 use serde::Deserialize;
@@ -84,21 +84,18 @@ struct AlignIql {
 impl Config {
     fn start(self, context: Context) -> Result<Diffusion<AlignIql>> {
         let shape = DiffusionShape {
-            observation_dim: context.observation_dim(),
-            action_dim: context.action_dim(),
             actor: self.actor.clone(),
             critic: self.critic.clone(),
             value: Some(self.value.clone()),
             critics: CRITICS,
             diffusion_steps: *self.diffusion_steps,
             reverse: Reverse::ClipSample,
+            ..DiffusionShape::default()
         };
-        let value = EnsembleShape { members: 1, action_dim: 0, layers: self.value.clone(), ..shape.critics() };
-        let value = ensemble(value, &context, 2)?;
-        Ok(Diffusion {
-            networks: Networks::new(shape, *self.weight_decay, context)?,
-            update: AlignIql { config: self, value },
-        })
+        let networks = Networks::new(shape, *self.weight_decay, context)?;
+        let value = EnsembleShape { members: 1, action_dim: 0, layers: self.value.clone(), ..networks.shape.critics() };
+        let value = ensemble(value, &networks.context, 2)?;
+        Ok(Diffusion { networks, update: AlignIql { config: self, value } })
     }
 }
 
@@ -119,7 +116,7 @@ impl Update for AlignIql {
         let bc_loss = (predicted - &noise.epsilon)?.sqr()?.sum(1)?.mean_all()?;
         let rate = *config.actor_learning_rate * cosine_decay(step, context.total_steps);
         actor.descend(&bc_loss, adam(rate))?;
-        target_actor.weights_mut().ema_update(actor.network.weights(), *config.actor_ema_rate)?;
+        target_actor.follow(&actor.network, *config.actor_ema_rate)?;
 
         // V(s) towards an expectile of the smaller Q̂(s, a), IQL's Eq. 5.
         let q = smaller(&target_critics.values(&batch.observations, &batch.actions)?)?;
@@ -133,7 +130,7 @@ impl Update for AlignIql {
         let targets = batch.target(*config.gamma, &next)?;
         let critic_loss = critics.network.squared_error(&batch.observations, &batch.actions, &targets)?;
         critics.descend(&critic_loss, adam(*config.critic_learning_rate))?;
-        target_critics.weights_mut().ema_update(critics.network.weights(), *config.ema_rate)?;
+        target_critics.follow(&critics.network, *config.ema_rate)?;
 
         let v = value.state_values(&batch.observations)?.squeeze(0)?;
         let mut measured = measured([

@@ -8,7 +8,7 @@ use super::parts::Parts;
 use super::random::{Purpose, stream};
 use super::trained::{Trained, ensemble, initial};
 use candle_core::{Device, Result, Tensor};
-use quad_policy::{Choice, DiffusionShape, Ensemble, NoisePredictor, PolicyConfig, Tensors};
+use quad_policy::{Choice, DiffusionShape, Ensemble, NoisePredictor, PolicyConfig, Tensors, Weighted};
 use rand_chacha::ChaCha8Rng;
 
 /// The networks of such an algorithm, and what they learn from.
@@ -24,8 +24,11 @@ pub(super) struct Networks {
 }
 
 impl Networks {
-    /// At step 0; each step takes the share `actor_decay` of its rate off the actor's weights.
-    pub fn new(shape: DiffusionShape, actor_decay: f32, context: Context) -> Result<Self> {
+    /// At step 0; each step takes the share `actor_decay` of its rate off the actor's weights. The sizes of observations and
+    /// actions are the data's.
+    pub fn new(layers: DiffusionShape, actor_decay: f32, context: Context) -> Result<Self> {
+        let (observation_dim, action_dim) = (context.observation_dim(), context.action_dim());
+        let shape = DiffusionShape { observation_dim, action_dim, ..layers };
         let weights = initial(&shape.actor().layout(), &context, 0)?;
         let target_actor = NoisePredictor::new(shape.actor(), weights.copy()?, context.precision);
         let actor = NoisePredictor::new(shape.actor(), weights, context.precision);

@@ -15,7 +15,9 @@ use super::diffusion::{Diffusion, Networks, Update};
 use super::hyperparameters::{Candidates, Count, NotNegative, Positive, Rate, Share, Steps};
 use candle_core::{Result, Tensor};
 use candle_nn::loss::mse;
-use quad_policy::{AdamStep, Choice, DiffusionPolicy, DiffusionShape, MlpConfig, Reduce, Reverse, Rule, Tensors};
+use quad_policy::{
+    AdamStep, Choice, DiffusionPolicy, DiffusionShape, MlpConfig, Reduce, Reverse, Rule, Tensors, Weighted,
+};
 use rand::Rng;
 use rand_chacha::ChaCha8Rng;
 use serde::Deserialize;
@@ -90,14 +92,12 @@ struct Noise {
 impl Config {
     fn start(self, context: Context) -> Result<Diffusion<Self>> {
         let shape = DiffusionShape {
-            observation_dim: context.observation_dim(),
-            action_dim: context.action_dim(),
             actor: self.actor.clone(),
             critic: self.critic.clone(),
-            value: None,
             critics: CRITICS,
             diffusion_steps: *self.diffusion_steps,
             reverse: Reverse::Posterior,
+            ..DiffusionShape::default()
         };
         Ok(Diffusion { networks: Networks::new(shape, 0.0, context)?, update: self })
     }
@@ -152,9 +152,9 @@ impl Update for Config {
         // Targets.
         let Networks { actor, target_actor, critics, target_critics, .. } = networks;
         if step.is_multiple_of(*self.actor_ema_every) && step >= self.actor_ema_start {
-            target_actor.weights_mut().ema_update(actor.network.weights(), *self.actor_ema_rate)?;
+            target_actor.follow(&actor.network, *self.actor_ema_rate)?;
         }
-        target_critics.weights_mut().ema_update(critics.network.weights(), *self.ema_rate)?;
+        target_critics.follow(&critics.network, *self.ema_rate)?;
 
         measured([
             ("q_mean", &targets.mean_all()?),

@@ -10,7 +10,7 @@ use super::hyperparameters::{Positive, Rate, Share};
 use super::parts::Parts;
 use super::trained::{Trained, ensemble};
 use candle_core::{DType, Result, Tensor};
-use quad_policy::{AdamStep, Ensemble, EnsembleShape, MlpConfig, PolicyConfig, Tensors, cosine_decay};
+use quad_policy::{AdamStep, Ensemble, EnsembleShape, MlpConfig, PolicyConfig, Tensors, Weighted, cosine_decay};
 use serde::Deserialize;
 
 /// Critics, of whose values the smaller counts.
@@ -163,7 +163,7 @@ impl<L: Losses> InSample<L> {
         let values = self.critics.network.values(&batch.observations, &batch.actions)?;
         let critic_loss = self.losses.critic_loss(&values, &targets)?;
         self.critics.descend(&critic_loss, adam(*common.critic_learning_rate, count))?;
-        self.target_critics.weights_mut().ema_update(self.critics.network.weights(), *common.ema_rate)?;
+        self.target_critics.follow(&self.critics.network, *common.ema_rate)?;
 
         let mut measured = measured([
             ("q_mean", &targets.mean_all()?),

@@ -17,7 +17,9 @@ use super::random::{Purpose, stream};
 use super::trained::{Trained, ensemble};
 use candle_core::{DType, Result, Tensor};
 use quad_dataset::Batch;
-use quad_policy::{AdamStep, Ensemble, EnsembleShape, GaussianPolicy, GaussianShape, MlpConfig, PolicyConfig, Tensors};
+use quad_policy::{
+    AdamStep, Ensemble, EnsembleShape, GaussianPolicy, GaussianShape, MlpConfig, PolicyConfig, Tensors, Weighted,
+};
 use rand_distr::{Distribution, StandardNormal};
 use serde::Deserialize;
 
@@ -146,7 +148,7 @@ impl Onestep {
         let (mean, log_std) = distribution(&self.behavior.network, &batch.observations)?;
         let loss = log_density(&batch.actions, &mean, &log_std)?.mean_all()?.neg()?;
         self.behavior.descend(&loss, self.adam(steps))?;
-        self.actor.network.weights_mut().ema_update(self.behavior.network.weights(), 1.0)?; // all the way
+        self.actor.network.follow(&self.behavior.network, 1.0)?; // all the way
         measured([("behavior_loss", &loss)])
     }
 
@@ -157,7 +159,7 @@ impl Onestep {
         let loss = self.critic.network.squared_error(&batch.observations, &batch.actions, &targets)?;
         self.critic.descend(&loss, self.adam(steps))?;
         if (steps + 1).is_multiple_of(*self.config.ema_every) {
-            self.target_critic.weights_mut().ema_update(self.critic.network.weights(), *self.config.ema_rate)?;
+            self.target_critic.follow(&self.critic.network, *self.config.ema_rate)?;
         }
         measured([("critic_loss", &loss), ("q_mean", &targets.mean_all()?)])
     }

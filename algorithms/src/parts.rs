@@ -1,9 +1,9 @@
 //! An algorithm's state as a list of named parts, by which it is saved and loaded.
 
 use candle_core::{Device, Result, Tensor};
-use quad_policy::{Adam, Layout, PolicyError, Tensors, Weights, take};
+use quad_policy::{Adam, Layout, PolicyError, Tensors, Weighted, Weights, take};
 
-use super::trained::{Network, Trained};
+use super::trained::Trained;
 
 /// Something that updates change.
 enum Part<'a> {
@@ -27,7 +27,7 @@ impl<'a> Parts<'a> {
     }
 
     /// The weights of a network, and its optimiser's moments.
-    pub(super) fn trained<N: Network>(mut self, name: &'static str, trained: &'a mut Trained<N>) -> Self {
+    pub(super) fn trained<N: Weighted>(mut self, name: &'static str, trained: &'a mut Trained<N>) -> Self {
         let Trained { network, adam } = trained;
         self.0.push((name, Part::Adam(adam, network.weights().layout().clone())));
         self.weights(name, network.weights_mut())

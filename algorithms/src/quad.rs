@@ -22,7 +22,7 @@ use candle_nn::loss::mse;
 use config::{Eta, Guidance, Quad as Config, TargetReduce};
 use metrics::METRICS;
 use quad_policy::{
-    AdamStep, Choice, DiffusionPolicy, DiffusionShape, Reverse, Tensors, cosine_decay, mean_and_variance,
+    AdamStep, Choice, DiffusionPolicy, DiffusionShape, Reverse, Tensors, Weighted, cosine_decay, mean_and_variance,
 };
 use rand::Rng;
 use rand::seq::SliceRandom;
@@ -68,14 +68,12 @@ struct Noise {
 impl Config {
     fn start(self, context: Context) -> Result<Diffusion<Quad>> {
         let shape = DiffusionShape {
-            observation_dim: context.observation_dim(),
-            action_dim: context.action_dim(),
             actor: self.actor.clone(),
             critic: self.critic.clone(),
-            value: None,
             critics: *self.critics,
             diffusion_steps: *self.diffusion_steps,
             reverse: Reverse::ClipClean,
+            ..DiffusionShape::default()
         };
         let unset = || Tensor::full(-1f32, shape.diffusion_steps, &context.device);
         let update = Quad {
@@ -134,7 +132,7 @@ impl Update for Quad {
         let critic_loss = critics.network.squared_error(&batch.observations, &batch.actions, &targets)?;
         let rate = *self.config.critic_learning_rate * decay;
         let critic_gradient_norm = critics.descend(&critic_loss, AdamStep { rate, clip, count })?;
-        target_critics.weights_mut().ema_update(critics.network.weights(), ema_rate)?;
+        target_critics.follow(&critics.network, ema_rate)?;
 
         // Lines 8–11: behaviour cloning, pulled along the gradients that the critics agree on (Eq. 5 and 19).
         let epsilon = &noise.denoising.epsilon;
@@ -163,7 +161,7 @@ impl Update for Quad {
             self.eta = self.ascended_eta((mse(&predicted, epsilon)? - f64::from(*threshold))?)?;
         }
         if step.is_multiple_of(*self.config.actor_ema_every) && step > self.config.actor_ema_start {
-            target_actor.weights_mut().ema_update(actor.network.weights(), ema_rate)?;
+            target_actor.follow(&actor.network, ema_rate)?;
         }
 
         let q_mean = targets.mean_all()?;

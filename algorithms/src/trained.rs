@@ -1,42 +1,10 @@
 //! A network with its optimiser, and how both begin.
 
 use candle_core::{Result, Tensor};
-use quad_policy::{Adam, AdamStep, Ensemble, EnsembleShape, Gradients, Layout, NoisePredictor, Weights};
+use quad_policy::{Adam, AdamStep, Ensemble, EnsembleShape, Gradients, Layout, Weighted, Weights};
 
 use super::context::Context;
 use super::random::{Purpose, stream};
-
-/// What has weights.
-pub(super) trait Network {
-    fn weights(&self) -> &Weights;
-    fn weights_mut(&mut self) -> &mut Weights;
-}
-
-macro_rules! network {
-    ($type:ty) => {
-        impl Network for $type {
-            fn weights(&self) -> &Weights {
-                <$type>::weights(self)
-            }
-
-            fn weights_mut(&mut self) -> &mut Weights {
-                <$type>::weights_mut(self)
-            }
-        }
-    };
-}
-network!(Ensemble);
-network!(NoisePredictor);
-
-impl Network for Weights {
-    fn weights(&self) -> &Weights {
-        self
-    }
-
-    fn weights_mut(&mut self) -> &mut Weights {
-        self
-    }
-}
 
 /// A network with its optimiser.
 pub(super) struct Trained<N> {
@@ -44,7 +12,7 @@ pub(super) struct Trained<N> {
     pub adam: Adam,
 }
 
-impl<N: Network> Trained<N> {
+impl<N: Weighted> Trained<N> {
     /// A network whose weights decay so much in each step, relative to its rate.
     pub fn new(network: N, decay: f32) -> Result<Self> {
         Ok(Self { adam: Adam::new(network.weights(), decay)?, network })

@@ -12,6 +12,7 @@ use crate::precision::Precision;
 use crate::schedule::Reverse;
 use crate::shape::{EnsembleShape, NoiseShape, bytes, tile_numbers};
 use crate::slices::read;
+use crate::weighted::Weighted;
 use crate::weights::{Tensors, Weights};
 use candle_core::{Device, Tensor};
 use serde::{Deserialize, Serialize};
@@ -25,7 +26,7 @@ const CRITIC: &str = "critic.";
 const VALUE: &str = "value.";
 
 /// The shapes of a diffusion policy's networks.
-#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Clone, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct DiffusionShape {
     /// Numbers in an observation s.
@@ -56,10 +57,9 @@ impl DiffusionShape {
             action_dim: dims.1,
             actor: layers.clone(),
             critic: layers.clone(),
-            value: None,
             critics,
             diffusion_steps,
-            reverse: Reverse::ClipClean,
+            ..Self::default()
         }
     }
 

@@ -8,6 +8,7 @@ use crate::packed::Packing;
 use crate::plain;
 use crate::precision::Precision;
 use crate::shape::EnsembleShape;
+use crate::weighted::weighted;
 use crate::weights::Weights;
 use candle_core::{Result, Tensor, Var, bail};
 
@@ -19,28 +20,13 @@ pub struct Ensemble {
     packing: Packing,
 }
 
+weighted!(Ensemble, networks);
+
 impl Ensemble {
     /// `weights` are of the shape's layout; `precision` is for what no gradient is taken of.
     pub fn new(shape: EnsembleShape, weights: Weights, precision: Precision) -> Self {
         let networks = Mlp::new(shape.layers(), "");
         Self { shape, networks, weights, packing: Packing::new(precision) }
-    }
-
-    /// Lays its kernels out for products now: for a policy that acts, whose weights do not change.
-    pub fn packed(self) -> Result<Self> {
-        self.packing.pack(&self.networks, &self.weights)?;
-        Ok(self)
-    }
-
-    /// Its weights.
-    pub fn weights(&self) -> &Weights {
-        &self.weights
-    }
-
-    /// Its weights, to be changed.
-    pub fn weights_mut(&mut self) -> &mut Weights {
-        self.packing = Packing::new(self.packing.precision);
-        &mut self.weights
     }
 
     /// Copies the networks, with constant weights: a target network at its beginning.

@@ -8,6 +8,7 @@ use crate::policy::Policy;
 use crate::precision::Precision;
 use crate::shape::{EnsembleShape, bytes};
 use crate::slices::read;
+use crate::weighted::Weighted;
 use crate::weights::{Tensors, Weights};
 use candle_core::{Device, Result, Tensor};
 use serde::{Deserialize, Serialize};

@@ -11,6 +11,7 @@ use crate::schedule::Reverse;
 use crate::shape::{EnsembleShape, NoiseShape};
 use crate::slices::{has_fast_implementation, modify, plainly};
 use crate::statistics::mean_and_variance;
+use crate::weighted::Weighted;
 use crate::weights::{Layout, Weights};
 use candle_core::{Device, Tensor, Var};
 use quad_kernels::activation::Activation;

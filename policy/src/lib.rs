@@ -61,6 +61,7 @@ mod schedule;
 mod shape;
 mod slices;
 mod statistics;
+mod weighted;
 mod weights;
 
 pub use choice::{Choice, Reduce, Rule};
@@ -81,4 +82,5 @@ pub use quad_kernels::scaling::{Affine, Scaling};
 pub use schedule::{Reverse, Schedule};
 pub use shape::{EnsembleShape, NoiseShape};
 pub use statistics::mean_and_variance;
+pub use weighted::Weighted;
 pub use weights::{Layout, Part, Start, Tensors, Weights, take};

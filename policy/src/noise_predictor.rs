@@ -8,6 +8,7 @@ use crate::precision::Precision;
 use crate::sampler::{Parts, Sample};
 use crate::schedule::Schedule;
 use crate::shape::{NoiseShape, TIME_FEATURES};
+use crate::weighted::weighted;
 use crate::weights::Weights;
 use candle_core::{DType, Result, Tensor, bail};
 use std::sync::Arc;
@@ -27,6 +28,8 @@ fn time_features(steps: usize) -> Vec<f32> {
     (1..=steps).flat_map(row).map(|x| x as f32).collect()
 }
 
+weighted!(NoisePredictor, parts.trunk);
+
 impl NoisePredictor {
     /// `weights` are of the shape's layout; `precision` is for what no gradient is taken of.
     pub fn new(shape: NoiseShape, weights: Weights, precision: Precision) -> Self {
@@ -38,23 +41,6 @@ impl NoisePredictor {
             shape,
         };
         Self { parts: Arc::new(parts), weights, packing: Packing::new(precision) }
-    }
-
-    /// Lays its kernels out for products now: for a policy that acts, whose weights do not change.
-    pub fn packed(self) -> Result<Self> {
-        self.packing.pack(&self.parts.trunk, &self.weights)?;
-        Ok(self)
-    }
-
-    /// Its weights.
-    pub fn weights(&self) -> &Weights {
-        &self.weights
-    }
-
-    /// Its weights, to be changed.
-    pub fn weights_mut(&mut self) -> &mut Weights {
-        self.packing = Packing::new(self.packing.precision);
-        &mut self.weights
     }
 
     /// Its shape.
