@@ -61,7 +61,7 @@ fn a_folder_is_of_one_configuration_and_of_one_learner_at_a_time() {
     assert!(scratch.path().join("run.old1/config.toml").exists());
     assert!(!fresh.process.log().contains("continues after step"));
     let mut twin = learner("6", &[]);
-    assert_eq!(twin.process.wait(PATIENCE).code(), Some(1));
+    assert_eq!(twin.process.wait(PATIENCE).code(), Some(75));
     assert!(twin.process.log().contains("another learner is at work"), "{}", twin.process.log());
 }
 
