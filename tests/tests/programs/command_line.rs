@@ -45,7 +45,7 @@ fn a_wrong_command_line_exits_with_2() {
 #[test]
 fn more_threads_than_the_system_has_are_an_error_and_not_a_panic() {
     let mut shell = Command::new("sh");
-    shell.args(["-c", "ulimit -v 4000000; exec \"$0\" completions bash"]).arg(binary("evaluator"));
+    shell.args(["-c", "ulimit -v 1000000; exec \"$0\" completions bash"]).arg(binary("evaluator"));
     let output = shell.env("RAYON_NUM_THREADS", "60000").output().unwrap();
     assert_refused(&output, "cannot start the threads", "RAYON_NUM_THREADS");
 }
