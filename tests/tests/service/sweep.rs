@@ -211,7 +211,7 @@ fn a_sweep_that_is_told_to_end_says_that_it_is_not_complete_whatever_hangs() {
     let mut sweep = study.sweep(&["--jobs", "2"]);
     study.wait_for(RUNS[1]);
     let learner = eventually("there is a learner", PATIENCE, || learner_of(&sweep, RUNS[1]));
-    let hung = study.dir(RUNS[1]).join("config.toml");
+    let hung = study.dir(RUNS[1]).join("learner.log");
     let aside = hung.with_extension("aside");
     fs::rename(&hung, &aside).unwrap();
     assert!(Command::new("mkfifo").arg(&hung).status().unwrap().success());
