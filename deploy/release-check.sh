@@ -1,5 +1,5 @@
 #!/usr/bin/env bash
-# For whoever makes a release: runs the commands that README.md and docs/ name, each as the first one on a fresh machine. That is a
+# For the person who makes a release: runs the commands that README.md and docs/ name, each as the first one on a fresh machine. That is a
 # clean clone of HEAD in a container of rust:1.95-bookworm: what is not committed is not there, nor any package or crate.
 #
 #   deploy/release-check.sh [NAME ...]      all of NAMES below, in turn, or those

@@ -111,7 +111,7 @@ async fn answer(stream: TcpStream, router: Router) {
     }
 }
 
-/// The owner of a web page may let its name lead to this machine (DNS rebinding). The browser of somebody who reads that page
+/// The owner of a web page may let its name lead to this machine (DNS rebinding). The browser of a person who reads that page
 /// would then give it our answers, but it tells us the page's name.
 async fn refuse_other_names(State(own_name): State<Option<Arc<str>>>, request: Request, next: Next) -> Response {
     let is_ours = |name: &[u8]| std::str::from_utf8(name).is_ok_and(|name| names_us(name, own_name.as_deref()));

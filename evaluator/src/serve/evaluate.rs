@@ -125,7 +125,7 @@ mod tests {
 
     const LIMIT: Duration = Duration::from_secs(3);
 
-    /// Acts slowly; or at once, but for one call, which lasts until somebody notices.
+    /// Acts slowly; or at once, but for one call, which lasts until the test notices.
     struct Sleeper {
         stuck_at: Option<u32>,
         calls: AtomicU32,

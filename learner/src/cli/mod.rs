@@ -196,7 +196,7 @@ fn task_names() -> PossibleValuesParser {
     tasks::all().iter().map(|task| &*task.name).into()
 }
 
-/// The same of algorithms.
+/// The names of algorithms, likewise.
 fn algorithm_names() -> PossibleValuesParser {
     ALGORITHMS.map(|known| known.name).into()
 }

@@ -28,7 +28,7 @@ pub fn draw_all(folder: &Path, report: &Report) -> anyhow::Result<()> {
     Ok(())
 }
 
-/// A picture's name for its file. What a task is called may come from somebody else's run, so it names no other folder.
+/// A picture's name for its file. What a task is called may come from another user's run, so it names no other folder.
 fn of_task(kind: &str, task: &str) -> String {
     let is_plain = |c: char| c.is_alphanumeric() || "-_.".contains(c);
     format!("{kind}-{}", task.replace(|c: char| !is_plain(c), "-"))

@@ -117,7 +117,7 @@ fn films(runs: &[RunReport]) -> Vec<Film> {
     films
 }
 
-/// Reads a film. The folder may be somebody else's, and the report is made to be sent: no other file gets into it by a link or
+/// Reads a film. The folder may be another user's, and the report is made to be sent: no other file gets into it by a link or
 /// another name.
 fn film(path: &Path, begin: &[u8]) -> io::Result<Vec<u8>> {
     let found = fs::symlink_metadata(path)?;

@@ -1,4 +1,4 @@
-//! Run folders that somebody else made.
+//! Run folders that another user made.
 
 use std::fs;
 use std::os::unix::fs::symlink;
@@ -55,7 +55,7 @@ fn what_a_run_calls_itself_leads_to_no_other_folder() {
     }
 }
 
-/// A pipe that nobody writes to, and a device without an end.
+/// A pipe that no program writes to, and a device without an end.
 #[test]
 fn what_is_no_file_holds_up_nobody_who_looks_at_the_run() {
     let folder = tempfile::tempdir().unwrap();

@@ -30,7 +30,7 @@ fn partial(target: &Path) -> PathBuf {
     target.with_file_name(name)
 }
 
-/// Opens a file for reading. In a folder that somebody else made, a pipe or a device in its place would have no end.
+/// Opens a file for reading. In a folder that another user made, a pipe or a device in its place would have no end.
 pub(crate) fn open_file(path: &Path) -> io::Result<File> {
     if fs::metadata(path)?.is_file() { File::open(path) } else { Err(io::Error::other("it is no file")) }
 }

@@ -54,7 +54,7 @@ impl Lock {
         Ok(Self { _file: file, _claim: claim })
     }
 
-    /// Locks the file together with others who share it, against whoever wants it alone. Where files have no locks, it does
+    /// Locks the file together with others who share it, against a process that wants it alone. Where files have no locks, it does
     /// nothing.
     ///
     /// # Errors

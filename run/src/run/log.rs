@@ -32,7 +32,7 @@ impl Log {
     /// # Errors
     /// The file cannot be opened or changed.
     pub(super) fn open(path: PathBuf, lock: Option<Lock>) -> Result<Self, RunDirError> {
-        // No link: in a folder that somebody else made, it may lead to any file of its reader's, which would be cut.
+        // No link: in a folder that another user made, it may lead to any file of its reader's, which would be cut.
         let no_link = OFlags::NOFOLLOW.bits() as i32;
         let opened = OpenOptions::new().create(true).read(true).append(true).custom_flags(no_link).open(&path);
         let mut file = opened.map_err(io_error("open", &path))?;

@@ -102,7 +102,7 @@ fn one_learner_at_a_time_works_in_a_folder() {
     run.score_log().unwrap();
 }
 
-/// A sweep leaves the mark. Whoever gives the run's command, it has not failed while a learner is at work.
+/// A sweep leaves the mark. While a learner is at work, the run has not failed.
 #[test]
 fn a_run_that_begins_or_goes_on_is_no_longer_called_failed() {
     let folder = tempfile::tempdir().unwrap();
@@ -159,7 +159,7 @@ fn scores_survive_a_reopened_log_and_an_unfinished_line_is_left_out() {
     assert!(error.contains("scores.jsonl, line 3"), "{error}");
 }
 
-/// In a folder that somebody else made, they may lead to any file of whoever trains there.
+/// In a folder that another user made, they may lead to any file of the user who trains there.
 #[test]
 fn no_link_is_written_through() {
     let folder = tempfile::tempdir().unwrap();

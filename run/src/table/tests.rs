@@ -24,7 +24,7 @@ fn what_a_format_would_take_for_its_own_is_escaped() {
     assert_eq!(words.render(Style::Latex), "$\\pm$1 of a\\_b\n\nand\n\n");
 }
 
-/// Tasks are called what their users' files are called, and runs may be somebody else's.
+/// Tasks are called what their users' files are called, and runs may be another user's.
 #[test]
 fn a_name_changes_no_table() {
     for (name, text, markdown, latex) in [

@@ -22,14 +22,14 @@ fn where_files_have_no_locks_a_folder_is_still_one_learners() {
     assert_eq!(second.process.wait(PATIENCE).code(), Some(75), "{}", second.process.log());
     assert!(second.process.log().contains("another learner is at work in"), "{}", second.process.log());
 
-    // One that was killed on this host keeps nobody out.
+    // One that was killed on this host keeps no learner out.
     first.process.kill();
     let mut next = start(&scratch);
     next.process.wait_for_log("continues after step", PATIENCE);
     next.assert_scores_are_distinct();
     assert_eq!(next.process.terminate(PATIENCE).code(), Some(75), "{}", next.process.log());
 
-    // Of another host nobody knows.
+    // Of another host this one knows nothing.
     let claim = folder.join("scores.host");
     assert!(!claim.exists(), "one that ends takes its claim back");
     fs::write(&claim, "elsewhere\n").unwrap();
