@@ -59,6 +59,8 @@ impl Agent {
         let (device, transitions) = (context.device.clone(), context.transitions.len());
         let scaling = Some(context.transitions.scaling().clone()).filter(|scaling| *scaling != Scaling::default());
         let algorithm = (definition.start)(table, context)?;
+        // Each thread has a queue of its own on a GPU; the next thread must find what this one has made.
+        device.synchronize()?;
         Ok(Self { definition, algorithm, device, transitions, scaling, step: 0 })
     }
 
