@@ -135,8 +135,7 @@ def test_what_the_environment_raises_is_told_and_costs_an_attempt(tmp_path, data
 def test_workers_that_are_killed_cost_no_score_and_come_again(tmp_path, data):
     # One pool for two runs: Python's workers have one environment, the programs' evaluators the other.
     ours = Learner(tmp_path / "ours", data, steps=3000)
-    hopper = ["--task", "hopper-demo", "--env", "hopper"]
-    theirs = Learner(tmp_path / "theirs", data, *hopper[2:], environment="hopper", steps=1000)
+    theirs = Learner(tmp_path / "theirs", data, environment="hopper", steps=1000)
     both = [ours.endpoint, theirs.endpoint]
     command = ["evaluator", "serve", *[word for endpoint in both for word in ("--connect", endpoint)]]
     programs = [subprocess.Popen(command, stderr=subprocess.DEVNULL) for _ in range(2)]
