@@ -75,30 +75,30 @@ pub fn all_evaluators(run: &Name) -> String {
 
 /// The evaluator that a key of [`live_evaluator`] names.
 pub fn evaluator_of(key: &str) -> Option<Name> {
-    let run = run_of(key)?;
-    let name = key.strip_prefix("quad/")?.strip_prefix(run.as_str())?.strip_prefix("/live/evaluator/")?;
-    Name::new(name).ok()
+    Name::new(within_run(key)?.1.strip_prefix("live/evaluator/")?).ok()
 }
 
 /// The run that `key` belongs to; `None` if it is no key of ours.
 pub fn run_of(key: &str) -> Option<Name> {
-    let (run, _) = key.strip_prefix("quad/")?.split_once('/')?;
-    Name::new(run).ok()
+    within_run(key).map(|(run, _)| run)
 }
 
 /// The incarnation that a key of [`live_learner`] names.
 pub fn incarnation_of(key: &str) -> Option<u64> {
-    let run = run_of(key)?;
-    let incarnation = key.strip_prefix("quad/")?.strip_prefix(run.as_str())?.strip_prefix("/live/learner/")?;
+    let incarnation = within_run(key)?.1.strip_prefix("live/learner/")?;
     // Only as it is written: `+1` and `01` would be 1, too.
     incarnation.parse().ok().filter(|number: &u64| number.to_string() == incarnation)
 }
 
 /// The step that a key of [`weights_at`] names.
 pub fn step_of(key: &str) -> Option<u64> {
-    let run = run_of(key)?;
-    let rest = key.strip_prefix("quad/")?.strip_prefix(run.as_str())?;
-    rest.strip_prefix("/weights/")?.parse().ok()
+    within_run(key)?.1.strip_prefix("weights/")?.parse().ok()
+}
+
+/// The run of a key, and the rest of the key.
+fn within_run(key: &str) -> Option<(Name, &str)> {
+    let (run, rest) = key.strip_prefix("quad/")?.split_once('/')?;
+    Some((Name::new(run).ok()?, rest))
 }
 
 #[cfg(test)]
@@ -108,19 +108,17 @@ mod tests {
     #[test]
     fn keys_give_back_what_they_were_made_of() {
         let (run, evaluator) = (Name::new("run-1").unwrap(), Name::new("box.7").unwrap());
-        let learner = live_learner(&run, 77);
-        assert_eq!(incarnation_of(&learner), Some(77));
-        for key in [weights(&run), jobs(&run), scores(&run), learner] {
-            assert_eq!(run_of(&key), Some(run.clone()), "{key}");
-            assert_eq!(step_of(&key), None, "{key}");
+        for (key, step, incarnation, of) in [
+            (jobs(&run), None, None, None),
+            (weights(&run), None, None, None),
+            (weights_at(&run, 10_000), Some(10_000), None, None),
+            (live_learner(&run, 77), None, Some(77), None),
+            (live_evaluator(&run, &evaluator), None, None, Some(evaluator)),
+        ] {
+            assert_eq!((run_of(&key), step_of(&key)), (Some(run.clone()), step), "{key}");
+            assert_eq!((incarnation_of(&key), evaluator_of(&key)), (incarnation, of), "{key}");
         }
-        let key = weights_at(&run, 10_000);
-        assert_eq!((run_of(&key), step_of(&key)), (Some(run.clone()), Some(10_000)));
-        assert_eq!(evaluator_of(&live_evaluator(&run, &evaluator)), Some(evaluator.clone()));
         assert_eq!(evaluator_of("quad/run-1/live/evaluator/a*b"), None);
-        for key in [progress(&run, &evaluator), live_evaluator(&run, &evaluator)] {
-            assert_eq!((run_of(&key), step_of(&key)), (Some(run.clone()), None), "{key}");
-        }
     }
 
     #[test]

@@ -1,9 +1,13 @@
 //! What a frame claims to hold is not allocated before it is known to be there.
 #![allow(clippy::unwrap_used, clippy::expect_used)]
 
+mod frames;
+
 use std::alloc::{GlobalAlloc, Layout, System};
 use std::cell::Cell;
+use std::fmt::Debug;
 
+use frames::{Check, each};
 use quad_protocol::*;
 
 /// The system's allocator, with a note of the largest allocation of each thread.
@@ -42,54 +46,26 @@ unsafe impl GlobalAlloc for Watched {
 #[global_allocator]
 static ALLOCATOR: Watched = Watched;
 
-/// Writes every claim over every eight bytes of the frame, among them every length, and decodes.
-fn claim_too_much<M: Message>(message: &M) {
-    let frame = encode(message).unwrap();
-    for claim in [u64::MAX, 1 << 60, 1 << 40, 1 << 32, 1 << 26, 1 << 22, 1 << 16] {
-        for position in 7..=frame.len() - 8 {
-            let mut frame = frame.clone();
-            frame[position..position + 8].copy_from_slice(&claim.to_le_bytes());
-            LARGEST.set(0);
-            drop(decode::<M>(&frame));
-            let largest = LARGEST.get();
-            assert!(largest <= 4 << 20, "{claim} at byte {position}: {largest} bytes were allocated");
+struct ClaimTooMuch;
+
+impl Check for ClaimTooMuch {
+    /// Writes every claim over every eight bytes of the frame, among them every length, and decodes.
+    fn check<M: Message + PartialEq + Debug>(&mut self, message: &M) {
+        let frame = encode(message).unwrap();
+        for claim in [u64::MAX, 1 << 60, 1 << 40, 1 << 32, 1 << 26, 1 << 22, 1 << 16] {
+            for position in 7..=frame.len() - 8 {
+                let mut frame = frame.clone();
+                frame[position..position + 8].copy_from_slice(&claim.to_le_bytes());
+                LARGEST.set(0);
+                drop(decode::<M>(&frame));
+                let largest = LARGEST.get();
+                assert!(largest <= 4 << 20, "{claim} at byte {position}: {largest} bytes were allocated");
+            }
         }
     }
 }
 
 #[test]
 fn claimed_lengths_are_not_believed() {
-    let name = || Name::new("some-name").unwrap();
-    let environment = || "hopper".to_owned();
-    let file = vec![7; 100];
-    let hash = Hash::of(&file);
-    let episodes = vec![EpisodeScore { seed: 1, episode_return: 2.0, length: 3, score: 4.0 }; 3];
-    let job = Job {
-        id: 1,
-        run: name(),
-        incarnation: 2,
-        step: 3,
-        weights: hash,
-        environment: environment(),
-        environment_seed: 4,
-        seeds: vec![1, 2, 3],
-        progress_milliseconds: 300,
-    };
-    claim_too_much(&Snapshot { run: name(), incarnation: 1, step: 2, hash, file });
-    let environments = vec![environment(); 3];
-    claim_too_much(&JobRequest::Claim { evaluator: name(), attempt: 1, environments });
-    let failed = Some(environment());
-    claim_too_much(&JobRequest::HandBack { evaluator: name(), job: 1, failed });
-    claim_too_much(&JobReply::Job(job));
-    claim_too_much(&ScoreReport {
-        evaluator: name(),
-        run: name(),
-        incarnation: 1,
-        job: 2,
-        step: 3,
-        weights: hash,
-        precision: name(),
-        episodes,
-    });
-    claim_too_much(&ScoreReply::Refused { incarnation: 1, reason: environment() });
+    each(&mut ClaimTooMuch);
 }

@@ -1,61 +1,71 @@
-//! Messages to be mutated, by a test beside this folder and by the fuzzer in protocol/fuzz.
+//! One message of each kind, for the tests beside this folder and for the fuzzer in protocol/fuzz.
+#![allow(dead_code)] // Not each of them uses all of it.
+
+use std::fmt::Debug;
 
 use quad_protocol::*;
+
+/// What a test does with a message of any type.
+pub trait Check {
+    fn check<M: Message + PartialEq + Debug>(&mut self, message: &M);
+}
+
+/// Collects frames.
+impl Check for Vec<Vec<u8>> {
+    fn check<M: Message + PartialEq + Debug>(&mut self, message: &M) {
+        self.push(encode(message).unwrap());
+    }
+}
+
+/// The frames of all messages of [`each`].
+pub fn frames() -> Vec<Vec<u8>> {
+    let mut frames = Vec::new();
+    each(&mut frames);
+    frames
+}
 
 fn name() -> Name {
     Name::new("some-name").unwrap()
 }
 
-/// One of each kind and variant, with all of its fields filled.
-pub fn frames() -> Vec<Vec<u8>> {
+/// A snapshot with this file.
+pub fn snapshot(file: Vec<u8>) -> Snapshot {
+    Snapshot { run: name(), incarnation: 1, step: 2, hash: Hash::of(&file), file }
+}
+
+/// Checks one message of each kind and variant, with all of its fields filled.
+pub fn each(test: &mut impl Check) {
     let text = || "hopper".to_owned();
-    let file: Vec<u8> = (0..100).collect();
-    let weights = Hash::of(&file);
-    let episodes = vec![EpisodeScore { seed: 1, episode_return: 2.0, length: 3, score: 4.0 }; 3];
+    let snapshot = snapshot((0..100).collect());
+    let score = |seed, score| EpisodeScore { seed, episode_return: 2.0, length: 3, score };
     let job = Job {
         id: 1,
         run: name(),
         incarnation: 2,
         step: 3,
-        weights,
+        weights: snapshot.hash,
         environment: text(),
         environment_seed: 4,
         seeds: vec![1, 2, 3],
         progress_milliseconds: 300,
     };
     let progress = Progress {
-        evaluator: name(),
-        run: name(),
-        incarnation: 2,
-        job: 1,
-        step: 3,
         episodes_done: 1,
-        episodes_total: 3,
         steps_done: 100,
         environment_steps: 200,
         episodes: 7,
+        ..Progress::of(&job, name())
     };
-    let environments = vec![text(), "walker2d".to_owned()];
-    vec![
-        encode(&Snapshot { run: name(), incarnation: 1, step: 2, hash: weights, file }).unwrap(),
-        encode(&JobRequest::Claim { evaluator: name(), attempt: 9, environments }).unwrap(),
-        encode(&JobRequest::HandBack { evaluator: name(), job: 1, failed: Some(text()) }).unwrap(),
-        encode(&JobReply::Job(job)).unwrap(),
-        encode(&JobReply::Wait { incarnation: 2, milliseconds: 10 }).unwrap(),
-        encode(&JobReply::HandedBack { incarnation: 2, accepted: true }).unwrap(),
-        encode(&ScoreReport {
-            evaluator: name(),
-            run: name(),
-            incarnation: 1,
-            job: 2,
-            step: 3,
-            weights,
-            precision: name(),
-            episodes,
-        })
-        .unwrap(),
-        encode(&ScoreReply::Recorded { incarnation: 1, new: 2, duplicates: 3 }).unwrap(),
-        encode(&ScoreReply::Refused { incarnation: 1, reason: text() }).unwrap(),
-        encode(&progress).unwrap(),
-    ]
+    let episodes = vec![score(1, 4.0), score(u64::MAX, f64::NEG_INFINITY), score(3, -0.0)];
+    let environments = vec![text(), "walker2d".to_owned(), String::new()];
+    test.check(&snapshot);
+    test.check(&JobRequest::Claim { evaluator: name(), attempt: 9, environments });
+    test.check(&JobRequest::HandBack { evaluator: name(), job: 1, failed: Some(text()) });
+    test.check(&ScoreReport::of(&job, name(), name(), episodes));
+    test.check(&JobReply::Job(job));
+    test.check(&JobReply::Wait { incarnation: 2, milliseconds: 10 });
+    test.check(&JobReply::HandedBack { incarnation: 2, accepted: true });
+    test.check(&ScoreReply::Recorded { incarnation: 1, new: 2, duplicates: 3 });
+    test.check(&ScoreReply::Refused { incarnation: 1, reason: text() });
+    test.check(&progress);
 }
