@@ -5,7 +5,8 @@ use std::sync::LazyLock;
 use serde::Deserialize;
 
 /// A file that can be fetched, and what it must be.
-#[derive(Clone, Debug, PartialEq)]
+#[derive(Clone, Debug, PartialEq, Deserialize)]
+#[serde(deny_unknown_fields)]
 pub struct NamedDataset {
     /// D4RL's name, e.g. `hopper-medium-v2`.
     pub name: String,
@@ -17,9 +18,11 @@ pub struct NamedDataset {
     pub bytes: Option<u64>,
     /// SHA-256 in lower-case hexadecimal, if it is known.
     pub sha256: Option<String>,
-    /// Licence of the data.
+    /// Licence of the data, which a collection shares.
+    #[serde(skip)]
     pub licence: String,
-    /// Where it can be had, best first.
+    /// Where it can be had, best first: the file in each folder of its collection.
+    #[serde(skip)]
     pub addresses: Vec<String>,
 }
 
@@ -34,29 +37,15 @@ struct Table {
 struct Collection {
     licence: String,
     folders: Vec<String>,
-    dataset: Vec<Entry>,
-}
-
-#[derive(Deserialize)]
-#[serde(deny_unknown_fields)]
-struct Entry {
-    name: String,
-    environment: String,
-    file: String,
-    bytes: Option<u64>,
-    sha256: Option<String>,
+    dataset: Vec<NamedDataset>,
 }
 
 impl Collection {
     fn into_datasets(self) -> impl Iterator<Item = NamedDataset> {
-        self.dataset.into_iter().map(move |Entry { name, environment, file, bytes, sha256 }| NamedDataset {
-            addresses: self.folders.iter().map(|folder| format!("{folder}{file}")).collect(),
-            licence: self.licence.clone(),
-            name,
-            environment,
-            file,
-            bytes,
-            sha256,
+        let Self { licence, folders, dataset } = self;
+        dataset.into_iter().map(move |dataset| {
+            let addresses = folders.iter().map(|folder| format!("{folder}{}", dataset.file)).collect();
+            NamedDataset { addresses, licence: licence.clone(), ..dataset }
         })
     }
 }

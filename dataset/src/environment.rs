@@ -139,25 +139,6 @@ mod tests {
     }
 
     #[test]
-    fn a_row_without_a_recipe_or_a_reason_is_refused() {
-        let row = |collect: &str| {
-            let row = "name = 'x'\nobservation_dim = 5\naction_dim = 1\nqpos_dim = 3\nqvel_dim = 3\nmax_episode_steps = 9\n\
-                       reference_returns = [0.0, 1.0]\nreward = 'as-is'\n";
-            toml::from_str::<EnvironmentSpec>(&format!("{row}{collect}")).map_err(|error| error.message().to_owned())
-        };
-        assert_eq!(row("").unwrap_err(), "missing field `collect`");
-        assert_eq!(row("collect.none = 'nobody knows'").unwrap().collect, Collect::None("nobody knows".to_owned()));
-    }
-
-    #[test]
-    fn references_score_zero_and_a_hundred() {
-        let hopper = find("hopper").unwrap();
-        assert_eq!(hopper.normalised_score(-20.272305), 0.0);
-        assert_eq!(hopper.normalised_score(3234.3), 100.0);
-        assert!((hopper.normalised_score(1607.0138475) - 50.0).abs() < 1e-9);
-    }
-
-    #[test]
     fn ids_of_gymnasium_are_known_where_the_simulation_is_ours() {
         for (id, name) in [("Hopper-v2", "hopper"), ("HalfCheetah-v5", "halfcheetah"), ("Walker2d-v4", "walker2d")] {
             assert_eq!(find_gymnasium(id).map(|environment| environment.name.as_str()), Some(name));
@@ -165,14 +146,5 @@ mod tests {
         for id in ["Walker2d-v5", "AntMaze_UMaze-v4", "AntMaze_Large_Diverse_GR-v4", "HopperStand-v0", "Ant-v5"] {
             assert_eq!(find_gymnasium(id), None, "{id}");
         }
-    }
-
-    #[test]
-    fn an_unknown_name_is_answered_with_the_known_ones() {
-        let error = find("Hopper-v2").unwrap_err();
-        assert!(
-            error.to_string().starts_with("unknown environment `Hopper-v2`; known: hopper, halfcheetah"),
-            "{error}"
-        );
     }
 }

@@ -1,5 +1,6 @@
 //! What can go wrong with a dataset. Every message names the file, and where it can the array and the row.
 
+use std::error::Error;
 use std::io;
 use std::path::PathBuf;
 
@@ -88,19 +89,12 @@ pub enum Problem {
     /// A virtual or external array, or a link that leads nowhere.
     #[error("array `{array}` is not in this file: it leads to numbers that lie elsewhere")]
     Elsewhere { array: String },
-    /// HDF5 fails in the middle of an array.
+    /// HDF5 or the archive fails in the middle of an array.
     #[error("array `{array}` cannot be read")]
-    UnreadableHdf5 {
+    Unreadable {
         array: String,
         #[source]
-        source: hdf5::Error,
-    },
-    /// The archive fails in the middle of an array.
-    #[error("array `{array}` cannot be read")]
-    UnreadableNpz {
-        array: String,
-        #[source]
-        source: io::Error,
+        source: Box<dyn Error + Send + Sync>,
     },
     /// Fewer episodes than Minari's metadata promises.
     #[error("{found} episodes, but metadata.json says {expected}")]
@@ -205,7 +199,7 @@ impl Problem {
                 "let that program close it; if the program is gone, `h5clear --status FILE` (of HDF5's tools) frees what it wrote"
             }
             Self::Filter { .. } | Self::Elsewhere { .. } => REWRITE,
-            Self::UnreadableHdf5 { .. } | Self::UnreadableNpz { .. } => "the file is damaged: fetch or copy it again",
+            Self::Unreadable { .. } => "the file is damaged: fetch or copy it again",
             Self::Oversized { .. } => {
                 "the file is damaged, or most of these rows were never written: fetch or copy it again, or write those alone \
                  that there are"

@@ -193,7 +193,7 @@ impl Hdf5File {
     }
 
     fn unreadable(&self, array: &str, source: hdf5::Error) -> DatasetError {
-        self.error(Problem::UnreadableHdf5 { array: array.to_owned(), source })
+        self.error(Problem::Unreadable { array: array.to_owned(), source: source.into() })
     }
 }
 

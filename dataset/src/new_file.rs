@@ -67,7 +67,7 @@ impl NewFile {
 /// An array that grows by rows: N, or N × width.
 pub(crate) struct Column {
     pub(crate) name: &'static str,
-    width: Option<usize>,
+    pub(crate) width: Option<usize>,
     dataset: hdf5::Dataset,
     rows: usize,
 }

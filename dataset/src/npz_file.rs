@@ -70,7 +70,7 @@ impl NpzFile {
             other => Problem::DamagedNpz(other),
         })?;
         let bytes = entry.size();
-        let unreadable = |source| Problem::UnreadableNpz { array: name.clone(), source };
+        let unreadable = |source: io::Error| Problem::Unreadable { array: name.clone(), source: source.into() };
         let mut reader = BufReader::new(entry);
         let file = NpyFile::new(&mut reader).map_err(unreadable)?;
         if continuous && holds_whole_numbers(&file.dtype()) {
@@ -127,7 +127,7 @@ fn convert<T: Deserialize, R: io::Read>(
     let found = file.dtype().descr();
     let values = file.data::<T>().map_err(|_| wrong_type(array, found))?;
     let values: io::Result<Vec<f32>> = values.map(|value| value.map(&to_f32)).collect();
-    values.map_err(|source| Problem::UnreadableNpz { array: array.to_owned(), source })
+    values.map_err(|source| Problem::Unreadable { array: array.to_owned(), source: source.into() })
 }
 
 fn wrong_type(array: &str, found: String) -> Problem {

@@ -129,18 +129,19 @@ fn differ(a: &[f32], b: &[f32]) -> bool {
 }
 
 #[cfg(test)]
-mod tests {
+pub(crate) mod tests {
     use super::*;
     use RowKind::{Dropped, LastState, Transition};
 
-    fn recording(kinds: &[RowKind]) -> Recording {
+    /// Rows whose observation and action (in hundredths) are their number, and whose reward is 2 to the power of it.
+    pub(crate) fn recording(kinds: &[RowKind]) -> Recording {
         let n = kinds.len();
         Recording {
             observation_dim: 1,
             action_dim: 1,
-            observations: (0..n).map(|i| i as f32).collect(),
-            actions: vec![0.0; n],
-            rewards: (0..n).map(|i| (1 << i) as f32).collect(),
+            observations: (0..n).map(|row| row as f32).collect(),
+            actions: (0..n).map(|row| row as f32 / 100.0).collect(),
+            rewards: (0..n).map(|row| (1 << row) as f32).collect(),
             kinds: kinds.to_vec(),
             terminals: vec![false; n],
             timeouts: vec![false; n],

@@ -72,10 +72,4 @@ mod tests {
             assert_eq!((scaling.apply(0.0), scaling.apply(1.0)), (of_0, of_1), "{name}");
         }
     }
-
-    #[test]
-    fn only_the_locomotion_rule_needs_returns_that_differ() {
-        assert_eq!(RewardRule::Locomotion.scaling(&[2.0, 2.0]), None);
-        assert!(RewardRule::Subtract1.scaling(&[2.0, 2.0]).is_some());
-    }
 }

@@ -96,22 +96,6 @@ mod tests {
     use super::*;
 
     #[test]
-    fn returns_are_cut_at_ends_and_the_rest_counts() {
-        let rows = [(1.0, false), (2.0, true), (4.0, true), (8.0, false), (16.0, false)];
-        assert_eq!(returns(rows.into_iter()), [3.0, 4.0, 24.0]);
-        assert_eq!(returns(rows[..3].iter().copied()), [3.0, 4.0]);
-        assert!(returns(std::iter::empty()).is_empty());
-    }
-
-    #[test]
-    fn a_spread_of_nothing_is_not_a_number() {
-        let Extent { min, mean, max } = Extent::of([3.0, -1.0, 4.0].into_iter());
-        assert_eq!((min, mean, max), (-1.0, 2.0, 4.0));
-        let nothing = Extent::of(std::iter::empty());
-        assert!(nothing.min.is_nan() && nothing.mean.is_nan() && nothing.max.is_nan());
-    }
-
-    #[test]
     fn what_is_gained_after_the_goal_does_not_count() {
         let sum = |goal| {
             let mut episode = Episode::default();

@@ -28,19 +28,15 @@ pub struct D4rlWriter {
     environment: &'static EnvironmentSpec,
     file: NewFile,
     rows: usize,
-    columns: Columns,
+    /// Those of [`FLOATS`].
+    floats: Vec<Buffered<f32>>,
+    /// Those of [`FLAGS`].
+    flags: Vec<Buffered<bool>>,
 }
 
-struct Columns {
-    observations: Buffered<f32>,
-    actions: Buffered<f32>,
-    next_observations: Buffered<f32>,
-    rewards: Buffered<f32>,
-    terminals: Buffered<bool>,
-    timeouts: Buffered<bool>,
-    qpos: Buffered<f32>,
-    qvel: Buffered<f32>,
-}
+/// The columns of numbers, in the order of a row's.
+const FLOATS: [&str; 6] = ["observations", "actions", "next_observations", "rewards", "infos/qpos", "infos/qvel"];
+const FLAGS: [&str; 2] = ["terminals", "timeouts"];
 
 /// A column, and rows that are not written yet: a chunk of them at most.
 struct Buffered<T> {
@@ -52,38 +48,40 @@ impl D4rlWriter {
     /// Starts a file of `environment`'s sizes, and the folder it lies in.
     pub fn create(path: impl AsRef<Path>, environment: &'static EnvironmentSpec) -> Result<Self, DatasetError> {
         let file = NewFile::create(path.as_ref())?;
-        let columns = Columns::create(&file, environment).map_err(|source| file.failed(source))?;
-        Ok(Self { environment, file, rows: 0, columns })
+        let EnvironmentSpec { observation_dim: o, action_dim: a, qpos_dim, qvel_dim, .. } = *environment;
+        let widths = [Some(o), Some(a), Some(o), None, Some(qpos_dim), Some(qvel_dim)];
+        let columns = || -> hdf5::Result<_> {
+            file.hdf5.create_group("infos")?;
+            let floats = FLOATS.iter().zip(widths).map(|(name, width)| Buffered::create(&file, name, width));
+            let flags = FLAGS.iter().map(|name| Buffered::create(&file, name, None));
+            Ok((floats.collect::<hdf5::Result<_>>()?, flags.collect::<hdf5::Result<_>>()?))
+        };
+        let (floats, flags) = columns().map_err(|source| file.failed(source))?;
+        Ok(Self { environment, file, rows: 0, floats, flags })
     }
 
     /// Appends a row. Rows of other sizes and numbers that are not finite in float32 are refused.
     pub fn push(&mut self, row: &Row) -> Result<(), DatasetError> {
-        let EnvironmentSpec { observation_dim, action_dim, qpos_dim, qvel_dim, .. } = *self.environment;
         let reward = [row.reward];
-        let columns: [(&mut Buffered<f32>, &[f64], usize); 6] = [
-            (&mut self.columns.observations, row.observation, observation_dim),
-            (&mut self.columns.actions, row.action, action_dim),
-            (&mut self.columns.next_observations, row.next_observation, observation_dim),
-            (&mut self.columns.rewards, &reward, 1),
-            (&mut self.columns.qpos, row.qpos, qpos_dim),
-            (&mut self.columns.qvel, row.qvel, qvel_dim),
-        ];
-        for (column, values, width) in &columns {
-            let problem = if values.len() != *width {
+        let values = [row.observation, row.action, row.next_observation, &reward, row.qpos, row.qvel];
+        for (Buffered { column, .. }, values) in self.floats.iter().zip(values) {
+            let width = column.width.unwrap_or(1);
+            let problem = if values.len() != width {
                 format!("has {} numbers, but must have {width}", values.len())
             } else if let Some(value) = values.iter().find(|&&value| !(value as f32).is_finite()) {
                 format!("has {value}, which is not a finite float32")
             } else {
                 continue;
             };
-            let problem = Problem::BadRow { row: self.rows, array: column.column.name, problem };
+            let problem = Problem::BadRow { row: self.rows, array: column.name, problem };
             return Err(DatasetError::new(self.file.path(), problem));
         }
-        for (column, values, _) in columns {
+        for (column, values) in self.floats.iter_mut().zip(values) {
             column.buffer.extend(values.iter().map(|&value| value as f32));
         }
-        self.columns.terminals.buffer.push(row.terminal);
-        self.columns.timeouts.buffer.push(row.timeout);
+        for (column, flag) in self.flags.iter_mut().zip([row.terminal, row.timeout]) {
+            column.buffer.push(flag);
+        }
         self.rows += 1;
         if self.rows.is_multiple_of(CHUNK_ROWS) { self.flush() } else { Ok(()) }
     }
@@ -97,8 +95,8 @@ impl D4rlWriter {
     pub fn finish(mut self, metadata: &Metadata) -> Result<(), DatasetError> {
         self.flush()?;
         self.write_metadata(metadata).map_err(|source| self.file.failed(source))?;
-        let Self { file, columns, .. } = self;
-        drop(columns);
+        let Self { file, floats, flags, .. } = self;
+        drop((floats, flags));
         file.finish()
     }
 
@@ -112,32 +110,9 @@ impl D4rlWriter {
     }
 
     fn flush(&mut self) -> Result<(), DatasetError> {
-        self.columns.flush().map_err(|source| self.file.failed(source))
-    }
-}
-
-impl Columns {
-    fn create(file: &NewFile, environment: &EnvironmentSpec) -> hdf5::Result<Self> {
-        file.hdf5.create_group("infos")?;
-        let EnvironmentSpec { observation_dim, action_dim, qpos_dim, qvel_dim, .. } = *environment;
-        Ok(Self {
-            observations: Buffered::create(file, "observations", Some(observation_dim))?,
-            actions: Buffered::create(file, "actions", Some(action_dim))?,
-            next_observations: Buffered::create(file, "next_observations", Some(observation_dim))?,
-            rewards: Buffered::create(file, "rewards", None)?,
-            terminals: Buffered::create(file, "terminals", None)?,
-            timeouts: Buffered::create(file, "timeouts", None)?,
-            qpos: Buffered::create(file, "infos/qpos", Some(qpos_dim))?,
-            qvel: Buffered::create(file, "infos/qvel", Some(qvel_dim))?,
-        })
-    }
-
-    fn flush(&mut self) -> hdf5::Result<()> {
-        let Self { observations, actions, next_observations, rewards, terminals, timeouts, qpos, qvel } = self;
-        for floats in [observations, actions, next_observations, rewards, qpos, qvel] {
-            floats.flush()?;
-        }
-        [terminals, timeouts].into_iter().try_for_each(Buffered::flush)
+        let floats = self.floats.iter_mut().try_for_each(Buffered::flush);
+        let flushed = floats.and_then(|()| self.flags.iter_mut().try_for_each(Buffered::flush));
+        flushed.map_err(|source| self.file.failed(source))
     }
 }
 

@@ -1,25 +1,8 @@
 //! Tests of what follows what.
 
 use super::*;
-use crate::recording::RowKind::{self, Dropped, LastState, Transition};
-
-/// Rows whose observation, action (in hundredths) and reward are their number.
-fn recording(kinds: &[RowKind]) -> Recording {
-    let n = kinds.len();
-    let numbers = || (0..n).map(|row| row as f32);
-    Recording {
-        observation_dim: 1,
-        action_dim: 1,
-        observations: numbers().collect(),
-        actions: numbers().map(|row| row / 100.0).collect(),
-        rewards: numbers().collect(),
-        kinds: kinds.to_vec(),
-        terminals: vec![false; n],
-        timeouts: vec![false; n],
-        ends: vec![false; n],
-        ..Recording::default()
-    }
-}
+use crate::recording::RowKind::{Dropped, LastState, Transition};
+use crate::recording::tests::recording;
 
 fn transitions(recording: Recording) -> Transitions {
     let scaling = RewardRule::AsIs.scaling(&[]).unwrap();

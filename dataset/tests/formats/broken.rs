@@ -4,13 +4,14 @@ use std::fs;
 use std::path::{Path, PathBuf};
 
 use hdf5::H5Type;
+use hdf5::types::FixedAscii;
 use ndarray::ArrayViewD;
 use quad_dataset::{DatasetError, Problem, ReadOptions, RecordedRows, RewardRule, Scale, Transitions};
 use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 use tempfile::{TempDir, tempdir};
 
-use crate::hopper;
+use crate::{hopper, put, try_read};
 
 const ROWS: usize = 20;
 
@@ -41,36 +42,22 @@ impl Subject {
         put(&file, array, shape, data);
     }
 
-    fn read(&self, reward: RewardRule) -> Result<Transitions, DatasetError> {
-        Transitions::read(self.path(), &ReadOptions { environment: Some(hopper()), reward, scale: Scale::default() })
+    fn read(&self) -> Result<Transitions, DatasetError> {
+        try_read(&self.path(), Some(hopper()))
     }
 
     /// The error's text after the file's path, which every error starts with.
     fn error(&self) -> String {
-        let error = self.read(RewardRule::AsIs).err().expect("the file is broken");
+        let error = self.read().err().expect("the file is broken");
         let text = error.to_string();
         let path = format!("{}: ", self.path().display());
         text.strip_prefix(&path).unwrap_or_else(|| panic!("{text} does not start with {path}")).to_owned()
     }
 }
 
-fn put<T: H5Type>(file: &hdf5::File, array: &str, shape: &[usize], data: &[T]) {
-    let view = ArrayViewD::from_shape(shape, data).unwrap();
-    file.new_dataset_builder().with_data(view).create(array).unwrap();
-}
-
-#[test]
-fn the_subject_itself_is_whole() {
-    assert_eq!(Subject::new().read(RewardRule::Locomotion).unwrap().len(), ROWS - 1);
-}
-
 #[test]
 fn a_missing_file() {
-    let error = Transitions::read(
-        "/nowhere/x.hdf5",
-        &ReadOptions { environment: Some(hopper()), reward: RewardRule::AsIs, scale: Scale::default() },
-    );
-    let error = error.err().unwrap();
+    let error = try_read(Path::new("/nowhere/x.hdf5"), Some(hopper())).err().unwrap();
     assert!(matches!(error.problem, Problem::Io(_)) && error.path == Path::new("/nowhere/x.hdf5"));
 }
 
@@ -109,7 +96,7 @@ fn damaged_inside_a_compressed_array() {
     file.flush().unwrap();
     let chunk = array.chunk_info(0).unwrap();
     drop((array, file));
-    subject.read(RewardRule::AsIs).unwrap();
+    subject.read().unwrap();
 
     let mut bytes = fs::read(subject.path()).unwrap();
     let stored = chunk.addr as usize..(chunk.addr + chunk.size) as usize;
@@ -130,68 +117,60 @@ fn a_missing_array() {
 }
 
 #[test]
-fn a_group_in_an_arrays_place() {
-    let subject = Subject::new();
-    let file = hdf5::File::open_rw(subject.path()).unwrap();
-    file.unlink("rewards").unwrap();
-    file.create_group("rewards").unwrap();
-    drop(file);
-    assert_eq!(subject.error(), "`rewards` is a group of arrays, but must be an array");
-}
-
-#[test]
-fn another_environments_sizes() {
-    let subject = Subject::new();
-    subject.replace("observations", &[ROWS, 17], &[0.5f32; ROWS * 17]);
-    assert_eq!(subject.error(), "`observations` has 17 numbers a row, but `hopper` has 11");
-    let subject = Subject::new();
-    subject.replace("actions", &[ROWS, 6], &[0.5f32; ROWS * 6]);
-    assert_eq!(subject.error(), "`actions` has 6 numbers a row, but `hopper` has 3");
-}
-
-#[test]
-fn arrays_of_different_lengths() {
-    let subject = Subject::new();
-    subject.replace("rewards", &[ROWS - 1], &[0.5f32; ROWS - 1]);
-    assert_eq!(subject.error(), "array `rewards` has shape [19], but must have [20, 1]");
-    let subject = Subject::new();
-    subject.replace("terminals", &[ROWS, 2], &[false; ROWS * 2]);
-    assert_eq!(subject.error(), "array `terminals` has shape [20, 2], but must have [20, 1]");
-}
-
-#[test]
-fn numbers_that_are_not_finite() {
-    let mut data = [0.5f32; ROWS * 11];
-    data[7 * 11 + 3] = f32::NAN;
-    data[8 * 11..9 * 11].fill(f32::INFINITY);
-    let subject = Subject::new();
-    subject.replace("observations", &[ROWS, 11], &data);
-    assert_eq!(subject.error(), "array `observations`, row 7: NaN is not a finite float32 (2 such rows)");
-
-    let mut data = [0.5f64; ROWS];
-    data[19] = 1e39;
-    let subject = Subject::new();
-    subject.replace("rewards", &[ROWS], &data);
-    assert_eq!(subject.error(), "array `rewards`, row 19: inf is not a finite float32");
-}
-
-#[test]
-fn elements_of_another_type() {
-    let subject = Subject::new();
-    subject.replace("actions", &[ROWS, 3], &[false; ROWS * 3]);
-    assert_eq!(subject.error(), "array `actions` holds bool, but must hold numbers");
-    let subject = Subject::new();
-    let text: hdf5::types::FixedAscii<4> = hdf5::types::FixedAscii::from_ascii(b"true").unwrap();
-    subject.replace("terminals", &[ROWS], &[text; ROWS]);
-    let expected = "but must hold booleans (h5py's enum, or numbers that are 0 or 1)";
-    assert!(subject.error().ends_with(expected), "{}", subject.error());
-    let subject = Subject::new();
-    subject.replace("observations", &[ROWS, 1, 11], &[0f32; ROWS * 11]);
-    assert!(
-        subject.error().ends_with("must have one or two axes: rows, and the numbers in each"),
-        "{}",
-        subject.error()
-    );
+fn an_array_that_is_not_what_it_must_be() {
+    let text: FixedAscii<4> = FixedAscii::from_ascii(b"true").unwrap();
+    let (half, mut unknown, mut large) = ([0.5f32; ROWS * 17], [0.5f32; ROWS * 11], [0.5f64; ROWS]);
+    unknown[7 * 11 + 3] = f32::NAN;
+    unknown[8 * 11..9 * 11].fill(f32::INFINITY);
+    large[19] = 1e39;
+    let flag = |value: i32| {
+        let mut flags = [0; ROWS];
+        flags[3] = value;
+        flags
+    };
+    type Spoil<'a> = &'a dyn Fn(&Subject);
+    let cases: [(&str, Spoil<'_>); 14] = [
+        ("`observations` has 17 numbers a row, but `hopper` has 11", &|file| {
+            file.replace("observations", &[ROWS, 17], &half);
+        }),
+        ("`actions` has 6 numbers a row, but `hopper` has 3", &|file| {
+            file.replace("actions", &[ROWS, 6], &half[..ROWS * 6]);
+        }),
+        ("array `rewards` has shape [19], but must have [20, 1]", &|file| {
+            file.replace("rewards", &[ROWS - 1], &half[..ROWS - 1]);
+        }),
+        ("array `terminals` has shape [20, 2], but must have [20, 1]", &|file| {
+            file.replace("terminals", &[ROWS, 2], &[false; ROWS * 2]);
+        }),
+        ("array `observations`, row 7: NaN is not a finite float32 (2 such rows)", &|file| {
+            file.replace("observations", &[ROWS, 11], &unknown);
+        }),
+        ("array `rewards`, row 19: inf is not a finite float32", &|file| file.replace("rewards", &[ROWS], &large)),
+        ("array `actions` holds bool, but must hold numbers", &|file| {
+            file.replace("actions", &[ROWS, 3], &[false; ROWS * 3]);
+        }),
+        ("but must hold booleans (h5py's enum, or numbers that are 0 or 1)", &|file| {
+            file.replace("terminals", &[ROWS], &[text; ROWS]);
+        }),
+        ("must have one or two axes: rows, and the numbers in each", &|file| {
+            file.replace("observations", &[ROWS, 1, 11], &half[..ROWS * 11]);
+        }),
+        ("array `timeouts`, row 3: 2 is neither 0 nor 1", &|file| file.replace("timeouts", &[ROWS], &flag(2))),
+        ("array `timeouts`, row 3: -1 is neither 0 nor 1", &|file| file.replace("timeouts", &[ROWS], &flag(-1))),
+        ("array `timeouts`, row 3: 127 is neither 0 nor 1", &|file| file.replace("timeouts", &[ROWS], &flag(256))),
+        ("20 rows, of which none makes a transition", &|file| file.replace("timeouts", &[ROWS], &[true; ROWS])),
+        ("`rewards` is a group of arrays, but must be an array", &|subject| {
+            let file = hdf5::File::open_rw(subject.path()).unwrap();
+            file.unlink("rewards").unwrap();
+            file.create_group("rewards").unwrap();
+        }),
+    ];
+    for (expected, spoil) in cases {
+        let subject = Subject::new();
+        assert_eq!(subject.read().unwrap().len(), ROWS - 1, "the subject itself is whole");
+        spoil(&subject);
+        assert!(subject.error().ends_with(expected), "{}, not {expected}", subject.error());
+    }
 }
 
 #[test]
@@ -200,7 +179,7 @@ fn actions_outside_the_unit_box() {
     data[4] = 1.0009; // rounding
     let subject = Subject::new();
     subject.replace("actions", &[ROWS, 3], &data);
-    assert!(subject.read(RewardRule::AsIs).is_ok());
+    assert!(subject.read().is_ok());
     data[16..20].fill(-30.0);
     subject.replace("actions", &[ROWS, 3], &data);
     assert_eq!(subject.error(), "array `actions`, row 5: the action -30 is outside [-1, 1] (2 such rows)");
@@ -217,41 +196,13 @@ fn an_endless_episode() {
         subject.replace("timeouts", &[rows], &vec![false; rows]);
         subject
     };
-    assert!(long(1000).read(RewardRule::AsIs).is_ok(), "a single episode of as many steps as Hopper allows");
+    assert!(long(1000).read().is_ok(), "a single episode of as many steps as Hopper allows");
     let subject = long(1001);
     assert_eq!(subject.error(), "1001 rows without any terminal or timeout, as if they were one endless episode");
-    let unknown = ReadOptions { environment: None, reward: RewardRule::AsIs, scale: Scale::default() };
-    assert!(Transitions::read(long(50).path(), &unknown).is_err());
+    assert!(try_read(&long(50).path(), None).is_err());
     // Without the array, Hopper's time limit cuts it.
     hdf5::File::open_rw(subject.path()).unwrap().unlink("timeouts").unwrap();
-    assert!(subject.read(RewardRule::AsIs).is_ok());
-}
-
-#[test]
-fn flags_that_are_neither_0_nor_1() {
-    let mut data = [0i32; ROWS];
-    for (value, shown) in [(2, 2), (-1, -1), (256, 127)] {
-        data[3] = value;
-        let subject = Subject::new();
-        subject.replace("timeouts", &[ROWS], &data);
-        assert_eq!(subject.error(), format!("array `timeouts`, row 3: {shown} is neither 0 nor 1"));
-    }
-}
-
-#[test]
-fn no_rows_and_no_transitions() {
-    let subject = Subject::new();
-    subject.replace::<f32>("observations", &[0, 11], &[]);
-    assert_eq!(subject.error(), "array `actions` has shape [20, 3], but must have [0, 3]");
-    subject.replace::<f32>("actions", &[0, 3], &[]);
-    subject.replace::<f32>("rewards", &[0], &[]);
-    subject.replace::<bool>("terminals", &[0], &[]);
-    subject.replace::<bool>("timeouts", &[0], &[]);
-    assert_eq!(subject.error(), "0 rows, of which none makes a transition");
-
-    let subject = Subject::new();
-    subject.replace("timeouts", &[ROWS], &[true; ROWS]);
-    assert_eq!(subject.error(), "20 rows, of which none makes a transition");
+    assert!(subject.read().is_ok());
 }
 
 #[test]
@@ -274,6 +225,8 @@ fn a_size_that_no_such_file_can_hold() {
 fn returns_without_any_spread() {
     let subject = Subject::new();
     subject.replace("rewards", &[ROWS], &[0f32; ROWS]);
-    assert!(matches!(subject.read(RewardRule::Locomotion), Err(DatasetError { problem: Problem::SameReturns, .. })));
-    assert!(subject.read(RewardRule::AsIs).is_ok());
+    assert!(subject.read().is_ok());
+    let options = ReadOptions { environment: Some(hopper()), reward: RewardRule::Locomotion, scale: Scale::default() };
+    let error = Transitions::read(subject.path(), &options).err().unwrap();
+    assert!(matches!(error.problem, Problem::SameReturns), "{error}");
 }

@@ -3,12 +3,12 @@
 
 use std::path::Path;
 
-use hdf5::H5Type;
-use ndarray::ArrayViewD;
 use quad_dataset::{ReadOptions, RewardRule, Scale, Transitions, inspect};
 use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 use tempfile::tempdir;
+
+use crate::{put, try_read};
 
 /// Numbers in an observation.
 const O: usize = 4;
@@ -52,27 +52,19 @@ impl Cart {
         cart
     }
 
-    fn rows(&self) -> usize {
-        self.rewards.len()
-    }
-
     /// Writes it in D4RL's layout, or in the custom one.
     fn write(&self, path: &Path, own: bool) {
-        fn put<T: H5Type>(file: &hdf5::File, array: &str, rows: usize, values: &[T]) {
-            let view = ArrayViewD::from_shape(vec![rows, values.len() / rows], values).unwrap();
-            file.new_dataset_builder().with_data(view).create(array).unwrap();
-        }
-        let file = hdf5::File::create(path).unwrap();
+        let (file, rows) = (hdf5::File::create(path).unwrap(), self.rewards.len());
         if own {
             let layout: hdf5::types::VarLenUnicode = "transitions".parse().unwrap();
             file.new_attr::<hdf5::types::VarLenUnicode>().create("layout").unwrap().write_scalar(&layout).unwrap();
-            put(&file, "next_observations", self.rows(), &self.next_observations);
+            put(&file, "next_observations", &[rows, O], &self.next_observations);
         }
-        put(&file, "observations", self.rows(), &self.observations);
-        put(&file, "actions", self.rows(), &self.actions);
-        put(&file, "rewards", self.rows(), &self.rewards);
-        put(&file, "terminals", self.rows(), &self.terminals);
-        put(&file, "timeouts", self.rows(), &self.timeouts);
+        put(&file, "observations", &[rows, O], &self.observations);
+        put(&file, "actions", &[rows, 2], &self.actions);
+        put(&file, "rewards", &[rows], &self.rewards);
+        put(&file, "terminals", &[rows], &self.terminals);
+        put(&file, "timeouts", &[rows], &self.timeouts);
     }
 
     /// What is said of it in each layout, by `inspect` and by who trains on it, who both say the same.
@@ -82,13 +74,9 @@ impl Cart {
         self.write(&path, own);
         let inspection = inspect(&path, None).unwrap();
         assert!(!inspection.refused);
-        assert_eq!(read(&path, Scale::default()).doubts(), inspection.problems);
+        assert_eq!(try_read(&path, None).unwrap().doubts(), inspection.problems);
         inspection.problems
     }
-}
-
-fn read(path: &Path, scale: Scale) -> Transitions {
-    Transitions::read(path, &ReadOptions { environment: None, reward: RewardRule::AsIs, scale }).unwrap()
 }
 
 #[test]
@@ -138,7 +126,7 @@ fn flags_that_are_a_row_out_of_step_with_the_resets() {
 fn crashes_are_no_resets() {
     // The step before a termination is as long as a reset.
     let mut cart = Cart::new(false);
-    for row in (1..cart.rows()).filter(|&row| cart.terminals[row]) {
+    for row in (1..cart.rewards.len()).filter(|&row| cart.terminals[row]) {
         cart.observations[row * O] += 3.0;
     }
     assert_eq!(cart.doubts(false), [""; 0]);
@@ -157,5 +145,7 @@ fn observations_too_large_to_train_on_as_they_are() {
     let folder = tempdir().unwrap();
     let path = folder.path().join("cart.hdf5");
     cart.write(&path, true);
-    assert_eq!(read(&path, Scale { states: true, actions: false }).doubts(), [""; 0]);
+    let scale = Scale { states: true, actions: false };
+    let options = ReadOptions { environment: None, reward: RewardRule::AsIs, scale };
+    assert_eq!(Transitions::read(&path, &options).unwrap().doubts(), [""; 0]);
 }

@@ -4,7 +4,9 @@
 use std::path::{Path, PathBuf};
 use std::process::Command;
 
-use quad_dataset::{Batch, EnvironmentSpec, ReadOptions, RewardRule, Scale, Transitions, environment};
+use hdf5::H5Type;
+use ndarray::ArrayViewD;
+use quad_dataset::{Batch, DatasetError, EnvironmentSpec, ReadOptions, RewardRule, Scale, Transitions, environment};
 
 mod broken;
 mod d4rl;
@@ -16,7 +18,6 @@ mod ogbench;
 mod own;
 mod round_trip;
 mod scale;
-mod speed;
 
 fn hopper() -> &'static EnvironmentSpec {
     environment::find("hopper").unwrap()
@@ -34,6 +35,17 @@ fn shared(path: &str) -> Option<PathBuf> {
 
 fn read(path: &Path, environment: Option<&'static EnvironmentSpec>, reward: RewardRule) -> Transitions {
     Transitions::read(path, &ReadOptions { environment, reward, scale: Scale::default() }).unwrap()
+}
+
+/// Reads a source, with its rewards as they are.
+fn try_read(path: &Path, environment: Option<&'static EnvironmentSpec>) -> Result<Transitions, DatasetError> {
+    Transitions::read(path, &ReadOptions { environment, reward: RewardRule::AsIs, scale: Scale::default() })
+}
+
+/// Writes an array.
+fn put<T: H5Type>(file: &hdf5::File, array: &str, shape: &[usize], data: &[T]) {
+    let view = ArrayViewD::from_shape(shape, data).unwrap();
+    file.new_dataset_builder().with_data(view).create(array).unwrap();
 }
 
 fn all(transitions: &Transitions) -> Batch {

@@ -2,10 +2,10 @@
 
 use std::path::{Path, PathBuf};
 
-use quad_dataset::{DatasetError, ReadOptions, RewardRule, Scale, Transitions, environment};
+use quad_dataset::{DatasetError, environment};
 use tempfile::{TempDir, tempdir};
 
-use crate::{compare, hopper, peers};
+use crate::{compare, hopper, peers, try_read};
 
 fn written(variant: &str) -> Option<(TempDir, PathBuf)> {
     let folder = tempdir().unwrap();
@@ -14,8 +14,7 @@ fn written(variant: &str) -> Option<(TempDir, PathBuf)> {
 }
 
 fn error(path: &Path) -> DatasetError {
-    let options = ReadOptions { environment: Some(hopper()), reward: RewardRule::AsIs, scale: Scale::default() };
-    Transitions::read(path, &options).err().unwrap()
+    try_read(path, Some(hopper())).err().unwrap()
 }
 
 #[test]
@@ -41,11 +40,8 @@ fn without_rewards_there_is_nothing_to_learn() {
 #[test]
 fn a_maze_of_ogbench_is_learnt_from_but_not_scored_in_one_of_ours() {
     let Some((_folder, path)) = written("maze") else { return };
-    let read = |environment| {
-        Transitions::read(&path, &ReadOptions { environment, reward: RewardRule::AsIs, scale: Scale::default() })
-    };
-    assert!(read(None).is_ok());
-    let error = read(environment::find("antmaze-medium").ok()).err().unwrap();
+    assert!(try_read(&path, None).is_ok());
+    let error = try_read(&path, environment::find("antmaze-medium").ok()).err().unwrap();
     assert!(error.to_string().ends_with("recorded in `OGBench`, which is not `antmaze-medium`"), "{error}");
     assert!(error.hint().contains("--task own-data"), "{}", error.hint());
 }

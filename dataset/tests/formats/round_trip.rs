@@ -45,7 +45,7 @@ fn write(path: &std::path::Path) {
 }
 
 #[test]
-fn the_reader_reads_every_row_bit_for_bit() {
+fn the_reader_reads_every_row_bit_for_bit_and_h5py_the_layout_of_d4rl() {
     let folder = tempdir().unwrap();
     let path = folder.path().join("new/folder/rows.hdf5");
     write(&path);
@@ -54,13 +54,6 @@ fn the_reader_reads_every_row_bit_for_bit() {
     for (i, row) in recorded.iter().enumerate() {
         assert_eq!(row, OwnedRow::new(i).row(i), "row {i}");
     }
-}
-
-#[test]
-fn h5py_reads_the_layout_of_d4rl() {
-    let folder = tempdir().unwrap();
-    let path = folder.path().join("rows.hdf5");
-    write(&path);
     peers(&["check-written", path.to_str().unwrap(), &ROWS.to_string()]);
 }
 

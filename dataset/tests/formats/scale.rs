@@ -73,20 +73,9 @@ fn actions_reach_from_least_to_largest() {
 
 #[test]
 fn states_alone_leave_the_range_of_actions_to_be_checked() {
-    let options =
-        ReadOptions { environment: None, reward: RewardRule::AsIs, scale: Scale { actions: false, states: true } };
+    let scale = Scale { actions: false, states: true };
+    let options = ReadOptions { environment: None, reward: RewardRule::AsIs, scale };
     let (_folder, path) = file();
     let error = Transitions::read(path, &options).err().unwrap();
     assert!(error.to_string().contains("the action -30 is outside [-1, 1]"), "{error}");
-}
-
-#[test]
-fn the_names_of_what_is_scaled() {
-    let read = |json: &str| serde_json::from_str::<Scale>(json);
-    let both = Scale { actions: true, states: true };
-    assert_eq!(read(r#"["states", "actions", "states"]"#).unwrap(), both);
-    assert_eq!(read("[]").unwrap(), Scale::default());
-    assert_eq!(serde_json::to_string(&both).unwrap(), r#"["actions","states"]"#);
-    let error = read(r#"["rewards"]"#).unwrap_err().to_string();
-    assert!(error.contains("unknown variant `rewards`, expected `actions` or `states`"), "{error}");
 }
