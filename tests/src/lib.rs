@@ -10,7 +10,7 @@
 //! - [`http`]: fetch a page, read a metric, serve a file.
 //! - [`router`]: a Zenoh router in the test's own process; [`certificates`]: one for each role, and sessions that show them.
 //! - [`made_up`]: messages that tests make up; [`crowd`]: hundreds of evaluators that only talk.
-//! - [`line`](mod@line): a connection on which things go wrong: a [`link`] of TCP, or a cable to a host of its own, in [`hosts`].
+//! - [`link`]: a connection on which things go wrong.
 //! - [`power`]: what a disk holds after a power cut; [`small_disk`]: one that is soon full.
 //! - [`peers`]: programs that are not ours; where one is missing, a test is skipped or fails.
 //! - [`prometheus`]: one to start, and what to ask any; [`dashboard`]: what Grafana's panels ask it.
@@ -21,10 +21,8 @@
 pub mod certificates;
 pub mod crowd;
 pub mod dashboard;
-pub mod hosts;
 pub mod http;
 pub mod learner;
-pub mod line;
 pub mod link;
 pub mod made_up;
 pub mod peers;

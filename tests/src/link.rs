@@ -1,5 +1,4 @@
 //! A network connection that a test can cut, freeze and slow down: it leads a program on to a port of this machine.
-//! Works for any user.
 
 use std::io::{ErrorKind, Read, Write};
 use std::net::{Shutdown, TcpListener, TcpStream};
@@ -8,21 +7,41 @@ use std::sync::{Arc, Mutex};
 use std::thread;
 use std::time::Duration;
 
-use crate::line::{Line, Trouble};
-
 /// How often a connection without traffic looks whether it still is one.
 const GLANCE: Duration = Duration::from_millis(20);
 
+/// What goes wrong on a connection, for a while.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
+pub enum Trouble {
+    /// Connections end, and new ones are turned away.
+    Cut,
+    /// Nothing goes through, and neither end is told.
+    Silent,
+    /// Nothing reaches the program; what it sends arrives.
+    Deaf,
+    /// Nothing that the program sends arrives; what others send reaches it.
+    Mute,
+    /// Everything takes its time.
+    Slow,
+}
+
+impl Trouble {
+    /// All that can go wrong.
+    pub const ALL: [Self; 5] = [Self::Cut, Self::Silent, Self::Deaf, Self::Mute, Self::Slow];
+}
+
 /// Leads every connection to its address on to a port of this machine.
 pub struct Link {
-    endpoint: String,
+    /// Where a program connects to, as `tcp/host:port`.
+    pub endpoint: String,
     state: Arc<State>,
 }
 
 #[derive(Default)]
 struct State {
     cut: AtomicBool,
-    frozen: AtomicBool,
+    /// What the program sends, and what it is sent.
+    frozen: [AtomicBool; 2],
     delay_milliseconds: AtomicU64,
     streams: Mutex<Vec<TcpStream>>,
 }
@@ -46,29 +65,18 @@ impl Link {
                 let mut open = shared.streams.lock().expect("no thread panics with it");
                 open.retain(|stream| stream.peer_addr().is_ok());
                 open.extend(copies);
-                for (from, to) in [(&near, &far), (&far, &near)] {
+                for (way, (from, to)) in [(&near, &far), (&far, &near)].into_iter().enumerate() {
                     let (Ok(from), Ok(to)) = (from.try_clone(), to.try_clone()) else { continue };
                     let state = shared.clone();
-                    thread::spawn(move || carry(from, to, &state));
+                    thread::spawn(move || carry(from, to, way, &state));
                 }
             }
         });
         Link { endpoint, state }
     }
-}
 
-impl Line for Link {
-    const TROUBLES: &'static [Trouble] = &[Trouble::Cut, Trouble::Silent, Trouble::Slow];
-
-    fn endpoint(&self) -> String {
-        self.endpoint.clone()
-    }
-
-    fn launcher(&self) -> Vec<String> {
-        Vec::new()
-    }
-
-    fn suffer(&self, trouble: Trouble, percent: u32, a_while: Duration) {
+    /// Lets something go wrong for a while, a little (1 %) or much (100 %). Afterwards the connection is whole again.
+    pub fn suffer(&self, trouble: Trouble, percent: u32, a_while: Duration) {
         let state = &self.state;
         match trouble {
             Trouble::Cut => {
@@ -77,18 +85,19 @@ impl Line for Link {
                     stream.shutdown(Shutdown::Both).ok();
                 }
             }
-            Trouble::Silent => state.frozen.store(true, Relaxed),
+            Trouble::Silent => state.frozen.iter().for_each(|way| way.store(true, Relaxed)),
+            Trouble::Mute => state.frozen[0].store(true, Relaxed),
+            Trouble::Deaf => state.frozen[1].store(true, Relaxed),
             Trouble::Slow => state.delay_milliseconds.store(u64::from(percent) * 7 / 2, Relaxed),
-            other => unreachable!("{other:?} is not among the troubles of links"),
         }
         thread::sleep(a_while);
         state.cut.store(false, Relaxed);
-        state.frozen.store(false, Relaxed);
+        state.frozen.iter().for_each(|way| way.store(false, Relaxed));
         state.delay_milliseconds.store(0, Relaxed);
     }
 }
 
-fn carry(mut from: TcpStream, mut to: TcpStream, state: &State) {
+fn carry(mut from: TcpStream, mut to: TcpStream, way: usize, state: &State) {
     from.set_read_timeout(Some(GLANCE)).ok();
     let mut block = [0; 1 << 16];
     loop {
@@ -96,7 +105,7 @@ fn carry(mut from: TcpStream, mut to: TcpStream, state: &State) {
             Ok(0) => break,
             Ok(length) => {
                 thread::sleep(Duration::from_millis(state.delay_milliseconds.load(Relaxed)));
-                while state.frozen.load(Relaxed) {
+                while state.frozen[way].load(Relaxed) {
                     thread::sleep(GLANCE);
                 }
                 if to.write_all(&block[..length]).is_err() {

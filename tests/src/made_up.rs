@@ -1,6 +1,17 @@
-//! Messages that tests make up: well-formed, but no learner or evaluator of ours has sent them.
+//! Messages that tests make up, and a client that sends them: well-formed, but no learner or evaluator of ours has sent them.
 
-use quad_protocol::{EpisodeScore, Hash, JobRequest, Name, Progress, ScoreReport, Snapshot};
+use std::time::{Duration, Instant};
+
+use quad_dataset::environment;
+use quad_protocol::{
+    EpisodeScore, Hash, Job, JobReply, JobRequest, Message, Name, Progress, ScoreReport, Snapshot, decode, encode, keys,
+};
+use quad_runtime::{Endpoints, open_session};
+use tokio::time::sleep;
+use zenoh::Session;
+use zenoh::query::{ConsolidationMode, QueryTarget};
+
+use crate::PATIENCE;
 
 /// A name that is allowed.
 pub fn name(text: &str) -> Name {
@@ -45,4 +56,40 @@ pub fn report(run: &Name, step: u64, seed: u64) -> ScoreReport {
 /// A snapshot, whatever is in its file.
 pub fn snapshot(run: &Name, incarnation: u64, step: u64, file: &[u8]) -> Snapshot {
     Snapshot { run: run.clone(), incarnation, step, hash: Hash::of(file), file: file.to_vec() }
+}
+
+/// Scores of all episodes of a job, as if a policy had run them.
+pub fn scores(job: &Job, evaluator: &str) -> ScoreReport {
+    let hopper = environment::find("hopper").expect("hopper is known");
+    let episodes = job.seeds.iter().map(|&seed| {
+        let episode_return = (seed % 3000) as f64;
+        EpisodeScore { seed, episode_return, length: 300, score: hopper.normalised_score(episode_return) }
+    });
+    ScoreReport::of(job, name(evaluator), name("f32"), episodes.collect())
+}
+
+/// A client without a certificate.
+pub async fn client(endpoint: &str) -> Session {
+    let endpoints = Endpoints { connect: vec![endpoint.to_owned()], ..Endpoints::default() };
+    open_session(&endpoints).await.expect("the endpoint is open")
+}
+
+/// The first answer; nothing if none came, or an error.
+pub async fn ask<A: Message>(session: &Session, key: String, question: &impl Message) -> Option<A> {
+    let get = session.get(key).payload(encode(question).expect("it is small")).timeout(PATIENCE);
+    let get = get.target(QueryTarget::All).consolidation(ConsolidationMode::None).await;
+    let answer = get.expect("the session is open").recv_async().await.ok()?.into_result().ok()?;
+    Some(decode(&answer.payload().to_bytes()).expect("the learner's answer"))
+}
+
+/// Claims a job of a run until there is one.
+pub async fn claim_eventually(session: &Session, run: &Name, evaluator: &str) -> Job {
+    let begin = Instant::now();
+    loop {
+        if let Some(JobReply::Job(job)) = ask(session, keys::jobs(run), &claim(evaluator, 1, "hopper")).await {
+            return job;
+        }
+        assert!(begin.elapsed() < PATIENCE, "no job for {evaluator}");
+        sleep(Duration::from_millis(50)).await;
+    }
 }

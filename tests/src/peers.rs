@@ -40,8 +40,7 @@ pub fn run_python(python: &Path, script: &str, arguments: &[&Path]) -> String {
 
 /// Makes certificates with deploy/zenoh/certificates.sh in `folder`; false if the test is to be skipped.
 pub fn certificates(folder: &Path, arguments: &[&str]) -> bool {
-    if Command::new("openssl").arg("version").output().is_err() {
-        missing("openssl", "install it with: apt-get install --no-install-recommends openssl");
+    if !has("openssl", &["version"], "openssl") {
         return false;
     }
     let script = Path::new(env!("CARGO_MANIFEST_DIR")).join("../deploy/zenoh/certificates.sh");
@@ -52,20 +51,18 @@ pub fn certificates(folder: &Path, arguments: &[&str]) -> bool {
 
 /// Whether programs of Debian's package `prometheus` are there; if not, the test is to be skipped.
 pub fn has_prometheus() -> bool {
-    let found = ["prometheus", "promtool"]
-        .iter()
-        .all(|program| Command::new(program).arg("--version").output().is_ok_and(|output| output.status.success()));
-    if !found {
-        missing("Prometheus", "install it with: apt-get install --no-install-recommends prometheus");
-    }
-    found
+    ["prometheus", "promtool"].iter().all(|program| has(program, &["--version"], "prometheus"))
 }
 
 /// Whether Debian's browser is there; if not, the test is to be skipped.
 pub fn has_chromium() -> bool {
-    let found = Command::new("chromium").arg("--version").output().is_ok_and(|output| output.status.success());
+    has("chromium", &["--version"], "chromium")
+}
+
+fn has(program: &str, version: &[&str], package: &str) -> bool {
+    let found = Command::new(program).args(version).output().is_ok_and(|output| output.status.success());
     if !found {
-        missing("Chromium", "install it with: apt-get install --no-install-recommends chromium");
+        missing(program, &format!("install it with: apt-get install --no-install-recommends {package}"));
     }
     found
 }

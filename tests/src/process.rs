@@ -7,22 +7,23 @@ use std::time::Duration;
 
 use crate::eventually;
 
-/// Where cargo put one of our programs: beside this test's own executable.
-pub fn binary(name: &str) -> PathBuf {
+/// Where cargo put a file, below the folder in which it puts our programs.
+fn built(path: &str) -> PathBuf {
     let test = std::env::current_exe().expect("a test knows its own executable");
     // target/release/deps/test-123 → target/release/name
-    let folder = test.parent().and_then(Path::parent).expect("a test lies two folders below target/");
-    let path = folder.join(name);
+    test.parent().and_then(Path::parent).expect("a test lies two folders below target/").join(path)
+}
+
+/// One of our programs.
+pub fn binary(name: &str) -> PathBuf {
+    let path = built(name);
     assert!(path.exists(), "{} is missing; build it with: cargo build --release --bins", path.display());
     path
 }
 
 /// The words that start a program with a library that is an example of this crate, as `cargo test` builds it.
 pub fn preload(example: &str) -> Vec<String> {
-    let test = std::env::current_exe().expect("a test knows its own executable");
-    // target/release/deps/test-123 → target/release/examples/libNAME.so
-    let release = test.parent().and_then(Path::parent).expect("a test lies two folders below target/");
-    let library = release.join(format!("examples/lib{example}.so"));
+    let library = built(&format!("examples/lib{example}.so"));
     assert!(library.exists(), "{} is missing; cargo build --release --examples makes it", library.display());
     vec!["env".to_owned(), format!("LD_PRELOAD={}", library.display())]
 }

@@ -4,6 +4,7 @@ use std::fs;
 use std::net::TcpListener;
 use std::path::{Path, PathBuf};
 use std::process::Command;
+use std::sync::LazyLock;
 
 use quad_dataset::{D4rlWriter, Metadata, Row, environment};
 use tempfile::TempDir;
@@ -28,7 +29,7 @@ impl Scratch {
     /// Makes the folder inside of another.
     pub fn inside(parent: &Path) -> Scratch {
         let folder = tempfile::tempdir_in(parent).expect("there is room for a scratch folder");
-        write_dataset(&folder.path().join("tiny.hdf5"));
+        fs::write(folder.path().join("tiny.hdf5"), &*DATASET).expect("the scratch folder is writable");
         Scratch { folder }
     }
 
@@ -126,6 +127,13 @@ pub fn free_port() -> u16 {
 pub fn free_endpoint() -> String {
     format!("tcp/127.0.0.1:{}", free_port())
 }
+
+/// Made once, and copied: a program that another test starts meanwhile would keep HDF5's lock of the file that is being written.
+static DATASET: LazyLock<Vec<u8>> = LazyLock::new(|| {
+    let file = tempfile::NamedTempFile::new().expect("there is room for a dataset");
+    write_dataset(file.path());
+    fs::read(file.path()).expect("it was written")
+});
 
 /// Ten episodes of three hundred steps: smooth, bounded, of different returns, and far from any physics.
 fn write_dataset(path: &Path) {

@@ -7,9 +7,6 @@ use std::path::Path;
 use quad_dataset::{HDF5_SIGNATURE, NamedDataset};
 use sha2::{Digest, Sha256};
 
-/// Read at a time.
-const CHUNK: usize = 1 << 20;
-
 /// SHA-256 of a file in lower-case hexadecimal if the file is what `dataset` says, as far as that is known; else what is wrong.
 pub fn verify(dataset: &NamedDataset, path: &Path) -> io::Result<Result<String, String>> {
     let mut file = File::open(path)?;
@@ -34,11 +31,6 @@ pub fn verify(dataset: &NamedDataset, path: &Path) -> io::Result<Result<String, 
 pub fn sha256(path: &Path) -> io::Result<String> {
     let mut file = File::open(path)?;
     let mut hasher = Sha256::new();
-    let mut chunk = vec![0; CHUNK];
-    loop {
-        match file.read(&mut chunk)? {
-            0 => return Ok(format!("{:x}", hasher.finalize())),
-            count => hasher.update(&chunk[..count]),
-        }
-    }
+    io::copy(&mut file, &mut hasher)?;
+    Ok(format!("{:x}", hasher.finalize()))
 }

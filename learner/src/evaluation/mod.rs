@@ -18,7 +18,7 @@ mod outcomes;
 mod refusal;
 mod scoreboard;
 #[cfg(test)]
-pub(crate) mod tests;
+mod tests;
 mod validate;
 
 pub(crate) use outcomes::{Claim, Claimed, HandedBack, Lost, OtherWeights};

@@ -166,6 +166,3 @@ impl EvaluatorMetrics {
         self.last_seen.remove_label_values(&label).ok();
     }
 }
-
-#[cfg(test)]
-mod tests;

@@ -31,8 +31,6 @@ mod scores;
 mod services;
 mod snapshots;
 mod spawn;
-#[cfg(test)]
-mod tests;
 mod threads;
 mod weights;
 

@@ -114,6 +114,3 @@ impl NotAccepted {
         }
     }
 }
-
-#[cfg(test)]
-mod tests;

@@ -10,7 +10,7 @@ use serde::{Serialize, Serializer};
 /// Most rows that are kept: more than a chart has pixels for. Even, so that pairs of rows can become one.
 const MOST_ROWS: usize = 500;
 /// Significant digits that are sent.
-const DIGITS: i32 = 5;
+const DIGITS: usize = 5;
 
 /// What `metrics.jsonl` says. Of a long run each row is the mean of as many lines as it takes to keep the rows few.
 #[derive(Debug, Serialize)]
@@ -108,12 +108,7 @@ impl Serialize for Row {
 
 /// The number with few digits; nothing if it is not finite.
 fn rounded(value: f64) -> Option<f64> {
-    let digits = DIGITS - 1 - value.abs().log10().floor().clamp(-300.0, 300.0) as i32;
-    let scale = 10f64.powi(digits);
-    match (value * scale).round() / scale {
-        _ if value == 0.0 || digits <= 0 => value.is_finite().then_some(value.round()),
-        rounded => rounded.is_finite().then_some(rounded),
-    }
+    format!("{value:.*e}", DIGITS - 1).parse().ok().filter(|rounded: &f64| rounded.is_finite())
 }
 
 #[cfg(test)]

@@ -10,8 +10,7 @@ use base64::prelude::{BASE64_STANDARD, Engine};
 use minijinja::Environment;
 use minijinja::value::Serde;
 use quad_run::results::RunReport;
-use quad_run::table::Part;
-use serde::Serialize;
+use serde_json::{Value, json};
 use tracing::warn;
 
 use super::figures;
@@ -27,47 +26,6 @@ const FILMS: [(&str, &str, &[u8]); 2] =
 /// Largest film, bytes: many times as large as any of ours.
 const LARGEST: u64 = 1 << 25;
 
-/// What the template is filled with.
-#[derive(Serialize)]
-struct Page {
-    title: String,
-    subtitle: String,
-    version: &'static str,
-    parts: Vec<Part>,
-    figures: Vec<Figure>,
-    films: Vec<Film>,
-    groups: Vec<Group>,
-    commands: String,
-}
-
-#[derive(Serialize)]
-struct Figure {
-    title: String,
-    svg: String,
-}
-
-#[derive(Serialize)]
-struct Film {
-    run: String,
-    /// A `data:` address.
-    data: String,
-}
-
-/// Runs that differ in their seed alone.
-#[derive(Serialize)]
-struct Group {
-    title: String,
-    facts: Vec<Fact>,
-    /// TOML, without the seed.
-    settings: String,
-}
-
-#[derive(Serialize)]
-struct Fact {
-    name: &'static str,
-    value: String,
-}
-
 /// Writes the report.
 ///
 /// # Errors
@@ -80,34 +38,36 @@ pub fn write(path: &Path, report: &Report) -> anyhow::Result<()> {
     plot::replace(path, page.as_bytes())
 }
 
-fn page(report: &Report) -> anyhow::Result<Page> {
+/// What the template is filled with.
+fn page(report: &Report) -> anyhow::Result<Value> {
     let tasks: BTreeSet<&str> = report.runs.iter().map(|run| &*run.task).collect();
     let plural = if report.runs.len() == 1 { "" } else { "s" };
     let complete = report.runs.iter().filter(|run| run.is_complete()).count();
     let figures = figures::all(report).into_iter().map(|(_, picture)| {
         let svg = picture.svg()?;
-        Ok(Figure { title: picture.title, svg })
+        Ok(json!({ "title": picture.title, "svg": svg }))
     });
-    Ok(Page {
-        title: Vec::from_iter(tasks).join(", "),
-        subtitle: format!("{} run{plural}, {complete} complete", report.runs.len()),
-        version: env!("CARGO_PKG_VERSION"),
-        parts: report.summaries(true),
-        figures: figures.collect::<anyhow::Result<_>>()?,
-        films: films(&report.runs),
-        groups: report.groups.iter().map(|group| of_group(group, &report.runs)).collect::<anyhow::Result<_>>()?,
-        commands: commands(&report.runs),
-    })
+    let groups = report.groups.iter().map(|group| of_group(group, &report.runs));
+    Ok(json!({
+        "title": Vec::from_iter(tasks).join(", "),
+        "subtitle": format!("{} run{plural}, {complete} complete", report.runs.len()),
+        "version": env!("CARGO_PKG_VERSION"),
+        "parts": report.summaries(true),
+        "figures": figures.collect::<anyhow::Result<Value>>()?,
+        "films": films(&report.runs),
+        "groups": groups.collect::<anyhow::Result<Value>>()?,
+        "commands": commands(&report.runs),
+    }))
 }
 
-fn films(runs: &[RunReport]) -> Vec<Film> {
+fn films(runs: &[RunReport]) -> Vec<Value> {
     let mut films = Vec::new();
     for run in runs {
         for (path, kind, begin) in FILMS.map(|(name, kind, begin)| (run.dir.join(name), kind, begin)) {
             match film(&path, begin) {
                 Ok(bytes) => {
                     let data = format!("data:{kind};base64,{}", BASE64_STANDARD.encode(bytes));
-                    films.push(Film { run: run.run.clone(), data });
+                    films.push(json!({ "run": run.run, "data": data }));
                 }
                 Err(error) if error.kind() == ErrorKind::NotFound => {}
                 Err(error) => warn!("{} is not in the report: {error}", path.display()),
@@ -128,7 +88,8 @@ fn film(path: &Path, begin: &[u8]) -> io::Result<Vec<u8>> {
     if bytes.starts_with(begin) { Ok(bytes) } else { Err(io::Error::other("it is no such picture")) }
 }
 
-fn of_group(group: &GroupReport, runs: &[RunReport]) -> anyhow::Result<Group> {
+/// Runs that differ in their seed alone: their settings are without it.
+fn of_group(group: &GroupReport, runs: &[RunReport]) -> anyhow::Result<Value> {
     let runs: Vec<&RunReport> = runs.iter().filter(|run| group.dirs.contains(&run.dir)).collect();
     let once_each = |value: &dyn Fn(&RunReport) -> Option<String>| {
         let values: BTreeSet<String> = runs.iter().filter_map(|run| value(run)).collect();
@@ -152,14 +113,17 @@ fn of_group(group: &GroupReport, runs: &[RunReport]) -> anyhow::Result<Group> {
         ("departures", group.departures.join("\n")),
         (title, once_each(&summary)),
     ];
-    let facts = facts.into_iter().filter(|(_, value)| !value.is_empty()).map(|(name, value)| Fact { name, value });
+    let facts = facts
+        .into_iter()
+        .filter(|(_, value)| !value.is_empty())
+        .map(|(name, value)| json!({ "name": name, "value": value }));
     let mut settings = toml::Table::try_from(&runs.first().context("a group has runs")?.config.experiment)?;
     settings.remove("seed");
-    Ok(Group {
-        title: format!("{}: {}", group.task, group.method),
-        facts: facts.collect(),
-        settings: toml::to_string(&settings)?,
-    })
+    Ok(json!({
+        "title": format!("{}: {}", group.task, group.method),
+        "facts": Value::from_iter(facts),
+        "settings": toml::to_string(&settings)?,
+    }))
 }
 
 fn commands(runs: &[RunReport]) -> String {

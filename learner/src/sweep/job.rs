@@ -1,20 +1,32 @@
-//! A learner at work on one run of a study.
+//! One run of a study: its learner, from the run's folder to what the learner's end means.
 
 use std::fs;
 use std::io;
 use std::net::SocketAddr;
 use std::path::{Path, PathBuf};
 use std::process::{Child, Command, ExitStatus};
+use std::time::Duration;
 
 use anyhow::Context;
 use quad_run::config::tables;
 use quad_run::run::RunDir;
 use quad_run::status::{Pace, State};
-use quad_runtime::{ENDED_AT_ONCE, UNFINISHED, error_in};
+use quad_runtime::{ENDED_AT_ONCE, LEAVE_WITHIN, UNFINISHED, error_in};
 use rustix::process::{Pid, Signal, kill_process};
+use tokio::sync::watch::Receiver;
+use tokio::task::spawn_blocking;
+use tokio::time::{sleep, timeout};
 
 use super::study::PlannedRun;
 use crate::local_evaluators::{not_encrypted, run_beside};
+
+/// How often it looks whether a learner has ended.
+pub(super) const GLANCE: Duration = Duration::from_millis(100);
+/// A learner that was told to stop ends within less; one that is frozen is killed. Then there is time for the evaluators to
+/// leave before the sweep must have ended.
+const LEARNERS_LEAVE: Duration = LEAVE_WITHIN.saturating_add(Duration::from_secs(2));
+/// How long a sweep that was told to end waits for what a disk has to say of a learner that has ended.
+const LAST_WORDS: Duration = Duration::from_secs(1);
 
 /// What all learners of a sweep have in common.
 #[derive(Clone)]
@@ -27,30 +39,14 @@ pub(crate) struct Learners {
     pub http: Option<SocketAddr>,
 }
 
-/// A run whose folder is there, and the command of its learner.
-pub(super) struct Prepared {
-    run: PlannedRun,
-    dir: PathBuf,
-    from: u64,
-    /// Bytes that earlier learners have logged.
-    logged: u64,
-    command: Command,
-}
-
-/// A learner's process.
+/// A run at work.
+#[derive(Clone)]
 pub(super) struct Job {
-    /// Its run.
     pub run: PlannedRun,
     /// The run's folder.
     pub dir: PathBuf,
     /// Steps that were done before.
     pub from: u64,
-    /// What it was last seen to have done.
-    pub progress: Pace,
-    logged: u64,
-    process: Child,
-    /// Whether it was told to stop.
-    stopped: bool,
 }
 
 /// How a learner has ended.
@@ -63,79 +59,100 @@ pub(super) enum End {
     Failed(String),
 }
 
-impl Prepared {
-    /// Makes the run's folder.
-    ///
-    /// # Errors
-    /// The folder cannot be written to.
-    pub fn new(run: PlannedRun, state: State, dir: PathBuf, with: &Learners) -> anyhow::Result<Self> {
-        let from = state.step(run.experiment.steps);
+impl Job {
+    /// A run of a study in this folder.
+    pub fn new(run: PlannedRun, state: State, study: &Path) -> Self {
+        Self { dir: study.join(&run.name), from: state.step(run.experiment.steps), run }
+    }
+
+    /// Starts the learner and waits for its end; after `stop`, in which it saves a checkpoint, for no longer than it may take.
+    /// The system ends the learner with the calling thread. Other threads read and write the folder: a disk that hangs holds
+    /// up neither other runs nor Ctrl-C.
+    pub async fn see_through(self, with: Learners, stop: Receiver<bool>) -> (Self, End, Pace) {
+        let begun = Pace { step: self.from, ..Pace::default() };
+        let (end, pace) =
+            self.work(with, stop).await.unwrap_or_else(|error| (End::Failed(format!("{error:#}")), begun));
+        (self, end, pace)
+    }
+
+    async fn work(&self, with: Learners, stop: Receiver<bool>) -> anyhow::Result<(End, Pace)> {
+        let unfinished = (End::Unfinished, Pace { step: self.from, ..Pace::default() });
+        let job = self.clone();
+        let (mut command, logged) = tokio::select! {
+            prepared = spawn_blocking(move || job.prepare(&with)) => prepared??,
+            () = told(&stop) => return Ok(unfinished),
+        };
+        let mut learner = command.spawn().with_context(|| format!("{}: cannot start a learner", self.run.name))?;
+        let status = tokio::select! {
+            status = ended(&mut learner) => status,
+            () = told(&stop) => {
+                kill_process(Pid::from_child(&learner), Signal::TERM).ok();
+                if timeout(LEARNERS_LEAVE, ended(&mut learner)).await.is_err() {
+                    learner.kill().ok();
+                }
+                ended(&mut learner).await
+            }
+        };
+        let (job, stopped) = (self.clone(), *stop.borrow());
+        let concluded = spawn_blocking(move || (job.conclude(status, stopped, logged), Pace::read(&job.dir)));
+        tokio::select! {
+            concluded = concluded => Ok(concluded?),
+            () = async { told(&stop).await; sleep(LAST_WORDS).await } => Ok(unfinished),
+        }
+    }
+
+    /// Makes the run's folder. Gives the learner's command, and how many bytes earlier learners have logged.
+    fn prepare(&self, with: &Learners) -> anyhow::Result<(Command, u64)> {
+        let Self { run, dir, .. } = self;
         let mut command = Command::new(std::env::current_exe()?);
-        command.args(["train", "--preset", &run.preset, "--connect", &with.endpoint, "--run-dir"]).arg(&dir);
+        command.args(["train", "--preset", &run.preset, "--connect", &with.endpoint, "--run-dir"]).arg(dir);
         command.args(with.http.iter().flat_map(|address| ["--http".to_owned(), address.to_string()]));
         for (key, value) in tables::keys(&run.changes) {
             command.args(["--set", &format!("{key}={value}")]);
         }
         command.env("RAYON_NUM_THREADS", with.threads.to_string());
         not_encrypted(&mut command, &with.endpoint);
-        fs::create_dir_all(&dir)
-            .and_then(|()| run_beside(&mut command, &log(&dir)))
+        fs::create_dir_all(dir)
+            .and_then(|()| run_beside(&mut command, &log(dir)))
             .with_context(|| format!("{}: cannot write to {}", run.name, dir.display()))?;
-        let logged = fs::metadata(log(&dir)).map_or(0, |log| log.len());
-        Ok(Self { run, dir, from, logged, command })
+        Ok((command, fs::metadata(log(dir)).map_or(0, |log| log.len())))
     }
 
-    /// Starts the learner. The system ends it with the calling thread.
-    ///
-    /// # Errors
-    /// No process can be made.
-    pub fn start(mut self) -> anyhow::Result<Job> {
-        let process = self.command.spawn().with_context(|| format!("{}: cannot start a learner", self.run.name))?;
-        let Self { run, dir, from, logged, .. } = self;
-        let progress = Pace { step: from, ..Pace::default() };
-        Ok(Job { run, dir, from, progress, logged, process, stopped: false })
-    }
-}
-
-impl Job {
-    /// How its process has ended, if it has.
-    pub fn ended(&mut self) -> Option<io::Result<ExitStatus>> {
-        self.process.try_wait().transpose()
-    }
-
-    /// Tells it to save a checkpoint and leave.
-    pub fn stop(&mut self) {
-        self.stopped = true;
-        kill_process(Pid::from_child(&self.process), Signal::TERM).ok();
-    }
-
-    /// Ends it at once.
-    pub fn kill(&mut self) {
-        self.process.kill().ok();
-    }
-
-    /// What its end means for the run; its last progress is read. Remembers a failure in the run's folder.
-    pub fn conclude(&mut self, status: io::Result<ExitStatus>) -> End {
-        self.progress = Pace::read(&self.dir);
+    /// What the learner's end means for the run. Remembers a failure in the run's folder.
+    fn conclude(&self, status: io::Result<ExitStatus>, stopped: bool, logged: u64) -> End {
         let code = status.as_ref().ok().and_then(ExitStatus::code).and_then(|code| u8::try_from(code).ok());
         match code {
             Some(0) => return End::Complete,
             Some(UNFINISHED) => return End::Unfinished,
             // It was ended before it could do as it was told; the same command continues all the same.
-            None | Some(ENDED_AT_ONCE) if self.stopped => return End::Unfinished,
+            None | Some(ENDED_AT_ONCE) if stopped => return End::Unfinished,
             _ => {}
         }
         // On a disk that takes nothing, `--list` calls it begun.
         RunDir::at(&self.dir).mark_failed(true).ok();
         let log = log(&self.dir);
         let text = fs::read(&log).unwrap_or_default();
-        let own = String::from_utf8_lossy(text.get(self.logged as usize..).unwrap_or_default());
+        let own = String::from_utf8_lossy(text.get(logged as usize..).unwrap_or_default());
         let reason = match (error_in(&own), status) {
             (Some(error), _) => error.to_owned(),
             (None, Ok(status)) => format!("the learner ended by {status}"),
             (None, Err(error)) => format!("the learner is lost: {error}"),
         };
         End::Failed(format!("{}: {reason} ({})", self.run.name, log.display()))
+    }
+}
+
+/// Waits until the sweep is told to end.
+async fn told(stop: &Receiver<bool>) {
+    stop.clone().wait_for(|stop| *stop).await.ok();
+}
+
+async fn ended(learner: &mut Child) -> io::Result<ExitStatus> {
+    loop {
+        if let Some(status) = learner.try_wait().transpose() {
+            return status;
+        }
+        sleep(GLANCE).await;
     }
 }
 

@@ -3,26 +3,19 @@
 use std::collections::{BTreeMap, VecDeque};
 use std::path::PathBuf;
 use std::pin::pin;
-use std::time::{Duration, Instant};
+use std::time::Instant;
 
 use indicatif::HumanDuration;
 use quad_run::status::{Pace, State};
 use quad_runtime::LEAVE_WITHIN;
-use tokio::task::JoinSet;
-use tokio::time::{interval, timeout};
+use tokio::sync::watch;
+use tokio::task::{JoinSet, LocalSet};
+use tokio::time::interval;
 
 use super::display::Display;
-use super::job::{End, Job, Learners, Prepared};
+use super::job::{End, GLANCE, Job, Learners};
 use super::study::PlannedRun;
 use crate::local_evaluators::LocalEvaluators;
-
-/// How often it looks whether a learner has ended.
-const GLANCE: Duration = Duration::from_millis(100);
-/// A learner that was told to stop ends within less; one that is frozen is killed. Then there is time for the evaluators to
-/// leave before the sweep must have ended.
-const LEARNERS_LEAVE: Duration = LEAVE_WITHIN.saturating_add(Duration::from_secs(2));
-/// How long a sweep that was told to end waits for what a disk has to say of learners that have ended.
-const LAST_WORDS: Duration = Duration::from_secs(1);
 
 /// What is to be done.
 pub(crate) struct Sweep {
@@ -51,140 +44,106 @@ pub(crate) struct Ended {
 
 /// What is going on.
 struct Floor {
-    at_work: Vec<Job>,
-    /// Tasks that read and write folders of runs, on other threads: a disk that hangs holds up neither learners nor Ctrl-C.
-    disk: JoinSet<Done>,
-    /// Runs whose folder is being made.
-    preparing: usize,
-    /// Whether the progress of the runs at work is being read.
-    reading: bool,
+    /// By the run's number, with what each was last seen to have done.
+    at_work: BTreeMap<usize, (Job, Pace)>,
     complete: usize,
     failed: Vec<String>,
     display: Display,
     begin: Instant,
     /// Estimated seconds of work that learners which have ended have done.
     done: f64,
-    /// When the sweep was told to end.
-    interrupted: Option<Instant>,
-}
-
-/// What a task on the disk has done.
-enum Done {
-    /// Made a run's folder.
-    Prepared(anyhow::Result<Box<Prepared>>),
-    /// Read and noted how a learner has ended.
-    Concluded(Box<Job>, End),
-    /// Read the progress of runs, by their numbers.
-    Read(BTreeMap<usize, Pace>),
 }
 
 impl Sweep {
     /// Runs all, or, at SIGINT or SIGTERM, lets those at work save what they have. Learners are the calling thread's.
     pub async fn run(mut self) -> Ended {
+        LocalSet::new().run_until(self.work()).await
+    }
+
+    async fn work(&mut self) -> Ended {
         let mut shutdown = pin!(quad_runtime::shutdown_signal(2 * LEAVE_WITHIN));
+        let (stop, told) = watch::channel(false);
         let mut ticker = interval(GLANCE);
         let count = self.waiting.len();
         let mut floor = Floor {
-            at_work: Vec::new(),
-            disk: JoinSet::new(),
-            preparing: 0,
-            reading: false,
+            at_work: BTreeMap::new(),
             complete: 0,
             failed: Vec::new(),
             display: Display::start(),
             begin: Instant::now(),
             done: 0.0,
-            interrupted: None,
         };
+        let (mut learners, mut reading) = (JoinSet::new(), JoinSet::new());
         loop {
-            tokio::select! {
-                _ = ticker.tick() => self.tick(&mut floor),
-                Some(Ok(done)) = floor.disk.join_next() => self.take_in(done, &mut floor),
-                () = &mut shutdown, if floor.interrupted.is_none() => {
-                    floor.interrupted = Some(Instant::now());
-                    floor.display.say("stopping; the runs at work save their checkpoints");
-                    floor.at_work.iter_mut().for_each(Job::stop);
-                    self.waiting.clear();
-                }
+            while learners.len() < self.jobs
+                && let Some((run, state)) = self.waiting.pop_front()
+            {
+                let job = Job::new(run, state, &self.folder);
+                let begun = Pace { step: job.from, ..Pace::default() };
+                floor.at_work.insert(job.run.index, (job.clone(), begun));
+                learners.spawn_local(job.see_through(self.learners.clone(), told.clone()));
             }
-            let idle = self.waiting.is_empty() && floor.disk.is_empty();
-            if floor.at_work.is_empty() && (idle || floor.interrupted.is_some()) {
+            if learners.is_empty() {
                 break;
             }
-        }
-        while let Ok(Some(Ok(done))) = timeout(LAST_WORDS, floor.disk.join_next()).await {
-            self.take_in(done, &mut floor);
+            tokio::select! {
+                _ = ticker.tick() => {
+                    for line in self.evaluators.news() {
+                        floor.display.say(&line);
+                    }
+                    if floor.display.is_due() {
+                        match reading.is_empty() {
+                            true => drop(reading.spawn_blocking(read(&floor))),
+                            false => floor.display.show(&self.lines(&floor)),
+                        }
+                    }
+                }
+                Some(Ok((job, end, pace))) = learners.join_next() => self.conclude(&job, end, pace, &mut floor),
+                Some(Ok(progress)) = reading.join_next() => {
+                    for (index, pace) in progress {
+                        floor.at_work.entry(index).and_modify(|(_, known)| *known = pace);
+                    }
+                    floor.display.show(&self.lines(&floor));
+                }
+                () = &mut shutdown, if !*told.borrow() => {
+                    floor.display.say("stopping; the runs at work save their checkpoints");
+                    self.waiting.clear();
+                    stop.send_replace(true);
+                }
+            }
         }
         floor.display.finish();
         self.evaluators.end().await;
         Ended { unfinished: count - floor.complete - floor.failed.len(), failed: floor.failed }
     }
 
-    fn tick(&mut self, floor: &mut Floor) {
-        reap(floor);
-        if floor.interrupted.is_some_and(|since| since.elapsed() > LEARNERS_LEAVE) {
-            floor.at_work.iter_mut().for_each(Job::kill);
-        }
-        while floor.at_work.len() + floor.preparing < self.jobs
-            && let Some((run, state)) = self.waiting.pop_front()
-        {
-            let (dir, learners) = (self.folder.join(&run.name), self.learners.clone());
-            floor.preparing += 1;
-            floor.disk.spawn_blocking(move || Done::Prepared(Prepared::new(run, state, dir, &learners).map(Box::new)));
-        }
-        for line in self.evaluators.news() {
-            floor.display.say(&line);
-        }
-        if floor.display.is_due() {
-            match floor.reading {
-                true => floor.display.show(&self.lines(floor)),
-                false => read(floor),
-            }
-        }
-    }
-
-    fn take_in(&self, done: Done, floor: &mut Floor) {
-        match done {
-            Done::Prepared(prepared) => {
-                floor.preparing -= 1;
-                match prepared.and_then(|run| floor.interrupted.is_none().then(|| run.start()).transpose()) {
-                    Ok(job) => floor.at_work.extend(job),
-                    Err(error) => floor.fail(format!("{error:#}")),
-                }
-            }
-            Done::Concluded(job, end) => self.conclude(&job, end, floor),
-            Done::Read(mut progress) => {
-                floor.reading = false;
-                for job in &mut floor.at_work {
-                    job.progress = progress.remove(&job.run.index).unwrap_or(job.progress);
-                }
-                floor.display.show(&self.lines(floor));
-            }
-        }
-    }
-
-    fn conclude(&self, job: &Job, end: End, floor: &mut Floor) {
-        let (name, progress) = (&job.run.name, &job.progress);
-        floor.done += self.seconds(&job.run, job.from, progress.step);
-        match end {
+    fn conclude(&self, job: &Job, end: End, pace: Pace, floor: &mut Floor) {
+        let name = &job.run.name;
+        floor.at_work.remove(&job.run.index);
+        floor.done += self.seconds(&job.run, job.from, pace.step);
+        let said = match end {
             End::Complete => {
                 floor.complete += 1;
-                let score = progress.score.map(|(_, score)| format!(", last score {score:.1}")).unwrap_or_default();
-                floor.display.say(&format!("{name} is complete{score}"));
+                let score = pace.score.map(|(_, score)| format!(", last score {score:.1}")).unwrap_or_default();
+                format!("{name} is complete{score}")
             }
-            End::Unfinished => floor.display.say(&format!("{name} has stopped; the same command continues")),
-            End::Failed(reason) => floor.fail(reason),
-        }
+            End::Unfinished => format!("{name} has stopped; the same command continues"),
+            End::Failed(reason) => {
+                floor.failed.push(reason.clone());
+                format!("failed: {reason}")
+            }
+        };
+        floor.display.say(&said);
     }
 
     /// A line for each run at work, and one for all.
     fn lines(&self, floor: &Floor) -> Vec<String> {
         let (mut lines, mut done, mut left) = (Vec::new(), floor.done, 0.0);
-        for Job { run, from, progress, .. } in &floor.at_work {
+        for (Job { run, from, .. }, pace) in floor.at_work.values() {
             let steps = run.experiment.steps;
-            done += self.seconds(run, *from, progress.step);
-            left += self.seconds(run, progress.step, steps);
-            lines.push(format!("{}: step {}/{steps}, {progress}", run.name, progress.step));
+            done += self.seconds(run, *from, pace.step);
+            left += self.seconds(run, pace.step, steps);
+            lines.push(format!("{}: step {}/{steps}, {pace}", run.name, pace.step));
         }
         for (run, state) in &self.waiting {
             left += self.seconds(run, state.step(run.experiment.steps), run.experiment.steps);
@@ -207,34 +166,8 @@ impl Sweep {
     }
 }
 
-impl Floor {
-    fn fail(&mut self, reason: String) {
-        self.display.say(&format!("failed: {reason}"));
-        self.failed.push(reason);
-    }
-}
-
-/// Takes those away that have ended.
-fn reap(floor: &mut Floor) {
-    let mut at = 0;
-    while let Some(job) = floor.at_work.get_mut(at) {
-        let Some(status) = job.ended() else {
-            at += 1;
-            continue;
-        };
-        let mut job = Box::new(floor.at_work.remove(at));
-        floor.disk.spawn_blocking(move || {
-            let end = job.conclude(status);
-            Done::Concluded(job, end)
-        });
-    }
-}
-
-/// Begins to read how far the runs at work are.
-fn read(floor: &mut Floor) {
-    floor.reading = true;
-    let dirs: Vec<_> = floor.at_work.iter().map(|job| (job.run.index, job.dir.clone())).collect();
-    floor
-        .disk
-        .spawn_blocking(move || Done::Read(dirs.into_iter().map(|(index, dir)| (index, Pace::read(&dir))).collect()));
+/// Reads how far the runs at work are.
+fn read(floor: &Floor) -> impl FnOnce() -> Vec<(usize, Pace)> + use<> {
+    let dirs: Vec<_> = floor.at_work.iter().map(|(index, (job, _))| (*index, job.dir.clone())).collect();
+    move || dirs.into_iter().map(|(index, dir)| (index, Pace::read(&dir))).collect()
 }

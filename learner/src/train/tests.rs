@@ -18,7 +18,7 @@ use super::outbox::{Outbox, Work};
 use super::price::mean_step;
 use super::results::{self, Outcome};
 use super::steps::{Outlets, Plan, TrainError, train};
-use super::{Registrar, Training, TrainingMetrics, begin};
+use super::{Registrar, TrainingMetrics};
 
 /// What a run has handed over.
 struct Result {
@@ -91,11 +91,7 @@ fn plan(steps: u64, eval_interval: u64) -> Plan {
 }
 
 fn run(plan: Plan, algorithm: &str, table: &toml::Table, stop: bool) -> Result {
-    run_from(None, plan, algorithm, table, stop)
-}
-
-fn run_from(from: Option<&Checkpoint>, plan: Plan, algorithm: &str, table: &toml::Table, stop: bool) -> Result {
-    run_of(plan.schedule.steps, from, plan, algorithm, table, stop)
+    run_of(plan.schedule.steps, None, plan, algorithm, table, stop)
 }
 
 /// A part of a run of so many steps in all.
@@ -180,7 +176,7 @@ fn training_goes_on_from_a_checkpoint_bit_for_bit() {
             let Plan { schedule, .. } = plan(300, 100);
             let until = Plan { schedule: Schedule { steps: stop_at, ..schedule }, ..plan(300, 100) };
             let begun = run_of(300, None, until, algorithm, &setting, false);
-            let rest = run_from(begun.checkpoint.as_ref(), plan(300, 100), algorithm, &setting, false);
+            let rest = run_of(300, begun.checkpoint.as_ref(), plan(300, 100), algorithm, &setting, false);
             assert!(rest.checkpoint == whole.checkpoint, "after step {stop_at}");
             let snapshots: Vec<_> = whole.snapshots.iter().copied().filter(|(step, _)| *step > stop_at).collect();
             assert_eq!(rest.snapshots, snapshots, "after step {stop_at}");
@@ -219,44 +215,6 @@ fn divergence_is_an_error_that_says_where_and_what() {
         let error = result.outcome.unwrap_err();
         assert!(matches!(error, TrainError::Diverged { step: 1..10, .. }), "{error}");
         assert!(result.snapshots.is_empty(), "nothing broken is handed to evaluation");
-    }
-}
-
-/// Networks whose policy no evaluator can be sent are refused before the first step, and trained if none is to be sent.
-#[test]
-fn a_policy_that_is_too_large_to_send_is_refused_at_the_start() {
-    // Two networks with two layers of 2048 × 2048 numbers each: 64 MiB, and a little more.
-    let large = toml::toml! {
-        steps = 1
-        batch_size = 1
-        agent = { actor.hidden = [2048, 2048, 2048], critic.hidden = [2048, 2048, 2048], critics = 1, samples = 1 }
-    };
-    for (eval_interval, refused) in [(1, true), (0, false)] {
-        let mut experiment = resolve("hopper-demo", &large).unwrap();
-        experiment.eval_interval = eval_interval;
-        let make = Registrar { registry: prometheus::Registry::new() };
-        let metrics = TrainingMetrics::new(&make, 1, experiment.definition().unwrap().metrics).unwrap();
-        let agent = match begin(&experiment, quad_run::config::Device::Cpu, transitions()) {
-            Ok(agent) if !refused => agent,
-            Err(error) if refused => {
-                let text = format!("{error:#?}");
-                assert!(text.contains("can be sent at most") && text.contains("smaller networks"), "{text}");
-                continue;
-            }
-            _ => panic!("refused with evaluations, and only then"),
-        };
-        let training = Training {
-            experiment,
-            agent,
-            checkpoint: None,
-            checkpoint_every: Duration::ZERO,
-            seconds_before: 0.0,
-            metrics: metrics.clone(),
-            outbox: Outbox::default(),
-            stop: Arc::default(),
-        };
-        training.run(&beat()).unwrap();
-        assert_eq!(metrics.gradient_steps.get(), 1);
     }
 }
 

@@ -24,20 +24,6 @@ fn a_dry_run_prints_the_run_and_its_cost_and_leaves_nothing() {
     assert!(!std::path::Path::new(&run).exists());
 }
 
-/// However short a run of Onestep-RL is, it has its three phases.
-#[test]
-fn phases_are_shares_of_a_run() {
-    let folder = tempfile::tempdir().unwrap();
-    let data = folder.path().join("data.hdf5").display().to_string();
-    write_dataset(data.as_ref());
-    let asked =
-        ["train", "--algorithm", "onestep", "--dataset", &data, "--dry-run", "--steps", "600", "--set", "batch_size=8"];
-    for task in ["hopper-demo", "hopper-medium-v2"] {
-        let text = printed(&[&asked[..], &["--task", task, "--set", "agent.critic.hidden=[8]"]].concat());
-        assert!(text.contains("hours for all 600"), "{text}");
-    }
-}
-
 /// Whatever an algorithm cannot learn with is refused while there is no folder to clear away.
 #[test]
 fn a_start_that_is_refused_leaves_no_folder() {

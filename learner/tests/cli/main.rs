@@ -12,7 +12,6 @@ mod published;
 mod report;
 mod run;
 mod study;
-mod threads;
 mod verify;
 
 use std::path::Path;

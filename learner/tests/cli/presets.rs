@@ -90,38 +90,6 @@ fn quad_has_the_values_of_tables_3_and_4_for_each_row() {
     }
 }
 
-/// Values of IQL's paper and code: Rret and 0.7, 3 in locomotion; r - 1 and 0.9, 10 in mazes.
-#[test]
-fn iql_has_its_authors_values_for_each_row() {
-    for (name, environment, ..) in TABLE_4 {
-        let row: Table = printed(&["presets", name, "--algorithm", "iql"]).parse().unwrap();
-        let maze = name.starts_with("antmaze");
-        for (key, word) in [
-            ("environment", environment),
-            ("dataset", name),
-            ("reward", if maze { "subtract-1" } else { "locomotion" }),
-            ("algorithm", "iql"),
-        ] {
-            assert_eq!(value(&row, key), Some(word.into()), "{name}: {key}");
-        }
-        for (key, expected) in [
-            ("agent.expectile", if maze { 0.9 } else { 0.7 }),
-            ("agent.temperature", if maze { 10.0 } else { 3.0 }),
-            ("agent.actor_learning_rate", 3e-4),
-            ("agent.critic_learning_rate", 3e-4),
-            ("agent.value_learning_rate", 3e-4),
-            ("agent.ema_rate", 0.005),
-            ("agent.gamma", 0.99),
-            ("batch_size", 256.0),
-            ("steps", 1_000_000.0),
-            ("eval_interval", if maze { 100_000.0 } else { 5_000.0 }),
-            ("episodes", if maze { 100.0 } else { 10.0 }),
-        ] {
-            assert_eq!(number(&row, key), Some(expected), "{name}: {key}");
-        }
-    }
-}
-
 #[test]
 fn tasks_and_algorithms_are_listed_with_what_their_authors_give() {
     let list = printed(&["presets"]);
@@ -143,15 +111,6 @@ fn tasks_and_algorithms_are_listed_with_what_their_authors_give() {
         assert!(row.contains(file["about"].as_str().unwrap()), "{row}");
     }
     assert!(algorithms[0].starts_with("quad ") && algorithms[0].ends_with("*-v0, *-v2"), "{list}");
-}
-
-#[test]
-fn data_of_ones_own_is_not_evaluated_and_not_scaled() {
-    for algorithm in ["quad", "iql"] {
-        let own: Table = printed(&["presets", "own-data", "--algorithm", algorithm]).parse().unwrap();
-        assert_eq!((value(&own, "reward"), number(&own, "eval_interval")), (Some("as-is".into()), Some(0.0)));
-        assert_eq!(value(&own, "scale"), Some(Vec::<Value>::new().into()));
-    }
 }
 
 #[test]

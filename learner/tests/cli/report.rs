@@ -120,16 +120,6 @@ fn a_run_is_summarised_by_its_complete_evaluations_and_says_how_many_there_are()
 }
 
 #[test]
-fn several_runs_are_summarised_over_seeds_with_both_deviations() {
-    let reported = report(&[small(0, 0.0), small(1, 4.0)]);
-    let group = reported.group();
-    assert_eq!((&group["seeds"], &group["mean_last_3"]["mean"]), (&json!([0, 1]), &json!(10.0)));
-    assert_eq!(group["mean_last_3"]["population_std"], json!(2.0));
-    assert!((group["mean_last_3"]["std"].as_f64().unwrap() - 8f64.sqrt()).abs() < 1e-12);
-    reported.says(&["10.00 ± 2.83 (2.00)", "divided by n - 1 (in parentheses: by n)"]);
-}
-
-#[test]
 fn a_run_that_is_not_complete_is_marked_and_not_averaged_with_complete_ones() {
     let [mut complete, mut stopped] = [small(0, 0.0), small(1, 0.0)];
     complete.score(6000, 0, 12.0, "00");

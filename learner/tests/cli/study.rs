@@ -93,25 +93,6 @@ fn a_value_that_is_not_the_tasks_own_is_named_on_every_task() {
 }
 
 #[test]
-fn what_is_not_complete_counts_in_no_statistic() {
-    let folder = tempfile::tempdir().unwrap();
-    write_study(folder.path());
-    let mut stopped = complete(Run::by("iql", TASKS[0], 4), 1000.0);
-    stopped.scores.pop();
-    stopped.write(&folder.path().join(TASKS[0]).join("4/4"));
-    let report = study(folder.path());
-    let iql = &report["study"][3];
-    near_mean_of(iql, (40.0 + 15.0 + 1.0 + 90.0 + 15.0) / 2.0);
-    let text = printed(&["report", folder.path().to_str().unwrap()]);
-    assert!(text.contains("4 to 5") && text.contains("4 of 5 evaluations are complete"), "{text}");
-    assert!(!text.contains("last 5 evaluations:"), "runs below a folder are not printed one by one: {text}");
-}
-
-fn near_mean_of(method: &Value, value: f64) {
-    assert!((method["mean"]["value"].as_f64().unwrap() - value).abs() < 1e-9, "{method}");
-}
-
-#[test]
 fn returns_are_summed_up_task_by_task_and_a_single_seed_has_no_interval() {
     let folder = tempfile::tempdir().unwrap();
     for (name, task) in [("a", "my-robot"), ("b", "other-robot")] {

@@ -44,13 +44,6 @@ impl Log {
         Ok(log)
     }
 
-    /// For tests, of other crates too: any file, neither locked nor looked at.
-    #[doc(hidden)]
-    pub fn unchecked(path: PathBuf) -> io::Result<Self> {
-        let file = OpenOptions::new().append(true).open(&path)?;
-        Ok(Self { path, file, length: 0, torn: false, lock: None })
-    }
-
     /// Whether there is no whole line in it.
     pub fn is_empty(&self) -> bool {
         self.length == 0

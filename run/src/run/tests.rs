@@ -177,14 +177,6 @@ fn no_link_is_written_through() {
     assert_eq!(std::fs::read_to_string(precious).unwrap(), "no line of a log");
 }
 
-#[test]
-fn score_lines_carry_the_words_that_scripts_read() {
-    let json = serde_json::to_value(line(3, 4, 0.5)).unwrap();
-    for key in ["step", "seed", "return", "length", "score", "weights", "evaluator"] {
-        assert!(json.get(key).is_some(), "{key}");
-    }
-}
-
 /// A user who tidies up while a learner is at work.
 #[test]
 fn a_folder_of_snapshots_that_was_removed_is_made_again_and_a_run_that_was_removed_is_an_error() {

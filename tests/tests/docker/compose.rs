@@ -84,16 +84,15 @@ impl Compose {
         format!("{}_default", self.project)
     }
 
-    /// Waits until the run is complete, and lets `learner verify` look at it, beside another one if there is one.
-    pub fn assert_run_is_complete(&self, name: &str, same_as: Option<&str>) -> String {
+    /// Waits until the run is complete, and lets `learner verify` look at it.
+    pub fn assert_run_is_complete(&self, name: &str) -> String {
         let learner = self.container("learner");
         eventually("the learner ended", TRAINING, || {
             sleep(PAUSE);
             has_ended(&learner).then_some(())
         });
         assert_eq!(inspect(&learner, "{{.State.ExitCode}}"), "0", "the learner's exit code");
-        let other = same_as.map(|other| format!("--same-as /runs/{other}"));
-        self.learner(&format!("learner verify /runs/{name} {}", other.unwrap_or_default())).trim().to_owned()
+        self.learner(&format!("learner verify /runs/{name}")).trim().to_owned()
     }
 
     /// What a command prints in a container of the learner's image with its volumes.

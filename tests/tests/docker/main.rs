@@ -8,7 +8,6 @@
 #![allow(clippy::unwrap_used, clippy::expect_used, clippy::print_stderr)]
 
 mod compose;
-mod faults;
 mod images;
 mod tls;
 mod whole;

@@ -57,7 +57,7 @@ fn compose_with_certificates_works_and_lets_in_no_others() {
     }
 
     compose.run(&["up", "--detach", "--no-recreate", "evaluator"]);
-    let verdict = compose.assert_run_is_complete("tls", None);
+    let verdict = compose.assert_run_is_complete("tls");
     assert!(verdict.contains("32 of 32 episodes are scored"), "{verdict}");
     let scores = compose.learner("cat /runs/tls/scores.jsonl");
     assert!(!scores.contains("stranger"), "{scores}");

@@ -5,7 +5,7 @@ use quad_tests::{dashboard, eventually};
 use serde_json::Value;
 use std::collections::HashSet;
 
-use crate::compose::{Compose, PATIENCE, inspect};
+use crate::compose::{Compose, PATIENCE, crash, inspect};
 
 const EVALUATORS: usize = 4;
 
@@ -31,7 +31,8 @@ fn compose_runs_the_whole_system() {
         assert!(!["", "0", "root"].contains(&user), "{container} runs as {user:?}");
     }
 
-    let verdict = compose.assert_run_is_complete("whole", None);
+    assert!(crash(&others[0]), "the learner ended too soon");
+    let verdict = compose.assert_run_is_complete("whole");
     assert!(verdict.contains("96 of 96 episodes are scored"), "{verdict}");
     let scores = compose.learner("cat /runs/whole/scores.jsonl");
     let scores = scores.lines().map(|line| serde_json::from_str::<Value>(line).expect("a JSON object"));

@@ -1,28 +1,25 @@
 //! Fault upon fault at random moments, and at the end a run that is, bit for bit, the one that nothing happened to.
 //!
-//! Once with the connections of one machine, once with a host for each program, on a network whose packets go astray.
-//! QUAD_FAULTS says how many faults there are in the long tests, and QUAD_FAULTS_SEED chooses others.
+//! QUAD_FAULTS says how many faults there are in the long test, and QUAD_FAULTS_SEED chooses others.
 
 use std::thread::sleep;
 use std::time::{Duration, Instant};
 
-use quad_tests::hosts::{Host, Network};
-use quad_tests::line::{Line, Trouble};
-use quad_tests::link::Link;
+use quad_tests::link::Trouble;
 use quad_tests::setting::Setting;
-use quad_tests::system::{Scratch, free_port};
+use quad_tests::system::Scratch;
 use quad_tests::{PATIENCE, eventually, number};
 use rand::seq::SliceRandom;
 use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 
-use crate::system::{EVALUATORS, Fault, Program, System, all_faults};
+use crate::system::{Fault, Program, System, all_faults};
 
 /// Gradient steps for each fault, so that training continues until the last of them.
 const STEPS_PER_FAULT: u64 = 12_000;
 
 /// Lets so many faults of those kinds happen.
-fn endure(faults: &[Fault], count: u64, endpoint: &str, lines: Vec<impl Line>) {
+fn endure(faults: &[Fault], count: u64) {
     let steps = STEPS_PER_FAULT * count;
     let setting =
         Setting { steps, eval_interval: STEPS_PER_FAULT / 2, episodes: 4, candidates: 20, hidden: 64, seed: 9 };
@@ -31,7 +28,7 @@ fn endure(faults: &[Fault], count: u64, endpoint: &str, lines: Vec<impl Line>) {
     let mut calm = scratch.learner("calm", setting);
     let _evaluator = scratch.evaluator("calm-evaluator", &calm.endpoint());
 
-    let mut system = System::start(setting, endpoint, lines);
+    let mut system = System::start(setting);
     let mut random = ChaCha8Rng::seed_from_u64(number("QUAD_FAULTS_SEED", 1));
     let (mut injected, mut round) = (0, Vec::new());
     while injected < count && !system.is_over() {
@@ -53,41 +50,22 @@ fn endure(faults: &[Fault], count: u64, endpoint: &str, lines: Vec<impl Line>) {
     assert!(injected >= count / 2, "the run was over after {injected} of {count} faults");
 }
 
-/// All programs on one machine.
-fn endure_on_one_machine(faults: &[Fault], count: u64) {
-    let port = free_port();
-    let lines = (0..=EVALUATORS).map(|_| Link::to(port)).collect();
-    endure(faults, count, &format!("tcp/127.0.0.1:{port}"), lines);
-}
-
 #[test]
 fn after_a_few_faults_a_run_ends_as_if_nothing_had_happened() {
     let faults = [
         Fault::Kill(Program::Evaluator),
         Fault::Kill(Program::Learner),
-        Fault::Line(Program::Evaluator, Trouble::Cut),
-        Fault::Line(Program::Learner, Trouble::Silent),
+        Fault::Link(Program::Evaluator, Trouble::Cut),
+        Fault::Link(Program::Learner, Trouble::Silent),
         Fault::RestartRouter,
         Fault::FillDisk,
         Fault::DeliverAgain,
     ];
-    endure_on_one_machine(&faults, faults.len() as u64);
+    endure(&faults, faults.len() as u64);
 }
 
 #[test]
 #[ignore = "ten minutes"]
 fn after_a_hundred_faults_a_run_ends_as_if_nothing_had_happened() {
-    endure_on_one_machine(&all_faults::<Link>(), number("QUAD_FAULTS", 100));
-}
-
-#[test]
-#[ignore = "five minutes, as root"]
-fn after_fifty_faults_between_hosts_a_run_ends_as_if_nothing_had_happened() {
-    let port = free_port();
-    let network = match Network::new() {
-        Ok(network) => network,
-        Err(reason) => return eprintln!("skipped, because there can be no network of hosts here: {reason}"),
-    };
-    let lines = (1..=EVALUATORS as u32 + 1).map(|number| network.host(number, port).unwrap()).collect();
-    endure(&all_faults::<Host>(), number("QUAD_FAULTS", 50), &format!("tcp/{}:{port}", network.address), lines);
+    endure(&all_faults(), number("QUAD_FAULTS", 100));
 }

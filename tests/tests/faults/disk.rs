@@ -5,9 +5,8 @@ use std::path::PathBuf;
 use std::sync::{Arc, Mutex};
 
 use quad_protocol::{Snapshot, decode, keys};
-use quad_runtime::{Endpoints, open_session};
 use quad_tests::learner::Learner;
-use quad_tests::made_up::name;
+use quad_tests::made_up::{client, name};
 use quad_tests::setting::Setting;
 use quad_tests::small_disk::SmallDisk;
 use quad_tests::system::Scratch;
@@ -21,8 +20,7 @@ pub const LISTEN: [&str; 4] = ["--listen", "tcp/127.0.0.1:0", "--checkpoint-seco
 
 /// The steps of the snapshots that are published from now on, and whether each was on the disk by then.
 async fn watch(learner: &Learner) -> (Session, Arc<Mutex<Vec<(u64, bool)>>>) {
-    let endpoints = Endpoints { connect: vec![learner.endpoint()], ..Endpoints::default() };
-    let session = open_session(&endpoints).await.unwrap();
+    let session = client(&learner.endpoint()).await;
     let published = Arc::new(Mutex::new(Vec::new()));
     let (heard, folder) = (published.clone(), learner.run_dir.clone());
     let listener = move |sample: zenoh::sample::Sample| {

@@ -6,8 +6,11 @@ use std::process::Command;
 use std::thread::sleep;
 use std::time::Duration;
 
+use quad_protocol::keys;
 use quad_tests::PATIENCE;
 use quad_tests::learner::Learner;
+use quad_tests::made_up::{claim_eventually, client, name};
+use quad_tests::setting::ENDLESS;
 use quad_tests::system::Scratch;
 
 use crate::disk::{LISTEN, SETTING};
@@ -62,4 +65,22 @@ fn a_disk_that_hangs_holds_up_neither_training_nor_the_end() {
     let mut learner = scratch.learner_with("run", SETTING, &LISTEN);
     let _evaluator = scratch.evaluator("one", &learner.endpoint());
     learner.assert_completes(&SETTING, PATIENCE);
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn while_the_disk_hangs_that_is_read_from_claims_are_answered() {
+    let scratch = Scratch::new();
+    let learner = scratch.learner("run", ENDLESS);
+    // The newest snapshot comes from memory.
+    learner.wait_for_metric("snapshots_published_total", "", |published| published > 1.0);
+    let (run, first) = (name("run"), ENDLESS.eval_interval);
+    fs::remove_file(learner.snapshot(first)).unwrap();
+    make_pipe(&learner.snapshot(first));
+    let session = client(&learner.endpoint()).await;
+    for _ in 0..20 {
+        session.get(keys::weights_at(&run, first)).timeout(PATIENCE).callback(drop).await.unwrap();
+    }
+    sleep(Duration::from_millis(200));
+    // Nothing is written to the pipe, so the answer cannot have waited for the disk.
+    assert_eq!(claim_eventually(&session, &run, "a").await.step, first);
 }

@@ -6,7 +6,6 @@
 mod chaos;
 mod disk;
 mod hanging_disk;
-mod kills;
 mod locks;
 mod power;
 mod resume;

@@ -6,7 +6,7 @@ use std::thread::sleep;
 use std::time::Duration;
 
 use quad_protocol::Hash;
-use quad_tests::crowd::{Crowd, Pace};
+use quad_tests::crowd::Crowd;
 use quad_tests::learner::Learner;
 use quad_tests::made_up::name;
 use quad_tests::power::Disk;
@@ -20,8 +20,8 @@ use tokio::runtime::Runtime;
 use zenoh::Session;
 
 const STEPS_PER_CUT: u64 = 6000;
-/// As quick as one of the evaluators' episodes is.
-const EPISODE: Duration = Duration::from_millis(200);
+/// The longest of the evaluators' episodes.
+const EPISODE: Duration = Duration::from_millis(10);
 
 /// A score: step, seed, weights.
 type Key = (u64, u64, String);
@@ -50,7 +50,6 @@ impl System {
         let (disk, endpoint, runtime) = (Disk::new(scratch.path()), free_endpoint(), Runtime::new().unwrap());
         let session = runtime.block_on(router(&endpoint));
         let crowd = runtime.block_on(Crowd::connect(2, EPISODE, &name("run"), &endpoint));
-        crowd.set(Pace::Quick);
         System { setting, scratch, disk, endpoint, crowd, promised: BTreeSet::new(), _router: session, runtime }
     }
 
@@ -105,10 +104,14 @@ impl System {
         let mut learner = self.learner();
         learner.assert_completes(&self.setting, 3 * PATIENCE);
         let mut calm = self.scratch.learner("calm", self.setting);
-        let crowd = self.runtime.block_on(Crowd::connect(2, EPISODE, &name("calm"), &calm.endpoint()));
-        crowd.set(Pace::Quick);
+        let _crowd = self.runtime.block_on(Crowd::connect(2, EPISODE, &name("calm"), &calm.endpoint()));
         calm.assert_completes(&self.setting, 3 * PATIENCE);
         learner.assert_same_as(&calm);
+        // A run that is complete is so at once.
+        let mut again = self.learner();
+        again.process.assert_succeeds(PATIENCE);
+        assert!(again.process.out().contains("mean score of the last 3 evaluations"), "{}", again.process.out());
+        again.assert_same_as(&calm);
     }
 }
 

@@ -65,6 +65,17 @@ fn a_folder_is_of_one_configuration_and_of_one_learner_at_a_time() {
     assert!(twin.process.log().contains("another learner is at work"), "{}", twin.process.log());
 }
 
+#[test]
+fn a_run_whose_folder_is_removed_ends() {
+    let scratch = Scratch::new();
+    let mut learner = scratch.learner("run", ENDLESS);
+    learner.process.wait_for_log("snapshot handed to evaluation", PATIENCE);
+    fs::rename(&learner.run_dir, scratch.path().join("elsewhere")).unwrap();
+    assert_eq!(learner.process.wait(PATIENCE).code(), Some(1));
+    let log = learner.process.log();
+    assert!(log.contains("was removed or renamed") && log.contains("hint: put it back"), "{log}");
+}
+
 /// As if the scores were of another machine's bits. Training has to come by the step again to find out.
 #[test]
 fn weights_that_come_out_otherwise_for_a_scored_step_end_the_run() {

@@ -8,20 +8,20 @@ use std::time::Duration;
 use quad_protocol::{EpisodeScore, Hash, ScoreReply, ScoreReport, decode, encode, keys};
 use quad_tests::PATIENCE;
 use quad_tests::learner::Learner;
-use quad_tests::line::{Line, Trouble};
+use quad_tests::link::{Link, Trouble};
 use quad_tests::made_up::name;
 use quad_tests::process::Process;
 use quad_tests::router::router;
 use quad_tests::setting::Setting;
 use quad_tests::small_disk::SmallDisk;
-use quad_tests::system::{Evaluator, Scratch};
+use quad_tests::system::{Evaluator, Scratch, free_port};
 use rand::Rng;
 use rand_chacha::ChaCha8Rng;
 use tokio::runtime::Runtime;
 use zenoh::query::ConsolidationMode;
 use zenoh::{Session, Wait};
 
-pub const EVALUATORS: usize = 3;
+const EVALUATORS: usize = 3;
 
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
 pub enum Program {
@@ -34,31 +34,31 @@ pub enum Fault {
     Kill(Program),
     Stop(Program),
     Freeze(Program),
-    Line(Program, Trouble),
+    Link(Program, Trouble),
     RestartRouter,
     FillDisk,
     DeliverAgain,
 }
 
-/// All that can happen where lines are of kind `L`.
-pub fn all_faults<L: Line>() -> Vec<Fault> {
+/// All that can happen.
+pub fn all_faults() -> Vec<Fault> {
     let of = |program| {
-        let lines = L::TROUBLES.iter().map(move |&trouble| Fault::Line(program, trouble));
-        [Fault::Kill(program), Fault::Stop(program), Fault::Freeze(program)].into_iter().chain(lines)
+        let links = Trouble::ALL.map(|trouble| Fault::Link(program, trouble));
+        [Fault::Kill(program), Fault::Stop(program), Fault::Freeze(program)].into_iter().chain(links)
     };
     let others = [Fault::RestartRouter, Fault::FillDisk, Fault::DeliverAgain];
     of(Program::Learner).chain(of(Program::Evaluator)).chain(others).collect()
 }
 
-/// Each program is at the end of a line of its own.
-pub struct System<L> {
+/// Each program is at the end of a link of its own.
+pub struct System {
     setting: Setting,
     runtime: Runtime,
     endpoint: String,
     router: Option<Session>,
     pub learner: Learner,
-    learners_line: L,
-    evaluators: Vec<(Evaluator, L)>,
+    learners_link: Link,
+    evaluators: Vec<(Evaluator, Link)>,
     started: usize,
     /// Disk of the run's folder, where it can be a disk of its own.
     disk: Option<SmallDisk>,
@@ -67,39 +67,40 @@ pub struct System<L> {
     scratch: Scratch,
 }
 
-impl<L: Line> System<L> {
-    /// With a router that listens at `endpoint`, where all lines lead to: the learner's and each evaluator's.
-    pub fn start(setting: Setting, endpoint: &str, mut lines: Vec<L>) -> System<L> {
+impl System {
+    /// All programs are on this machine, and linked to a router.
+    pub fn start(setting: Setting) -> System {
         let scratch = Scratch::new();
         let disk = SmallDisk::mount(&scratch.path().join("run"), 64);
-        let runtime = Runtime::new().unwrap();
-        let session = runtime.block_on(router(endpoint));
-        let learners_line = lines.pop().expect("there are lines");
-        let learner = learner(&scratch, setting, &learners_line);
+        let (runtime, port) = (Runtime::new().unwrap(), free_port());
+        let endpoint = format!("tcp/127.0.0.1:{port}");
+        let session = runtime.block_on(router(&endpoint));
+        let learners_link = Link::to(port);
+        let learner = learner(&scratch, setting, &learners_link);
         let mut system = System {
             setting,
             runtime,
-            endpoint: endpoint.to_owned(),
+            endpoint,
             router: Some(session),
             learner,
-            learners_line,
+            learners_link,
             evaluators: Vec::new(),
             started: 0,
             disk,
             faults: BTreeMap::new(),
             scratch,
         };
-        for line in lines {
-            let evaluator = system.evaluator(&line);
-            system.evaluators.push((evaluator, line));
+        for link in (0..EVALUATORS).map(|_| Link::to(port)) {
+            let evaluator = system.evaluator(&link);
+            system.evaluators.push((evaluator, link));
         }
         system
     }
 
-    fn evaluator(&mut self, line: &L) -> Evaluator {
+    fn evaluator(&mut self, link: &Link) -> Evaluator {
         self.started += 1;
         let name = format!("evaluator-{}", self.started);
-        self.scratch.evaluator_through(&line.launcher(), &name, &["--connect", &line.endpoint()])
+        self.scratch.evaluator_with(&name, &["--connect", &link.endpoint])
     }
 
     /// Whether the learner has reached its end. If it has ended in any other way, that is a bug.
@@ -133,8 +134,8 @@ impl<L: Line> System<L> {
                 sleep(a_while);
                 process.signal("CONT");
             }
-            Fault::Line(Program::Learner, trouble) => self.learners_line.suffer(trouble, percent, a_while),
-            Fault::Line(Program::Evaluator, trouble) => self.evaluators[victim].1.suffer(trouble, percent, a_while),
+            Fault::Link(Program::Learner, trouble) => self.learners_link.suffer(trouble, percent, a_while),
+            Fault::Link(Program::Evaluator, trouble) => self.evaluators[victim].1.suffer(trouble, percent, a_while),
             Fault::RestartRouter => {
                 let session = self.router.take().expect("it is there");
                 session.close().wait().ok();
@@ -161,11 +162,11 @@ impl<L: Line> System<L> {
 
     fn restart(&mut self, program: Program, index: usize) {
         match program {
-            Program::Learner => self.learner = learner(&self.scratch, self.setting, &self.learners_line),
+            Program::Learner => self.learner = learner(&self.scratch, self.setting, &self.learners_link),
             Program::Evaluator => {
-                let (_, line) = self.evaluators.remove(index);
-                let evaluator = self.evaluator(&line);
-                self.evaluators.insert(index, (evaluator, line));
+                let (_, link) = self.evaluators.remove(index);
+                let evaluator = self.evaluator(&link);
+                self.evaluators.insert(index, (evaluator, link));
             }
         }
     }
@@ -203,7 +204,6 @@ impl<L: Line> System<L> {
     }
 }
 
-fn learner(scratch: &Scratch, setting: Setting, line: &impl Line) -> Learner {
-    let arguments = ["--connect", &line.endpoint(), "--checkpoint-seconds", "1"];
-    scratch.learner_through(&line.launcher(), "run", setting, &arguments)
+fn learner(scratch: &Scratch, setting: Setting, link: &Link) -> Learner {
+    scratch.learner_with("run", setting, &["--connect", &link.endpoint, "--checkpoint-seconds", "1"])
 }

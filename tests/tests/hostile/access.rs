@@ -1,47 +1,21 @@
 //! Which programs may come in: those with a certificate, at the router as it is shipped and at a learner that listens itself.
 
-use std::fs;
-use std::path::{Path, PathBuf};
-use std::sync::{LazyLock, Mutex};
+use std::path::PathBuf;
 
+use quad_tests::PATIENCE;
 use quad_tests::certificates::{Certificates, connect};
 use quad_tests::router::protected_router;
 use quad_tests::setting::{ENDLESS, IDLE, SHORT};
 use quad_tests::system::Scratch;
-use quad_tests::{PATIENCE, eventually};
-use tempfile::NamedTempFile;
 use tokio::time::timeout;
 use zenoh::sample::SampleKind;
 
 /// What the router's certificate is for.
 pub const HOST: &str = "127.0.0.1";
 
-/// Where Zenoh logs in this process, which the routers are in.
-fn log() -> &'static Path {
-    static LOG: LazyLock<NamedTempFile> = LazyLock::new(|| {
-        let file = NamedTempFile::new().unwrap();
-        let filter = "zenoh=warn,zenoh::net::routing::interceptor=trace";
-        let log = tracing_subscriber::fmt().with_env_filter(filter).with_ansi(false);
-        log.with_writer(Mutex::new(file.reopen().unwrap())).init();
-        file
-    });
-    LOG.path()
-}
-
-pub fn wait_for_log(text: &str) {
-    let what = format!("{text:?} in the router's log");
-    eventually(&what, PATIENCE, || fs::read_to_string(log()).unwrap().contains(text).then_some(()));
-}
-
-/// `None` if the test is to be skipped.
-pub fn make_certificates() -> Option<Certificates> {
-    log();
-    Certificates::make()
-}
-
 #[tokio::test(flavor = "multi_thread")]
 async fn a_run_completes_through_the_shipped_router() {
-    let Some(certificates) = make_certificates() else { return };
+    let Some(certificates) = Certificates::make() else { return };
     let (_router, endpoint) = protected_router(HOST, &certificates.of("router")).await;
     let scratch = Scratch::new();
     let connect =
@@ -55,7 +29,7 @@ async fn a_run_completes_through_the_shipped_router() {
 
 #[tokio::test(flavor = "multi_thread")]
 async fn a_router_whose_certificate_is_for_another_host_is_not_believed() {
-    let Some(certificates) = make_certificates() else { return };
+    let Some(certificates) = Certificates::make() else { return };
     let (_router, endpoint) = protected_router("127.0.0.2", &certificates.of("router")).await;
     let (scratch, folder) = (Scratch::new(), certificates.argument("evaluator"));
     let launcher = ["env", "RUST_LOG=info,zenoh=debug"].map(str::to_owned);
@@ -67,7 +41,7 @@ async fn a_router_whose_certificate_is_for_another_host_is_not_believed() {
 
 #[tokio::test(flavor = "multi_thread")]
 async fn a_learner_that_listens_itself_asks_who_comes() {
-    let Some(certificates) = make_certificates() else { return };
+    let Some(certificates) = Certificates::make() else { return };
     let (scratch, folder) = (Scratch::new(), certificates.argument("learner"));
     let learner = scratch.learner_with("run", ENDLESS, &["--listen", "tls/127.0.0.1:0", "--certificates", &folder]);
     let (endpoint, authority) = (learner.endpoint(), certificates.of("learner"));
@@ -85,23 +59,18 @@ async fn a_learner_that_listens_itself_asks_who_comes() {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn the_router_refuses_and_logs_those_without_a_valid_certificate() {
-    let Some(certificates) = make_certificates() else { return };
-    let elsewhere = make_certificates().unwrap();
+async fn the_router_refuses_those_without_a_valid_certificate() {
+    let Some(certificates) = Certificates::make() else { return };
+    let elsewhere = Certificates::make().unwrap();
     let (_router, endpoint) = protected_router(HOST, &certificates.of("router")).await;
     let (authority, evaluator) = (certificates.of("router"), certificates.of("evaluator"));
     // In all but the certificate they are what is let in.
     connect(&endpoint, &authority, Some(&evaluator)).await.expect("an evaluator is let in");
     let foreign = elsewhere.of("evaluator");
     let expired = certificates.of("expired");
-    for (folder, reason) in [
-        (None, "peer sent no certificates"),
-        (Some(&foreign), "invalid peer certificate: UnknownIssuer"),
-        (Some(&expired), "invalid peer certificate: certificate expired"),
-    ] {
+    for folder in [None, Some(&foreign), Some(&expired)] {
         let session = connect(&endpoint, &authority, folder.map(PathBuf::as_path)).await;
         assert!(session.is_err(), "{folder:?} came in");
-        wait_for_log(reason);
     }
 
     // The other way round: a router that is not of the evaluator's authority, or only an evaluator, is not talked to.
@@ -119,7 +88,7 @@ async fn the_router_refuses_and_logs_those_without_a_valid_certificate() {
 /// At a learner that listens itself, the same is tested beside the session.
 #[tokio::test(flavor = "multi_thread")]
 async fn an_expired_certificate_ends_a_connection_and_a_renewed_one_brings_it_back() {
-    let Some(certificates) = make_certificates() else { return };
+    let Some(certificates) = Certificates::make() else { return };
     let (scratch, folder) = (Scratch::new(), certificates.argument("learner"));
     let (_router, endpoint) = protected_router(HOST, &certificates.of("router")).await;
     let _learner = scratch.learner_with("run", IDLE, &["--connect", &endpoint, "--certificates", &folder]);

@@ -6,7 +6,6 @@ use std::sync::atomic::{AtomicBool, Ordering::Relaxed};
 use std::time::Duration;
 
 use quad_protocol::{Name, encode, keys};
-use quad_runtime::{Endpoints, open_session};
 use quad_tests::made_up::{self, name};
 use quad_tests::setting::{ENDLESS, Setting};
 use quad_tests::system::Scratch;
@@ -102,9 +101,7 @@ fn claim(evaluator: &str) -> Vec<u8> {
 
 /// Begins to send, until told to stop.
 async fn start(flood: Flood, endpoint: &str, stop: Arc<AtomicBool>) -> tokio::task::JoinHandle<()> {
-    let endpoints = Endpoints { connect: vec![endpoint.to_owned()], ..Endpoints::default() };
-    let session = open_session(&endpoints).await.unwrap();
-    let mut client = Client { session, run: name("run"), tokens: Vec::new() };
+    let mut client = Client { session: made_up::client(endpoint).await, run: name("run"), tokens: Vec::new() };
     tokio::spawn(async move {
         let mut number = 0;
         while !stop.load(Relaxed) {

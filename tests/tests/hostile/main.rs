@@ -9,3 +9,4 @@ mod certificates;
 mod floods;
 mod nonsense;
 mod roles;
+mod silence;

@@ -115,7 +115,9 @@ async fn nonsense_on_every_key_is_counted_and_survived() {
             (http::sum(&page, "quad_evaluator_rejected_messages_total", &label) > 0.0).then_some(())
         });
     }
-    assert!(learner.metric("rejected_messages_total", "").unwrap() > 10.0);
+    for reason in ["empty", "not_quad", "version", "truncated", "oversized", "kind"] {
+        learner.wait_for_metric("rejected_messages_total", &format!("reason=\"{reason}\""), |count| count > 0.0);
+    }
 
     let count = learner.scores().len();
     learner.wait_for_scores(count + 2 * ENDLESS.episodes as usize);
@@ -125,4 +127,23 @@ async fn nonsense_on_every_key_is_counted_and_survived() {
     for (name, log) in [("learner", learner.process.log()), ("evaluator", evaluator.process.log())] {
         assert!(!log.contains("panicked"), "a thread of the {name} panicked:\n{log}");
     }
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn why_a_job_could_not_be_done_is_told_once_in_few_plain_letters() {
+    let scratch = Scratch::new();
+    let learner = scratch.learner("run", ENDLESS);
+    let (session, run) = (made_up::client(&learner.endpoint()).await, name("run"));
+    for evaluator in ["a", "b"] {
+        let job = made_up::claim_eventually(&session, &run, evaluator).await;
+        let reason = format!("the policy\u{1b}[2J cannot act, says {evaluator}\n{}", "x".repeat(10_000));
+        let request = JobRequest::HandBack { evaluator: name(evaluator), job: job.id, failed: Some(reason) };
+        let reply = made_up::ask(&session, keys::jobs(&run), &request).await;
+        assert!(matches!(reply, Some(JobReply::HandedBack { accepted: true, .. })), "{reply:?}");
+    }
+    learner.wait_for_metric("jobs_total", "outcome=\"failed\"", |failed| failed == 2.0);
+    let said = learner.process.wait_for_log("could not do a job", PATIENCE);
+    let (_, reason) = said.split_once("which goes to others: ").unwrap();
+    assert!(reason.starts_with("the policy[2J cannot act, says axxx") && reason.len() == 300, "{said}");
+    assert_eq!(learner.process.log().matches("could not do a job").count(), 1, "the second is not told");
 }

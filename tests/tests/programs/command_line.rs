@@ -24,8 +24,6 @@ fn a_wrong_command_line_exits_with_2() {
     for (program, arguments) in [
         ("learner", &[][..]),
         ("learner", &["train"]),
-        ("learner", &["train", "--task", "hopper-demo", "--dataset", "x", "--algorithm", "td3"]),
-        ("learner", &["train", "--task", "hopper-demo", "--dataset", "x", "--agent", "tau"]),
         ("learner", &["presets", "no-such-task"]),
         ("evaluator", &[]),
         ("evaluator", &["serve", "--name", "not a name"]),
@@ -48,35 +46,6 @@ fn more_threads_than_the_system_has_are_an_error_and_not_a_panic() {
     shell.args(["-c", "ulimit -v 1000000; exec \"$0\" completions bash"]).arg(binary("evaluator"));
     let output = shell.env("RAYON_NUM_THREADS", "60000").output().unwrap();
     assert_refused(&output, "cannot start the threads", "RAYON_NUM_THREADS");
-}
-
-#[test]
-fn an_algorithm_that_lacks_a_hyper_parameter_says_what_it_has() {
-    for (algorithm, value, words) in [
-        ("quad", "guidance=sac", ["sac", "`dac`"]),
-        ("iql", "guidance=dac", ["guidance", "`learner presets TASK`"]),
-        ("iql", "candidates=10", ["candidates", "`learner presets TASK`"]),
-    ] {
-        let flags = ["--task", "hopper-demo", "--dataset", "x", "--algorithm", algorithm, "--agent", value];
-        refused(&flags, 1, &words);
-    }
-}
-
-#[test]
-fn a_wrong_name_is_answered_with_the_right_ones() {
-    let folder = tempfile::tempdir().unwrap();
-    let own = folder.path().join("own.toml");
-    std::fs::write(&own, "task = \"hopper-demo\"\nbatchsize = 3\n").unwrap();
-    for (arguments, code, words) in [
-        (&["--task", "walker2d-medium-reply-v2"][..], 2, &["walker2d-medium-replay-v2"][..]),
-        (&["--preset", "hopper-demo-iql"], 2, &["did you mean hopper-demo"]),
-        (&["--task", "hopper-demo", "--algorithm", "quads"], 2, &["a similar value exists: 'quad'"]),
-        (&["--task", "hopper-demo", "--agent", "tua=0.5"], 1, &["`tua`", "`tau`", "hint:"]),
-        (&["--task", "hopper-demo", "--set", "tau=0.5"], 1, &["`tau`", "hint:", "--agent KEY=VALUE"]),
-        (&["--preset", own.to_str().unwrap()], 1, &["`batchsize`", "`batch_size`", "hint:"]),
-    ] {
-        refused(&[&["--dataset", "x"], arguments].concat(), code, words);
-    }
 }
 
 #[test]
@@ -129,22 +98,6 @@ fn a_terminal_is_coloured_unless_its_user_does_not_want_it() {
         assert_eq!(text.contains("\u{1b}["), coloured, "{setting}: {text:?}");
     }
     assert!(!shell(&["sh", "-c", &format!("{train} 2>&1")]).contains('\u{1b}'), "a pipe has no colours");
-}
-
-#[test]
-fn presets_are_listed_and_printed() {
-    let print = |arguments: &[&str]| {
-        let output = run("learner", &[&["presets"], arguments].concat());
-        assert_eq!(output.status.code(), Some(0), "{arguments:?}");
-        String::from_utf8(output.stdout).unwrap()
-    };
-    assert!(print(&[]).contains("\nantmaze-large-play-v0 "));
-    let folder = tempfile::tempdir().unwrap();
-    let own = folder.path().join("own.toml");
-    let text = print(&["walker2d-medium-replay-v2"]);
-    assert!(text.contains("\ntau = 100.0\n"), "{text}");
-    std::fs::write(&own, &text).unwrap();
-    assert_eq!(print(&[own.to_str().unwrap()]), text, "what is printed is a preset of one's own");
 }
 
 #[test]

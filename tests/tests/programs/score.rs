@@ -1,12 +1,9 @@
 //! `evaluator score` measures what a run measured, and says clearly what it cannot score.
 
-use std::collections::BTreeMap;
 use std::fs;
 use std::path::Path;
 use std::process::{Command, Output};
 
-use quad_policy::Header;
-use quad_protocol::Origin;
 use quad_tests::PATIENCE;
 use quad_tests::learner::{Learner, Score};
 use quad_tests::process::binary;
@@ -17,8 +14,9 @@ use serde_json::{Value, json};
 const SETTING: Setting = Setting { steps: 40, eval_interval: 20, episodes: 7, candidates: 3, hidden: 16, seed: 5 };
 
 /// A finished run, evaluated in the arithmetic of that name.
-fn run(scratch: &Scratch, name: &str, precision: &str) -> Learner {
-    let mut learner = scratch.learner(name, SETTING);
+fn run(scratch: &Scratch, name: &str, precision: &str, scale: &[&str]) -> Learner {
+    let listen = ["--listen", "tcp/127.0.0.1:0"];
+    let mut learner = scratch.learner_with(name, SETTING, &[&listen, scale].concat());
     let connect = ["--connect", &learner.endpoint(), "--http", "127.0.0.1:0", "--precision", precision];
     let _evaluator = scratch.evaluator_with(&format!("evaluator-of-{name}"), &connect);
     learner.process.assert_succeeds(PATIENCE);
@@ -43,11 +41,14 @@ fn episodes(scored: &Value) -> Vec<(u64, u64, u64, u64)> {
     episodes.map(|of| (whole(&of["seed"]), whole(&of["length"]), bits(&of["return"]), bits(&of["score"]))).collect()
 }
 
+/// Whether or not the policy learnt from scaled data: the simulator's units go in and come out.
 #[test]
 fn a_snapshot_gets_the_scores_that_its_run_has() {
     let scratch = Scratch::new();
-    for precision in ["f32", "bf16"] {
-        let learner = run(&scratch, precision, precision);
+    for (name, precision, scale) in
+        [("exact", "f32", &[][..]), ("rounded", "bf16", &[]), ("scaled", "f32", &["--scale", "states,actions"])]
+    {
+        let learner = run(&scratch, name, precision, scale);
         let steps = SETTING.evaluated_steps();
         let snapshots: Vec<_> = steps.iter().map(|&step| learner.snapshot(step)).collect();
         let snapshots: Vec<&Path> = snapshots.iter().map(AsRef::as_ref).collect();
@@ -69,29 +70,8 @@ fn a_snapshot_gets_the_scores_that_its_run_has() {
             let mut again = episodes(scored);
             of_run.sort_unstable();
             again.sort_unstable();
-            assert_eq!(again, of_run, "step {step} in {precision}");
+            assert_eq!(again, of_run, "step {step}, {name}");
         }
-    }
-}
-
-/// The simulator's units go in and come out, in a run's evaluations as in `evaluator score`.
-#[test]
-fn a_policy_that_learnt_from_scaled_states_is_scored_like_any_other() {
-    let scratch = Scratch::new();
-    let mut learner =
-        scratch.learner_with("scaled", SETTING, &["--listen", "tcp/127.0.0.1:0", "--scale", "states,actions"]);
-    let _evaluator = scratch.evaluator("evaluator-of-scaled", &learner.endpoint());
-    learner.assert_completes(&SETTING, PATIENCE);
-    let of_run: BTreeMap<_, _> = learner.scores().iter().map(|score| (score.key(), score.number("return"))).collect();
-    let snapshot = learner.snapshot(SETTING.steps);
-    let header = Header::<Origin>::read(&fs::read(&snapshot).unwrap()).unwrap();
-    assert!(header.scaling.is_some_and(|scaling| scaling.observations.is_some() && scaling.actions.is_some()));
-    let scored = read(&score("2", &[&snapshot], &["--json"]));
-    let again = scored[0]["episodes"].as_array().unwrap();
-    assert_eq!(again.len(), SETTING.episodes as usize);
-    for episode in again {
-        let key = (SETTING.steps, episode["seed"].as_u64().unwrap());
-        assert_eq!(of_run[&key], episode["return"].as_f64().unwrap(), "{key:?}");
     }
 }
 

@@ -8,7 +8,6 @@ mod crowds;
 mod leaving;
 mod local_evaluators;
 mod names;
-mod pace;
 mod page;
 mod runs;
 mod sweep;

@@ -1,18 +1,12 @@
 //! The page in a browser: Debian's Chromium, without a screen.
 
 use std::process::Command;
-use std::sync::Arc;
-use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering::Relaxed};
-use std::time::Duration;
 
-use quad_tests::http::get;
 use quad_tests::peers::has_chromium;
 use quad_tests::process::{Process, binary};
 use quad_tests::setting::{ENDLESS, SHORT};
 use quad_tests::system::Scratch;
-use quad_tests::{PATIENCE, dashboard, eventually};
-
-use crate::pace::compare;
+use quad_tests::{PATIENCE, dashboard};
 
 /// The page as the browser has it after some seconds of its own clock.
 fn shown(address: &str) -> String {
@@ -87,31 +81,4 @@ fn a_browser_compares_finished_runs() {
         );
     }
     server.terminate(PATIENCE);
-}
-
-#[test]
-fn browsers_that_ask_without_end_cost_training_little() {
-    let scratch = Scratch::new();
-    let learner = scratch.learner_with("run", ENDLESS, &["--listen", "tcp/127.0.0.1:0"]);
-    let address = learner.metrics();
-    let is_answered = |address: &str| {
-        ["/api/runs", "/api/live", "/"].iter().all(|path| get(address, path).is_some_and(|(status, _)| status == 200))
-    };
-    learner.wait_for_metric("gradient_steps_total", "", |steps| steps > 100.0);
-    let (asking, answers) = (Arc::new(AtomicBool::new(false)), Arc::new(AtomicUsize::new(0)));
-    let (asks, answered) = (asking.clone(), answers.clone());
-    std::thread::spawn(move || {
-        // As long as the test runs.
-        while Arc::strong_count(&asks) > 1 {
-            match asks.load(Relaxed) {
-                true => _ = answered.fetch_add(usize::from(is_answered(&address)), Relaxed),
-                false => std::thread::sleep(Duration::from_millis(10)),
-            }
-        }
-    });
-    // Other tests take this machine's time, too, so it need not be seen at once.
-    eventually("training keeps half its pace", PATIENCE, || {
-        let [alone, asked] = compare(&learner, 3, Duration::from_millis(500), |loud| asking.store(loud, Relaxed));
-        (answers.load(Relaxed) > 20 && asked.steps_per_second > 0.5 * alone.steps_per_second).then_some(())
-    });
 }

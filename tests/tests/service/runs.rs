@@ -2,8 +2,10 @@
 
 use std::time::Duration;
 
-use quad_tests::crowd::{Crowd, Pace};
-use quad_tests::made_up::name;
+use quad_protocol::{ScoreReply, keys};
+use quad_tests::crowd::Crowd;
+use quad_tests::made_up::{ask, claim_eventually, client, name, scores};
+use quad_tests::power::Disk;
 use quad_tests::router::{router, router_without_scores};
 use quad_tests::setting::{ENDLESS, SHORT, Setting};
 use quad_tests::system::{Scratch, free_endpoint};
@@ -94,7 +96,6 @@ async fn evaluators_behind_a_router_are_counted_and_missed_when_they_leave() {
     for _ in 0..2 {
         let (lost, before) = (learner.metric("jobs_total", "expired").unwrap(), given_up());
         let crowd = Crowd::connect(3, Duration::from_millis(400), &name("run"), &endpoint).await;
-        crowd.set(Pace::Real);
         present(3.0);
         eventually("all have jobs", PATIENCE, || (crowd.busy() == 3).then_some(()));
         drop(crowd);
@@ -104,4 +105,29 @@ async fn evaluators_behind_a_router_are_counted_and_missed_when_they_leave() {
             (given_up() > before && learner.metric("jobs_total", "expired")? > lost).then_some(())
         });
     }
+}
+
+/// As evaluators do that wait for long: the second report comes many times while the disk is slow to take the first.
+#[tokio::test(flavor = "multi_thread")]
+async fn a_report_that_is_delivered_many_times_at_once_counts_once() {
+    let scratch = Scratch::new();
+    let slow = Disk::new(scratch.path());
+    let setting = Setting { eval_interval: 50_000, episodes: 40, ..ENDLESS };
+    let learner = scratch.learner_through(&slow.launcher(), "run", setting, &["--listen", "tcp/127.0.0.1:0"]);
+    let (session, run) = (client(&learner.endpoint()).await, name("run"));
+    let (mut deliveries, mut episodes) = (Vec::new(), 0);
+    let jobs = [(claim_eventually(&session, &run, "a").await, 1), (claim_eventually(&session, &run, "b").await, 20)];
+    for ((job, times), evaluator) in jobs.iter().zip(["a", "b"]) {
+        episodes += job.seeds.len();
+        for _ in 0..*times {
+            let (session, key, report) = (session.clone(), keys::scores(&run), scores(job, evaluator));
+            deliveries.push(tokio::spawn(async move { ask::<ScoreReply>(&session, key, &report).await }));
+        }
+    }
+    let mut counted = 0;
+    for delivery in deliveries {
+        let Some(ScoreReply::Recorded { new, .. }) = delivery.await.unwrap() else { panic!("refused") };
+        counted += new as usize;
+    }
+    assert_eq!((counted, learner.assert_scores_are_distinct().len()), (episodes, episodes));
 }

@@ -1,7 +1,5 @@
 //! Which episodes are handed out, to whom, how often.
 
-use std::time::Duration;
-
 use super::*;
 
 #[test]
@@ -39,22 +37,6 @@ fn a_claim_that_is_repeated_gets_the_same_job_and_another_one_waits() {
     assert_eq!(bench.job("b", 3).seeds, [6, 7]);
     assert_eq!(bench.expire(10), 1, "to ask again does not extend the lease");
     assert_eq!(bench.job("a", 10).seeds, first.seeds);
-}
-
-#[test]
-fn the_more_have_nothing_to_do_the_less_often_each_asks() {
-    let mut bench = Bench::new();
-    for evaluator in ["a", "b", "c", "d"] {
-        bench.job(evaluator, 0);
-    }
-    for (present, expected) in [(0, 500), (5, 500), (200, 20_000), (500, 50_000)] {
-        bench.present = present;
-        let reply = bench.claim("e", 0, 0);
-        assert!(
-            matches!(reply, Claimed::Wait { time, .. } if time == Duration::from_millis(expected)),
-            "{present}: {reply:?}"
-        );
-    }
 }
 
 #[test]
@@ -174,15 +156,6 @@ fn a_machine_that_fails_again_and_again_does_not_keep_others_from_the_end() {
         }
     }
     assert_eq!((bench.board.pending(), bench.board.missing()), (0, vec![]));
-}
-
-#[test]
-fn an_evaluation_asked_for_twice_is_one() {
-    let mut bench = Bench::new();
-    let job = bench.job("a", 0);
-    bench.board.add_evaluation(1000, hash(1000), &Vec::from_iter(1..=7)).unwrap();
-    assert_eq!((bench.board.pending(), bench.job("b", 0).seeds), (14, vec![6, 7]));
-    assert_eq!(job.seeds.len(), 5);
 }
 
 #[test]

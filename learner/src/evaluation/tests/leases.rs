@@ -55,17 +55,6 @@ fn an_evaluator_may_prepare_for_a_while() {
     assert_eq!((bench.expire(68), bench.expire(69)), (0, 1));
 }
 
-#[test]
-fn a_job_has_a_longest_life() {
-    let mut bench = Bench::new();
-    let job = bench.job("a", 0);
-    let longest = Job::LONGEST.as_secs();
-    for seconds in (5..longest).step_by(5) {
-        bench.progress(&progress(&job, "a", seconds), seconds).unwrap();
-    }
-    assert_eq!((bench.expire(longest - 1), bench.expire(longest)), (0, 1));
-}
-
 /// The disk is full: an evaluator that has delivered its scores has done all that it can, and delivers them again.
 #[test]
 fn scores_that_cannot_be_saved_keep_their_job() {
@@ -100,14 +89,4 @@ fn progress_of_others_is_refused_and_extends_nothing() {
         assert_eq!(bench.progress(&message, 9), Err(refusal));
     }
     assert_eq!(bench.expire(10), 2);
-}
-
-#[test]
-fn progress_does_not_bring_back_a_job_that_was_taken_away() {
-    let mut bench = Bench::new();
-    let job = bench.job("a", 0);
-    bench.expire(10);
-    assert_eq!(bench.progress(&progress(&job, "a", 1), 11), Err(Refusal::Job));
-    assert_eq!(bench.job("b", 11).seeds, job.seeds);
-    assert_eq!(bench.expire(21), 1, "b's alone");
 }

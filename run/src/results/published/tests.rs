@@ -52,24 +52,3 @@ fn every_remark_is_on_a_figure_and_says_something_else_than_it() {
         }
     }
 }
-
-/// The table's tasks are those that a method of it alone has figures for.
-#[test]
-fn table_2_has_seven_tasks() {
-    let is_of =
-        |number: u8| TABLES.scores.keys().filter(move |task| scores(task).iter().any(|one| one.tables == [number]));
-    assert_eq!([is_of(1).count(), is_of(2).count()], [15, 7]);
-}
-
-/// Each is a line below a table, and has a letter there.
-#[test]
-fn the_remarks_of_a_task_are_few_and_short() {
-    for task in TABLES.scores.keys() {
-        let remarks: Vec<_> = scores(task).into_iter().flat_map(|published| published.remarks).collect();
-        assert!((3..=12).contains(&remarks.len()), "{task}: {}", remarks.len());
-        assert!(remarks.iter().any(|remark| remark.selected), "{task}");
-        for Remark { reason, .. } in remarks {
-            assert!(reason.len() < 130 && !reason.ends_with('.') && !reason.contains('\n'), "{reason}");
-        }
-    }
-}

@@ -1,0 +1,49 @@
+//! A peer that reads nothing.
+
+use std::process::Command;
+use std::{env, fs};
+
+use quad_protocol::keys;
+use quad_tests::made_up::{client, name};
+use quad_tests::process::Process;
+use quad_tests::setting::ENDLESS;
+use quad_tests::system::Scratch;
+use quad_tests::{PATIENCE, eventually};
+
+const STRANGER: &str = "QUAD_TESTS_STRANGER";
+
+/// Asks for weights again and again, wants all that is published, and then reads nothing: the process stops itself.
+async fn read_nothing(endpoint: &str) {
+    let (session, run) = (client(endpoint).await, name("run"));
+    let _all = session.declare_subscriber("quad/run/**").callback(drop).await.unwrap();
+    let _token = session.liveliness().declare_token(keys::live_evaluator(&run, &name("stranger"))).await.unwrap();
+    for _ in 0..150 {
+        session.get(keys::weights_at(&run, ENDLESS.eval_interval)).timeout(PATIENCE).callback(drop).await.unwrap();
+    }
+    let stop = format!("kill -STOP {}", std::process::id());
+    Command::new("sh").args(["-c", &stop]).status().unwrap();
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn a_peer_that_reads_nothing_holds_up_neither_jobs_nor_snapshots() {
+    if let Ok(endpoint) = env::var(STRANGER) {
+        return read_nothing(&endpoint).await;
+    }
+    let scratch = Scratch::new();
+    let learner = scratch.learner("run", ENDLESS);
+    let _evaluator = scratch.evaluator("steady", &learner.endpoint());
+    learner.wait_for_scores(0);
+    let mut command = Command::new(env::current_exe().unwrap());
+    command.args(["--exact", "silence::a_peer_that_reads_nothing_holds_up_neither_jobs_nor_snapshots"]);
+    command.env(STRANGER, learner.endpoint());
+    let stranger = Process::start("stranger", scratch.path(), command);
+    let stat = format!("/proc/{}/stat", stranger.id());
+    let scored = eventually("the stranger has stopped", PATIENCE, || {
+        fs::read_to_string(&stat).ok()?.contains(") T ").then(|| learner.scores().len())
+    });
+    // Until the learner has closed the connection; the stranger itself does nothing any more.
+    let meanwhile = eventually("the stranger is gone", PATIENCE, || {
+        learner.process.log().contains("evaluator stranger has left").then(|| learner.scores().len())
+    });
+    assert!(meanwhile > scored, "no evaluator was served while the stranger read nothing");
+}
