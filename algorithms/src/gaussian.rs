@@ -1,15 +1,15 @@
 //! The Gaussian policy that several algorithms train by weighted regression: its mean is the tanh of a network, its log σ the
 //! same in all states.
 
-use candle_core::{DType, Result, Tensor};
+use candle_core::{Result, Tensor};
 use quad_policy::{
-    AdamStep, Ensemble, GaussianPolicy, GaussianShape, Gradients, Layout, MlpConfig, Part, PolicyConfig, Start,
-    Tensors, Weights, gaussian_mean,
+    AdamStep, Ensemble, GaussianPolicy, GaussianShape, Gradients, MlpConfig, PolicyConfig, Tensors, Weights,
+    gaussian_mean,
 };
 
 use super::context::Context;
 use super::parts::Parts;
-use super::trained::{Trained, ensemble};
+use super::trained::{Trained, ensemble, learned};
 
 /// Bounds of log σ.
 const LOG_STD: (f32, f32) = (-5.0, 2.0);
@@ -27,10 +27,8 @@ impl Gaussian {
     pub fn new(layers: &MlpConfig, context: &Context, network: u64) -> Result<Self> {
         let action_dim = context.action_dim();
         let shape = GaussianShape { observation_dim: context.observation_dim(), action_dim, actor: layers.clone() };
-        let part = Part { name: "log_std".to_owned(), shape: vec![action_dim], start: Start::Constant(0.0) };
-        let log_std = Tensor::zeros(action_dim, DType::F32, &context.device)?;
-        let log_std = Weights::trainable(Layout::new(vec![part]), &log_std)?;
-        Ok(Self { mean: ensemble(shape.actor(), context, network)?, log_std: Trained::new(log_std, 0.0)?, shape })
+        let log_std = learned("log_std", &vec![0.0; action_dim], context)?;
+        Ok(Self { mean: ensemble(shape.actor(), context, network)?, log_std, shape })
     }
 
     /// log π(a|s), `[B]`.
@@ -65,4 +63,16 @@ pub(super) fn log_density(actions: &Tensor, mean: &Tensor, log_std: &Tensor) -> 
     let square = (actions - mean)?.broadcast_div(&log_std.exp()?)?.sqr()?;
     let half_log_2_pi = 0.5 * (2.0 * std::f64::consts::PI).ln();
     ((square * -0.5)?.broadcast_sub(log_std)? - half_log_2_pi)?.sum(1)
+}
+
+/// The policy that acts by the tanh of the first half of what comes out of a network of these hidden layers, `[n, 2a]`.
+pub(super) fn first_half(network: &Ensemble, layers: &MlpConfig, context: &Context) -> Result<(PolicyConfig, Tensors)> {
+    let (observation_dim, action_dim) = (context.observation_dim(), context.action_dim());
+    let mut tensors = GaussianPolicy::tensors(network)?;
+    let last = format!(".{}.", layers.hidden.len());
+    for (_, tensor) in tensors.iter_mut().filter(|(name, _)| name.contains(&last)) {
+        *tensor = tensor.narrow(tensor.rank() - 1, 0, action_dim)?.contiguous()?;
+    }
+    let shape = GaussianShape { observation_dim, action_dim, actor: layers.clone() };
+    Ok((PolicyConfig::Gaussian { shape }, tensors))
 }

@@ -23,6 +23,8 @@ mod parts;
 mod pool;
 mod quad;
 mod random;
+#[allow(dead_code)] // until an algorithm uses all of it
+mod squashed;
 mod trained;
 mod values;
 mod xql;

@@ -10,16 +10,14 @@ mod golden;
 use super::algorithm::{Algorithm, AlgorithmError, Measured, measured};
 use super::context::{Context, Minibatch};
 use super::definition::{Definition, Metric, Reporting, metrics, read, readable};
-use super::gaussian::log_density;
+use super::gaussian::{first_half, log_density};
 use super::hyperparameters::{Count, Positive, Rate, Share, Steps};
 use super::parts::Parts;
 use super::random::{Purpose, stream};
 use super::trained::{Trained, ensemble};
 use candle_core::{DType, Result, Tensor};
 use quad_dataset::Batch;
-use quad_policy::{
-    AdamStep, Ensemble, EnsembleShape, GaussianPolicy, GaussianShape, MlpConfig, PolicyConfig, Tensors, Weighted,
-};
+use quad_policy::{AdamStep, Ensemble, EnsembleShape, MlpConfig, PolicyConfig, Tensors, Weighted};
 use rand_distr::{Distribution, StandardNormal};
 use serde::Deserialize;
 
@@ -248,14 +246,7 @@ impl Algorithm for Onestep {
 
     /// Acts by the mean, which comes from the first half of the last layer.
     fn policy(&self) -> Result<(PolicyConfig, Tensors)> {
-        let (observation_dim, action_dim) = (self.context.observation_dim(), self.context.action_dim());
-        let shape = GaussianShape { observation_dim, action_dim, actor: self.config.behavior.clone() };
-        let mut tensors = GaussianPolicy::tensors(&self.actor.network)?;
-        let last = format!(".{}.", self.config.behavior.hidden.len());
-        for (_, tensor) in tensors.iter_mut().filter(|(name, _)| name.contains(&last)) {
-            *tensor = tensor.narrow(tensor.rank() - 1, 0, action_dim)?.contiguous()?;
-        }
-        Ok((PolicyConfig::Gaussian { shape }, tensors))
+        first_half(&self.actor.network, &self.config.behavior, &self.context)
     }
 
     fn parts(&mut self) -> Parts<'_> {

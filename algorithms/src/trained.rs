@@ -1,7 +1,7 @@
 //! A network with its optimiser, and how both begin.
 
 use candle_core::{Result, Tensor};
-use quad_policy::{Adam, AdamStep, Ensemble, EnsembleShape, Gradients, Layout, Weighted, Weights};
+use quad_policy::{Adam, AdamStep, Ensemble, EnsembleShape, Gradients, Layout, Part, Start, Weighted, Weights};
 
 use super::context::Context;
 use super::random::{Purpose, stream};
@@ -40,4 +40,11 @@ pub(super) fn initial(layout: &Layout, context: &Context, network: u64) -> Resul
 pub(super) fn ensemble(shape: EnsembleShape, context: &Context, network: u64) -> Result<Trained<Ensemble>> {
     let weights = initial(&shape.layout(), context, network)?;
     Trained::new(Ensemble::new(shape, weights, context.precision), 0.0)
+}
+
+/// Learned numbers, `[n]`, under one name, that begin as these.
+pub(super) fn learned(name: &str, begin: &[f32], context: &Context) -> Result<Trained<Weights>> {
+    let part = Part { name: name.to_owned(), shape: vec![begin.len()], start: Start::Constant(0.0) };
+    let values = Tensor::from_slice(begin, begin.len(), &context.device)?;
+    Trained::new(Weights::trainable(Layout::new(vec![part]), &values)?, 0.0)
 }
