@@ -61,7 +61,7 @@ checked!(
 
 checked!(
     /// Actions that a policy draws in each state.
-    Candidates(u32), |x| (1..=Choice::MOST_CANDIDATES).contains(&x), "a whole number from 1 to 1000"
+    Candidates(u32), |x| (1..=Choice::MOST_CANDIDATES).contains(&x), "a whole number from 1 to 10000"
 );
 
 /// What policies are read with: their denoising steps have the same bound.

@@ -7,7 +7,8 @@ use std::sync::atomic::{AtomicUsize, Ordering::Relaxed};
 use candle_core::{Device, Tensor};
 use quad_policy::{
     Choice, DiffusionPolicy, DiffusionShape, Ensemble, GaussianPolicy, GaussianShape, Header, Layout, MlpConfig,
-    NoisePredictor, Policy, PolicyConfig, Precision, Rule, Tensors, Weights, load_policy,
+    NoisePredictor, Policy, PolicyConfig, Precision, Rule, SquashedPolicy, SquashedShape, Tensors, Weights,
+    load_policy,
 };
 
 /// What is not counted, such as the embedding of each denoising step: little of what an evaluator gives, bytes.
@@ -61,17 +62,31 @@ fn gaussian(hidden: usize) -> Box<dyn Policy> {
     loaded(PolicyConfig::Gaussian { shape }, &GaussianPolicy::tensors(&actor).unwrap())
 }
 
+fn squashed(hidden: usize, norm: bool) -> Box<dyn Policy> {
+    let actor = MlpConfig::mish(&[hidden; 3]);
+    let critic = MlpConfig { norm, ..actor.clone() };
+    let shape = SquashedShape { observation_dim: 11, action_dim: 3, actor, critic, critics: 2 };
+    let [actor, critics] = [shape.actor(), shape.critics()].map(|of| {
+        let weights = zeros(of.layout());
+        Ensemble::new(of, weights, Precision::F32)
+    });
+    let choice = Choice::best_of(1024);
+    loaded(PolicyConfig::Squashed { shape, choice }, &SquashedPolicy::tensors(&actor, &critics).unwrap())
+}
+
 #[test]
 fn actions_take_no_more_memory_than_was_said() {
     let best_of = Choice::best_of;
     let nearest = Choice { rule: Rule::Nearest, ..best_of(1000) };
-    let cases: [(&str, Box<dyn Policy>, usize); 6] = [
+    let cases: [(&str, Box<dyn Policy>, usize); 8] = [
         ("the paper's", diffusion(256, 10, 5, best_of(50)), 10),
         ("many critics", diffusion(1, 4096, 1, best_of(32)), 64),
         ("many steps", diffusion(4, 1, 1000, best_of(8)), 256),
         ("many candidates", diffusion(8, 2, 5, best_of(1000)), 64),
         ("a value function", diffusion(8, 2, 5, nearest), 256),
         ("a Gaussian", gaussian(256), 256),
+        ("a squashed Gaussian", squashed(4, false), 64),
+        ("critics with a norm", squashed(64, true), 10),
     ];
     for (name, policy, n) in cases {
         let said = policy.memory(n) as usize;

@@ -48,7 +48,7 @@ pub enum Rule {
 
 impl Choice {
     /// Most actions drawn in a state: far above any use, low enough for evaluators' memory.
-    pub const MOST_CANDIDATES: u32 = 1000;
+    pub const MOST_CANDIDATES: u32 = 10_000;
 
     /// The best of so many candidates by the mean of the critics (Eq. 25).
     pub fn best_of(candidates: u32) -> Self {
@@ -226,7 +226,7 @@ mod tests {
 
     #[test]
     fn a_choice_out_of_range_is_refused() {
-        for candidates in [0, 1001, u32::MAX] {
+        for candidates in [0, 10_001, u32::MAX] {
             assert!(matches!(Choice::best_of(candidates).check(), Err(PolicyError::Range { .. })));
         }
         for temperature in [0.0, -1.0, f32::NAN, f32::INFINITY] {

@@ -2,6 +2,7 @@
 
 use crate::action_gradients::ActionGradients;
 use crate::composed::Pass;
+use crate::error::PolicyError;
 use crate::mlp::Mlp;
 use crate::operation::OnCpu;
 use crate::packed::Packing;
@@ -9,7 +10,7 @@ use crate::plain;
 use crate::precision::Precision;
 use crate::shape::EnsembleShape;
 use crate::weighted::weighted;
-use crate::weights::Weights;
+use crate::weights::{Tensors, Weights};
 use candle_core::{Result, Tensor, Var, bail};
 
 /// An ensemble and its weights.
@@ -27,6 +28,21 @@ impl Ensemble {
     pub fn new(shape: EnsembleShape, weights: Weights, precision: Precision) -> Self {
         let networks = Mlp::new(shape.layers(), "");
         Self { shape, networks, weights, packing: Packing::new(precision) }
+    }
+
+    /// Takes the tensors of such networks out of `tensors`, for a policy that acts.
+    pub(crate) fn take(
+        shape: EnsembleShape,
+        tensors: &mut Tensors,
+        prefix: &str,
+        precision: Precision,
+    ) -> std::result::Result<Self, PolicyError> {
+        let weights = Weights::take(shape.layout(), tensors, prefix)?;
+        Ok(Self::new(shape, weights, precision).packed()?)
+    }
+
+    pub(crate) fn shape(&self) -> &EnsembleShape {
+        &self.shape
     }
 
     /// Copies the networks, with constant weights: a target network at its beginning.

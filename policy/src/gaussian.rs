@@ -9,7 +9,7 @@ use crate::precision::Precision;
 use crate::shape::{EnsembleShape, bytes};
 use crate::slices::read;
 use crate::weighted::Weighted;
-use crate::weights::{Tensors, Weights};
+use crate::weights::Tensors;
 use candle_core::{Device, Result, Tensor};
 use serde::{Deserialize, Serialize};
 
@@ -57,8 +57,7 @@ impl GaussianPolicy {
     pub(crate) fn load(shape: GaussianShape, tensors: &mut Tensors) -> std::result::Result<Self, PolicyError> {
         check_range("observation_dim", shape.observation_dim, MOST)?;
         check_range("action_dim", shape.action_dim, MOST)?;
-        let weights = Weights::take(shape.actor().layout(), tensors, ACTOR)?;
-        let actor = Ensemble::new(shape.actor(), weights, Precision::F32).packed()?;
+        let actor = Ensemble::take(shape.actor(), tensors, ACTOR, Precision::F32)?;
         Ok(Self { shape, actor })
     }
 }

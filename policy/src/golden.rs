@@ -170,7 +170,7 @@ fn the_file_s_rule_chooses_unless_another_is_asked_for() {
     assert_eq!((other.choice(), act(&*other)), (Some(cold), high.clone()));
     assert!(matches!(policy_of_best.with_choice(nearest), Err(PolicyError::NoValue)));
     assert!(matches!(policy(nearest, 0.1, None), Err(PolicyError::NoValue)));
-    assert!(matches!(policy_of_best.with_choice(Choice::best_of(1001)), Err(PolicyError::Range { .. })));
+    assert!(matches!(policy_of_best.with_choice(Choice::best_of(10_001)), Err(PolicyError::Range { .. })));
     assert_eq!((policy_of_best.choice(), act(&*policy_of_best)), (Some(best), high), "it stays as it is");
 }
 

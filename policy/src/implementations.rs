@@ -3,7 +3,7 @@
 
 use crate::ensemble::Ensemble;
 use crate::gradient::Gradients;
-use crate::mlp_config::{Initial, MlpConfig};
+use crate::mlp_config::{Epsilon, Initial, MlpConfig};
 use crate::noise_predictor::NoisePredictor;
 use crate::optimiser::{Adam, AdamStep};
 use crate::precision::Precision;
@@ -56,6 +56,7 @@ fn layers(generator: &mut ChaCha8Rng) -> MlpConfig {
         hidden: (0..generator.random_range(1..5)).map(|_| widths[generator.random_range(0..4)]).collect(),
         activation: ACTIVATIONS[generator.random_range(0..4)],
         norm: false,
+        norm_epsilon: Epsilon::Flax,
         initial: [Initial::Xavier, Initial::Orthogonal, Initial::Torch][generator.random_range(0..3)],
     }
 }
@@ -116,8 +117,7 @@ fn gradients_are_what_finite_differences_say() {
         ACTIVATIONS.into_iter().flat_map(|f| [(f, false, 1), (f, false, 3), (f, true, 1), (f, true, 2)])
     {
         let mut generator = ChaCha8Rng::seed_from_u64(depth as u64);
-        let layers =
-            MlpConfig { hidden: vec![24, 32, 7][..depth].to_vec(), activation, norm, initial: Initial::Xavier };
+        let layers = MlpConfig { activation, norm, ..MlpConfig::mish(&[24, 32, 7][..depth]) };
         let shape = EnsembleShape { members: 2, observation_dim: 4, action_dim: 3, layers: layers.clone(), outputs: 2 };
         let networks = ensemble(&mut generator, shape.clone());
         let observations = Var::from_tensor(&tensor(&mut generator, &[5, 4])).unwrap();

@@ -7,6 +7,7 @@ use crate::gaussian::{GaussianPolicy, GaussianShape};
 use crate::policy::Policy;
 use crate::precision::Precision;
 use crate::scaled::scaled;
+use crate::squashed::{SquashedPolicy, SquashedShape};
 use crate::weights::{Tensors, check_finite};
 use candle_core::Device;
 use candle_core::safetensors::Load;
@@ -30,6 +31,13 @@ pub enum PolicyConfig {
     Diffusion {
         /// Shape of its networks.
         shape: DiffusionShape,
+        /// Which sample it is.
+        choice: Choice,
+    },
+    /// One of several samples of a tanh-squashed Gaussian.
+    Squashed {
+        /// Shape of its networks.
+        shape: SquashedShape,
         /// Which sample it is.
         choice: Choice,
     },
@@ -85,6 +93,9 @@ pub fn load_policy(file: &[u8], precision: Precision) -> Result<Box<dyn Policy>,
     let policy: Box<dyn Policy> = match policy {
         PolicyConfig::Diffusion { shape, choice } => {
             Box::new(DiffusionPolicy::load(shape, choice, &mut tensors, precision)?)
+        }
+        PolicyConfig::Squashed { shape, choice } => {
+            Box::new(SquashedPolicy::load(&shape, choice, &mut tensors, precision)?)
         }
         PolicyConfig::Gaussian { shape } => Box::new(GaussianPolicy::load(shape, &mut tensors)?),
     };

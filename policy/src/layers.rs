@@ -3,7 +3,7 @@
 //! A vector for all weights keeps an optimiser's step at one operation, and each named tensor is one contiguous run of it:
 //! layer after layer the kernels of all members, then their biases, then scales and shifts of the norm, if there is one.
 
-use crate::mlp_config::{Initial, MlpConfig};
+use crate::mlp_config::{Epsilon, Initial, MlpConfig};
 use crate::weights::{Part, Start};
 use candle_core::{Result, Tensor};
 use quad_kernels::activation::Activation;
@@ -20,6 +20,8 @@ pub(crate) struct Layers {
     widths: Vec<usize>,
     /// Whether a norm stands between the hidden layers' linear maps and their activations.
     pub norm: bool,
+    /// What it adds to the variance.
+    pub norm_epsilon: Epsilon,
     pub activation: Activation,
     initial: Initial,
     /// Where each layer's parameters begin in the vector; behind the last layer, its end.
@@ -38,8 +40,8 @@ impl Layers {
     /// The first kernel lies at `start`.
     pub fn new(members: usize, inputs: usize, config: &MlpConfig, outputs: usize, start: usize) -> Self {
         let widths: Vec<usize> = [inputs].iter().chain(&config.hidden).chain(&[outputs]).copied().collect();
-        let MlpConfig { norm, activation, initial, .. } = *config;
-        let mut layers = Self { members, widths, norm, activation, initial, offsets: vec![start] };
+        let MlpConfig { norm, norm_epsilon, activation, initial, .. } = *config;
+        let mut layers = Self { members, widths, norm, norm_epsilon, activation, initial, offsets: vec![start] };
         for layer in 0..layers.count() {
             let ((inputs, outputs), normed) = (layers.shape(layer), layers.is_normed(layer));
             let numbers = (inputs + if normed { 3 } else { 1 }) * outputs;

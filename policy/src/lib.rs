@@ -7,13 +7,13 @@
 //!   implementation for the CPU, one of few operations for a GPU (`composed`), and a plain one (`plain`) that runs on any
 //!   device and has layer norm.
 //! - [`Ensemble`] (`ensemble`): such networks as critics, value functions or means; [`NoisePredictor`] (`noise_predictor`):
-//!   ε_θ; [`Schedule`] (`schedule`): the noise schedule and one reverse step. `sampler` and `action_gradients` go through
+//!   ε_θ; [`Denoiser`] (`edm`), told of noise by a real number; [`Schedule`] (`schedule`): the noise schedule and one reverse step. `sampler` and `action_gradients` go through
 //!   whole networks tile by tile.
 //! - [`Weights`] (`weights`): a network's weights as one vector with named tensors in it; [`Gradients`] (`gradient`) of a loss
 //!   with respect to them; [`Adam`] (`optimiser`).
 //! - [`Policy`] (`policy`): what any policy can do; [`EpisodeState`] (`episode`): what it carries through an episode. `kind`
-//!   reads one from a file whose [`Header`] says what it is: [`DiffusionPolicy`] (`diffusion`, one of N_a samples by its
-//!   [`Choice`], in `choice`) or [`GaussianPolicy`] (`gaussian`, a mean); one with a [`Scaling`] is asked in its user's units (`scaled`).
+//!   reads one from a file whose [`Header`] says what it is: [`DiffusionPolicy`] (`diffusion`) and [`SquashedPolicy`]
+//!   (`squashed`) take one of N_a samples (`candidates`) by their [`Choice`] (`choice`), [`GaussianPolicy`] (`gaussian`) a mean; one with a [`Scaling`] is asked in its user's units (`scaled`).
 //! - [`Precision`] (`precision`): how exactly networks are evaluated that no gradient is taken of.
 //! - Below: `layers` (where each layer lies in the vector), `network` (one network on one tile of rows, over the crate
 //!   `kernels`), `saved` and `kept_gradient` (what forward and backward passes leave), `operation` (candle's custom
@@ -25,9 +25,11 @@
 #![deny(unsafe_code)]
 
 mod action_gradients;
+mod candidates;
 mod choice;
 mod composed;
 mod diffusion;
+mod edm;
 mod ensemble;
 mod episode;
 mod error;
@@ -60,19 +62,21 @@ mod scaled;
 mod schedule;
 mod shape;
 mod slices;
+mod squashed;
 mod statistics;
 mod weighted;
 mod weights;
 
 pub use choice::{Choice, Reduce, Rule};
 pub use diffusion::{DiffusionPolicy, DiffusionShape};
+pub use edm::{Denoiser, DenoiserShape, NoiseLevels};
 pub use ensemble::Ensemble;
 pub use episode::EpisodeState;
 pub use error::PolicyError;
 pub use gaussian::{GaussianPolicy, GaussianShape, gaussian_mean};
 pub use gradient::Gradients;
 pub use kind::{Header, PolicyConfig, load_policy, read_header, read_tensors, write_tensors};
-pub use mlp_config::{Initial, MlpConfig};
+pub use mlp_config::{Epsilon, Initial, MlpConfig};
 pub use noise_predictor::NoisePredictor;
 pub use optimiser::{Adam, AdamStep, cosine_decay};
 pub use policy::{Policy, Sampled};
@@ -81,6 +85,7 @@ pub use quad_kernels::activation::Activation;
 pub use quad_kernels::scaling::{Affine, Scaling};
 pub use schedule::{Reverse, Schedule};
 pub use shape::{EnsembleShape, NoiseShape};
+pub use squashed::{SquashedActor, SquashedPolicy, SquashedShape};
 pub use statistics::mean_and_variance;
 pub use weighted::Weighted;
 pub use weights::{Layout, Part, Start, Tensors, Weights, take};

@@ -18,12 +18,40 @@ pub struct MlpConfig {
     pub hidden: Vec<usize>,
     /// What follows each of them.
     pub activation: Activation,
-    /// Whether a layer norm (Ba et al. 2016; ε = 1e-6) stands before each activation.
+    /// Whether a layer norm (Ba et al. 2016) stands before each activation.
     #[serde(default)]
     pub norm: bool,
+    /// What the norm adds to the variance.
+    #[serde(default, skip_serializing_if = "Epsilon::is_default")]
+    pub norm_epsilon: Epsilon,
     /// What the weights begin with.
     #[serde(default)]
     pub initial: Initial,
+}
+
+/// What a layer norm adds to the variance, ε.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum Epsilon {
+    /// 1e-6, as in Flax.
+    #[default]
+    Flax,
+    /// 1e-5, as in PyTorch.
+    Torch,
+}
+
+impl Epsilon {
+    /// The number.
+    pub(crate) fn value(self) -> f64 {
+        match self {
+            Self::Flax => 1e-6,
+            Self::Torch => 1e-5,
+        }
+    }
+
+    fn is_default(&self) -> bool {
+        *self == Self::default()
+    }
 }
 
 /// What a network's weights begin with.
@@ -35,6 +63,8 @@ pub enum Initial {
     Xavier,
     /// Kernels √2 times an orthogonal matrix (Saxe et al. 2014), biases 0.
     Orthogonal,
+    /// Kernels an orthogonal matrix as it is, biases 0.
+    Orthonormal,
     /// PyTorch's: kernels and biases U(±1/√in).
     Torch,
 }
@@ -45,6 +75,7 @@ impl Initial {
         match self {
             Self::Xavier => (Start::Uniform((6.0 / (inputs + outputs) as f32).sqrt()), Start::Constant(0.0)),
             Self::Orthogonal => (Start::Orthogonal(std::f32::consts::SQRT_2), Start::Constant(0.0)),
+            Self::Orthonormal => (Start::Orthogonal(1.0), Start::Constant(0.0)),
             Self::Torch => {
                 let bound = 1.0 / (inputs as f32).sqrt();
                 (Start::Uniform(bound), Start::Uniform(bound))
@@ -71,4 +102,25 @@ fn widths<'de, D: Deserializer<'de>>(deserializer: D) -> Result<Vec<usize>, D::E
         return Ok(widths);
     }
     Err(D::Error::custom(format_args!("hidden layers are 1 to {MOST_LAYERS} widths from 1 to {MOST}, not {widths:?}")))
+}
+
+#[cfg(test)]
+#[allow(clippy::unwrap_used)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_configuration_names_what_a_norm_adds_only_where_it_is_not_the_usual() {
+        let config = MlpConfig { norm: true, norm_epsilon: Epsilon::Torch, ..MlpConfig::mish(&[4]) };
+        let json = serde_json::to_string(&config).unwrap();
+        assert!(json.contains(r#""norm_epsilon":"torch""#), "{json}");
+        assert_eq!(serde_json::from_str::<MlpConfig>(&json).unwrap(), config);
+        assert!(!serde_json::to_string(&MlpConfig::mish(&[4])).unwrap().contains("epsilon"));
+    }
+
+    #[test]
+    fn orthogonal_weights_have_the_gain_that_their_name_says() {
+        let gains = [Initial::Orthogonal, Initial::Orthonormal].map(|initial| initial.of_layer(3, 5).0);
+        assert_eq!(gains, [Start::Orthogonal(std::f32::consts::SQRT_2), Start::Orthogonal(1.0)]);
+    }
 }

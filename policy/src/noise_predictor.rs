@@ -20,12 +20,16 @@ pub struct NoisePredictor {
     packing: Packing,
 }
 
-/// cos(t·f_k), then sin(t·f_k), with f_k = exp(-k·ln(10000)/7) for k = 0..7, of t = 1..T.
-fn time_features(steps: usize) -> Vec<f32> {
+/// cos(x·f_k), then sin(x·f_k), with f_k = exp(-k·ln(10000)/7) for k = 0..7.
+pub(crate) fn sinusoids(x: f64) -> impl Iterator<Item = f32> {
     let half = TIME_FEATURES / 2;
-    let angle = |t: usize, k: usize| t as f64 * (-(k as f64) * 10_000_f64.ln() / (half - 1) as f64).exp();
-    let row = |t| (0..half).map(move |k| angle(t, k).cos()).chain((0..half).map(move |k| angle(t, k).sin()));
-    (1..=steps).flat_map(row).map(|x| x as f32).collect()
+    let angle = move |k: usize| x * (-(k as f64) * 10_000_f64.ln() / (half - 1) as f64).exp();
+    (0..half).map(move |k| angle(k).cos()).chain((0..half).map(move |k| angle(k).sin())).map(|x| x as f32)
+}
+
+/// The sinusoids of t = 1..T.
+fn time_features(steps: usize) -> Vec<f32> {
+    (1..=steps).flat_map(|t| sinusoids(t as f64)).collect()
 }
 
 weighted!(NoisePredictor, parts.trunk);

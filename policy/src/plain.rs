@@ -6,9 +6,6 @@ use crate::weights::Tensors;
 use candle_core::{D, Result, Tensor};
 use quad_kernels::activation::Activation;
 
-/// Added to a layer norm's variance.
-const EPSILON: f64 = 1e-6;
-
 /// x·tanh(softplus(x)) as x·n/(n + 2) with n = e^x (e^x + 2). From 20 on it is x, to the last bit of f32; the bound keeps
 /// value and derivative finite everywhere (the derivative of candle's own Mish is NaN from 89 on).
 fn mish(x: &Tensor) -> Result<Tensor> {
@@ -30,9 +27,9 @@ fn activate(f: Activation, x: &Tensor) -> Result<Tensor> {
 
 /// Each row over its numbers: (x - mean)/√(variance + ε)·scale + shift, for `x [K, rows, width]` and `[K, 1, width]`.
 /// (candle-nn's own has no gradient, and says nothing.)
-fn layer_norm(x: &Tensor, scale: &Tensor, shift: &Tensor) -> Result<Tensor> {
+fn layer_norm(x: &Tensor, scale: &Tensor, shift: &Tensor, epsilon: f64) -> Result<Tensor> {
     let centred = x.broadcast_sub(&x.mean_keepdim(D::Minus1)?)?;
-    let deviation = (centred.sqr()?.mean_keepdim(D::Minus1)? + EPSILON)?.sqrt()?;
+    let deviation = (centred.sqr()?.mean_keepdim(D::Minus1)? + epsilon)?.sqrt()?;
     centred.broadcast_div(&deviation)?.broadcast_mul(scale)?.broadcast_add(shift)
 }
 
@@ -50,7 +47,7 @@ pub(crate) fn mlp(weights: &Tensors, prefix: &str, layers: &Layers, x: &Tensor) 
         x = x.contiguous()?.broadcast_matmul(&get(layer, "kernel")?)?.broadcast_add(&get(layer, "bias")?)?;
         if layer + 1 < layers.count() {
             if layers.norm {
-                x = layer_norm(&x, &get(layer, "scale")?, &get(layer, "shift")?)?;
+                x = layer_norm(&x, &get(layer, "scale")?, &get(layer, "shift")?, layers.norm_epsilon.value())?;
             }
             x = activate(layers.activation, &x)?;
         }
@@ -65,4 +62,24 @@ pub(crate) fn repeat_rows(x: &Tensor, times: usize) -> Result<Tensor> {
         return Ok(x.clone());
     }
     x.unsqueeze(1)?.broadcast_as((rows, times, width))?.reshape((rows * times, width))
+}
+
+#[cfg(test)]
+#[allow(clippy::unwrap_used)]
+mod tests {
+    use super::*;
+    use candle_core::Device;
+
+    /// Rows of variance 1e-6, in which it shows what is added to it.
+    #[test]
+    fn a_norm_divides_by_the_root_of_the_variance_and_what_it_adds() {
+        let x = Tensor::new(&[[[5.001f32, 4.999]]], &Device::Cpu).unwrap();
+        let one = |x: f32| Tensor::full(x, (1, 1, 2), &Device::Cpu).unwrap();
+        for (epsilon, expected) in [(1e-6, 0.5f64.sqrt()), (1e-5, (1.0 / 11.0f64).sqrt())] {
+            let y = layer_norm(&x, &one(2.0), &one(0.5), epsilon).unwrap();
+            let y: Vec<f32> = y.flatten_all().unwrap().to_vec1().unwrap();
+            let expected = [0.5 + 2.0 * expected, 0.5 - 2.0 * expected];
+            assert!(y.iter().zip(expected).all(|(y, x)| (f64::from(*y) - x).abs() < 1e-3), "{y:?} {expected:?}");
+        }
+    }
 }

@@ -215,11 +215,13 @@ impl PyPolicy {
         self.origin.step
     }
 
-    /// "diffusion", which draws actions and chooses one, or "gaussian", which acts by its mean.
+    /// "diffusion" or "squashed" (a Gaussian through a tanh), which draw actions and choose one, or "gaussian", which acts by
+    /// its mean.
     #[getter]
     fn kind(&self) -> &'static str {
         match self.config {
             PolicyConfig::Diffusion { .. } => "diffusion",
+            PolicyConfig::Squashed { .. } => "squashed",
             PolicyConfig::Gaussian { .. } => "gaussian",
         }
     }

@@ -101,7 +101,7 @@ class Reference:
             x = x @ kernel + (bias if kernel.ndim == 2 else bias[:, None])
             if i + 1 < layers:
                 if config["norm"]:
-                    x = (x - x.mean(-1, keepdims=True)) / np.sqrt(x.var(-1, keepdims=True) + 1e-6)
+                    x = (x - x.mean(-1, keepdims=True)) / np.sqrt(x.var(-1, keepdims=True) + (1e-5 if config.get("norm_epsilon") == "torch" else 1e-6))
                     scale, shift = self.tensors[f"{prefix}{i}.scale"], self.tensors[f"{prefix}{i}.shift"]
                     x = x * (scale if scale.ndim == 1 else scale[:, None]) + (shift if shift.ndim == 1 else shift[:, None])
                 x = ACTIVATIONS[config["activation"]](x)
@@ -120,6 +120,15 @@ class Reference:
 
     def draw(self, observation, random, candidates):
         """Actions for one observation, [candidates, a]."""
+        return (self.squash if self.kind == "squashed" else self.denoise)(observation, random, candidates)
+
+    def squash(self, observation, random, candidates):
+        a = self.shape["action_dim"]
+        noise = np.asarray([random.normal() for _ in range(candidates * a)], np.float32).reshape(candidates, a)
+        mean, log_std = np.split(self.mlp("actor.", self.shape["actor"], observation[None]).reshape(-1), 2)
+        return np.tanh(mean + np.exp(np.clip(log_std, -5, 2)) * noise)
+
+    def denoise(self, observation, random, candidates):
         a, steps, reverse = (self.shape[name] for name in ("action_dim", "diffusion_steps", "reverse"))
         noise = [[random.normal() for _ in range(candidates * a)] for _ in range(steps)]
         noise = np.asarray(noise, np.float32).astype(np.float64).reshape(steps, candidates, a)

@@ -161,7 +161,7 @@ def test_what_cannot_be_is_refused(snapshots, tmp_path):
         "could not convert string": lambda: policy.act(["a"]),
         "seed must be an int .* sequence of 3": lambda: policy.act(states, seed=-1),
         "sequence of 3 of them, or None": lambda: policy.act(states, seed=[1, 2]),
-        "candidates is 0, but must be from 1 to 1000": lambda: policy.act(states, candidates=0),
+        "candidates is 0, but must be from 1 to 10000": lambda: policy.act(states, candidates=0),
         "candidates is -1": lambda: policy.act(states, candidates=-1),
         'rule is "worst", not one of best': lambda: policy.act(states, rule="worst"),
         "temperature is -1": lambda: policy.act(states, rule="softmax:-1"),

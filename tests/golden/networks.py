@@ -39,29 +39,29 @@ def mish(x):
 ACTIVATIONS = {"mish": mish, "relu": jax.nn.relu, "silu": jax.nn.silu, "tanh": jnp.tanh}
 
 
-def normalised(x):
+def normalised(x, epsilon):
     """Mean 0 and variance 1 over the last axis."""
-    return (x - x.mean(-1, keepdims=True)) / jnp.sqrt(x.var(-1, keepdims=True) + 1e-6)
+    return (x - x.mean(-1, keepdims=True)) / jnp.sqrt(x.var(-1, keepdims=True) + epsilon)
 
 
-def mlp(parameters, prefix, activation, x):
+def mlp(parameters, prefix, activation, x, epsilon=1e-6):
     last = sum(bool(re.fullmatch(rf"{prefix}\d+\.kernel", name)) for name in parameters) - 1
     for i in range(last + 1):
         x = x @ parameters[f"{prefix}{i}.kernel"] + parameters[f"{prefix}{i}.bias"]
         if f"{prefix}{i}.scale" in parameters:
-            x = parameters[f"{prefix}{i}.scale"] * normalised(x) + parameters[f"{prefix}{i}.shift"]
+            x = parameters[f"{prefix}{i}.scale"] * normalised(x, epsilon) + parameters[f"{prefix}{i}.shift"]
         x = ACTIVATIONS[activation](x) if i < last else x
     return x
 
 
-def ensemble(networks, x, activation):
+def ensemble(networks, x, activation, epsilon=1e-6):
     """The outputs of all members of an ensemble of MLPs for the same inputs [..., in], as [K, ..., out]."""
-    return jax.vmap(lambda network: mlp(network, "", activation, x))(networks)
+    return jax.vmap(lambda network: mlp(network, "", activation, x, epsilon))(networks)
 
 
-def values(critics, states, actions, activation):
+def values(critics, states, actions, activation, epsilon=1e-6):
     """Q_k(s, a) of the whole ensemble, [K, ...]."""
-    return ensemble(critics, jnp.concatenate([states, actions], -1), activation)[..., 0]
+    return ensemble(critics, jnp.concatenate([states, actions], -1), activation, epsilon)[..., 0]
 
 
 fast_values = compiled(values)

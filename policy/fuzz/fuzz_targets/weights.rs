@@ -9,7 +9,8 @@ use candle_core::{DType, Device, Tensor};
 use libfuzzer_sys::fuzz_target;
 use quad_policy::{
     Affine, Choice, DiffusionPolicy, DiffusionShape, Ensemble, EnsembleShape, GaussianPolicy, GaussianShape, Header,
-    Layout, MlpConfig, NoisePredictor, PolicyConfig, Precision, Rule, Scaling, Weights, load_policy,
+    Layout, MlpConfig, NoisePredictor, PolicyConfig, Precision, Rule, Scaling, SquashedPolicy, SquashedShape, Weights,
+    load_policy,
 };
 
 const STATES: usize = 2;
@@ -40,6 +41,16 @@ fn write_seeds() {
     };
     let (best, nearest) = (diffusion(Rule::Best), diffusion(Rule::Nearest));
     let softmax = diffusion(Rule::Softmax { temperature: 0.5 });
+    let (actor, critic) = (layers.clone(), MlpConfig { norm: true, ..layers.clone() });
+    let shape = SquashedShape { observation_dim: 2, action_dim: 1, actor, critic, critics: 2 };
+    let [actor, critics] = [shape.actor(), shape.critics()].map(|of| {
+        let weights = halves(of.layout());
+        Ensemble::new(of, weights, Precision::F32)
+    });
+    let tensors = SquashedPolicy::tensors(&actor, &critics).unwrap();
+    let choice = Choice { rule: Rule::Softmax { temperature: 0.5 }, ..Choice::best_of(2) };
+    let squashed = Header { policy: PolicyConfig::Squashed { shape, choice }, scaling: None, origin: () };
+    let squashed = squashed.to_safetensors(&tensors).unwrap();
     let shape = GaussianShape { observation_dim: 2, action_dim: 1, actor: layers };
     let actor = Ensemble::new(shape.actor(), halves(shape.actor().layout()), Precision::F32);
     let tensors = GaussianPolicy::tensors(&actor).unwrap();
@@ -47,7 +58,8 @@ fn write_seeds() {
     let scaling = Some(Scaling { observations: None, actions });
     let gaussian = Header { policy: PolicyConfig::Gaussian { shape }, scaling, origin: () };
     let gaussian = gaussian.to_safetensors(&tensors).unwrap();
-    for (name, file) in [("best", best), ("nearest", nearest), ("softmax", softmax), ("gaussian", gaussian)] {
+    let drawn = [("best", best), ("nearest", nearest), ("softmax", softmax), ("squashed", squashed)];
+    for (name, file) in drawn.into_iter().chain([("gaussian", gaussian)]) {
         fs::write(corpus.join(name), file).unwrap();
     }
 }

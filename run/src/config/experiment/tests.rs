@@ -27,7 +27,7 @@ fn what_cannot_be_used_is_named_with_what_can() {
         ("hopper-demo", toml! { algorithm = "td3" }, "no algorithm named td3"),
         ("hopper-demo", toml! { episodes = 0 }, "episodes is 0, but must be from 1 to 10000"),
         ("hopper-demo", toml! { steps = 3_000_000 eval_interval = 2 }, "every 2 are 1500000 evaluations"),
-        ("hopper-demo", toml! { agent.candidates = 1001 }, "1001 is not a whole number from 1 to 1000"),
+        ("hopper-demo", toml! { agent.candidates = 10_001 }, "10001 is not a whole number from 1 to 10000"),
         ("hopper-demo", toml! { algorithm = "iql" agent.candidates = 2 }, "unknown field `candidates`"),
         ("hopper-demo", toml! { algorithm = "iql" agent.tau = 2 }, "unknown field `tau`"),
         ("hoper-demo", toml! { steps = 1 }, "no task named hoper-demo"),
