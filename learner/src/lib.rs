@@ -22,6 +22,7 @@ pub mod command;
 mod data;
 mod evaluation;
 #[cfg(test)]
+#[path = "../../run/src/fixtures.rs"]
 mod fixtures;
 mod live;
 mod local_evaluators;

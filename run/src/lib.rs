@@ -10,7 +10,12 @@
 
 #![deny(unsafe_code)]
 
+#[cfg(test)]
+extern crate self as quad_run;
+
 pub mod config;
+#[cfg(test)]
+mod fixtures;
 pub mod results;
 pub mod run;
 pub mod status;

@@ -1,9 +1,7 @@
-//! A client for `/metrics`, `/healthz` and Prometheus's API; a server of one file.
+//! A client for `/metrics`, `/healthz` and Prometheus's API.
 
-use std::io::{BufRead, BufReader, Read, Write};
-use std::net::{TcpListener, TcpStream};
-use std::sync::Arc;
-use std::sync::atomic::{AtomicUsize, Ordering};
+use std::io::{Read, Write};
+use std::net::TcpStream;
 use std::time::Duration;
 
 /// Fetches `http://<address><path>`: status and body, or nothing without an answer.
@@ -32,41 +30,4 @@ pub fn sum(page: &str, name: &str, label: &str) -> f64 {
         (exact && labels.contains(label)).then(|| value.parse::<f64>().ok())?
     });
     samples.sum()
-}
-
-/// A server of one file, on a port that the system chooses.
-pub struct FileServer {
-    /// Its address, as `http://host:port`.
-    pub url: String,
-    requests: Arc<AtomicUsize>,
-}
-
-impl FileServer {
-    /// Answers a request for `/<name>` with `content`, and every other with 404.
-    pub fn start(name: &str, content: Vec<u8>) -> FileServer {
-        let listener = TcpListener::bind("127.0.0.1:0").expect("there is a free port");
-        let url = format!("http://{}", listener.local_addr().expect("it is bound"));
-        let requests = Arc::new(AtomicUsize::new(0));
-        let (counter, wanted) = (requests.clone(), format!("GET /{name} HTTP/1.1"));
-        std::thread::spawn(move || {
-            for mut stream in listener.incoming().map_while(Result::ok) {
-                counter.fetch_add(1, Ordering::Relaxed);
-                let lines = BufReader::new(&stream).lines().map_while(Result::ok);
-                let request: Vec<_> = lines.take_while(|line| !line.is_empty()).collect();
-                let (status, body) = match request.first() == Some(&wanted) {
-                    true => ("200 OK", content.as_slice()),
-                    false => ("404 Not Found", &[][..]),
-                };
-                let head = format!("HTTP/1.1 {status}\r\nContent-Length: {}\r\nConnection: close\r\n\r\n", body.len());
-                // The client may leave at any time.
-                stream.write_all(head.as_bytes()).and_then(|()| stream.write_all(body)).ok();
-            }
-        });
-        FileServer { url, requests }
-    }
-
-    /// How often it was asked.
-    pub fn requests(&self) -> usize {
-        self.requests.load(Ordering::Relaxed)
-    }
 }

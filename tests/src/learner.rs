@@ -6,11 +6,9 @@ use std::path::{Path, PathBuf};
 use std::process::Command;
 use std::time::Duration;
 
-use quad_protocol::Hash;
 use serde_json::Value;
 
 use crate::process::{Process, binary};
-use crate::setting::Setting;
 use crate::{PATIENCE, eventually, http};
 
 /// A learner and the folder of its run.
@@ -53,9 +51,9 @@ impl Learner {
     }
 
     /// Waits for its end, which must be a success, after which everything must have been scored once.
-    pub fn assert_completes(&mut self, setting: &Setting, patience: Duration) {
+    pub fn assert_completes(&mut self, patience: Duration) {
         self.process.assert_succeeds(patience);
-        self.assert_complete(setting);
+        self.assert_complete();
     }
 
     /// The lines of scores.jsonl so far.
@@ -75,32 +73,26 @@ impl Learner {
         scores
     }
 
-    /// Fails unless every episode of every evaluation has exactly one score, measured with the snapshot on disk.
-    pub fn assert_complete(&self, setting: &Setting) {
-        let scores = self.assert_scores_are_distinct();
-        for step in setting.evaluated_steps() {
-            let of_step: Vec<_> = scores.iter().filter(|score| score.key().0 == step).collect();
-            assert_eq!(of_step.len(), setting.episodes as usize, "scores of step {step}");
-            let tensors = fs::read(self.snapshot(step)).expect("an evaluated snapshot is kept");
-            let hash = Hash::of(&tensors).to_string();
-            for score in of_step {
-                assert_eq!(score.text("weights"), hash, "weights of step {step}");
-            }
-        }
-        assert_eq!(scores.len(), setting.evaluated_steps().len() * setting.episodes as usize, "scores in all");
+    /// Fails unless `learner verify` finds every episode of every evaluation scored once, with the snapshot on disk.
+    pub fn assert_complete(&self) {
+        self.verify(&[]);
+    }
+
+    fn verify(&self, flags: &[&Path]) -> String {
+        let mut verify = Command::new(binary("learner"));
+        let output =
+            verify.arg("verify").arg(&self.run_dir).args(flags).output().expect("the learner was found before");
+        let found = String::from_utf8_lossy(&output.stdout).into_owned();
+        assert!(output.status.success(), "{found}");
+        found
     }
 
     /// Fails unless snapshots, scores and the last checkpoint are those of another run, bit for bit; gives what
     /// `learner verify` says.
     pub fn assert_same_as(&self, other: &Learner) -> String {
-        let mut verify = Command::new(binary("learner"));
-        let output = verify.arg("verify").arg(&self.run_dir).arg("--same-as").arg(&other.run_dir).output();
-        let output = output.expect("the learner was found before");
-        let found = String::from_utf8_lossy(&output.stdout).into_owned();
-        assert!(output.status.success(), "{found}");
         let last = |learner: &Learner| learner.files("checkpoints").pop_last().expect("there is a checkpoint");
         assert!(last(self) == last(other), "the last checkpoints differ");
-        found
+        self.verify(&[Path::new("--same-as"), &other.run_dir])
     }
 
     /// The whole files of a folder in the run's, name by name; none if it is not there.

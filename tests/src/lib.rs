@@ -7,7 +7,7 @@
 //! - [`process`]: start a program, signal it, wait for it, read what it said.
 //! - [`setting`]: how long a run is; [`system`]: a scratch folder with a tiny dataset, and what is started in it; [`learner`]: what a
 //!   learner tells and leaves in its run's folder.
-//! - [`http`]: fetch a page, read a metric, serve a file.
+//! - [`http`]: fetch a page, read a metric.
 //! - [`router`]: a Zenoh router in the test's own process; [`certificates`]: one for each role, and sessions that show them.
 //! - [`made_up`]: messages that tests make up; [`crowd`]: hundreds of evaluators that only talk.
 //! - [`link`]: a connection on which things go wrong.

@@ -4,7 +4,7 @@ use std::time::{Duration, Instant};
 
 use quad_dataset::environment;
 use quad_protocol::{
-    EpisodeScore, Hash, Job, JobReply, JobRequest, Message, Name, Progress, ScoreReport, Snapshot, decode, encode, keys,
+    EpisodeScore, Hash, Job, JobReply, JobRequest, Message, Name, Progress, ScoreReport, decode, encode, keys,
 };
 use quad_runtime::{Endpoints, open_session};
 use tokio::time::sleep;
@@ -51,11 +51,6 @@ pub fn report(run: &Name, step: u64, seed: u64) -> ScoreReport {
         precision: name("f32"),
         episodes: vec![EpisodeScore { seed, episode_return: f64::NAN, length: 0, score: f64::NAN }],
     }
-}
-
-/// A snapshot, whatever is in its file.
-pub fn snapshot(run: &Name, incarnation: u64, step: u64, file: &[u8]) -> Snapshot {
-    Snapshot { run: run.clone(), incarnation, step, hash: Hash::of(file), file: file.to_vec() }
 }
 
 /// Scores of all episodes of a job, as if a policy had run them.

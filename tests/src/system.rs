@@ -6,13 +6,16 @@ use std::path::{Path, PathBuf};
 use std::process::Command;
 use std::sync::LazyLock;
 
-use quad_dataset::{D4rlWriter, Metadata, Row, environment};
 use tempfile::TempDir;
 
 use crate::PATIENCE;
 use crate::learner::Learner;
 use crate::process::{Process, binary};
 use crate::setting::Setting;
+
+#[path = "../fixtures/hopper.rs"]
+mod hopper;
+use hopper::write_hopper;
 
 /// A folder that goes when the test is over.
 pub struct Scratch {
@@ -131,31 +134,6 @@ pub fn free_endpoint() -> String {
 /// Made once, and copied: a program that another test starts meanwhile would keep HDF5's lock of the file that is being written.
 static DATASET: LazyLock<Vec<u8>> = LazyLock::new(|| {
     let file = tempfile::NamedTempFile::new().expect("there is room for a dataset");
-    write_dataset(file.path());
+    write_hopper(file.path(), 10, 300);
     fs::read(file.path()).expect("it was written")
 });
-
-/// Ten episodes of three hundred steps: smooth, bounded, of different returns, and far from any physics.
-fn write_dataset(path: &Path) {
-    let spec = environment::find("hopper").expect("hopper is known");
-    let mut writer = D4rlWriter::create(path, spec).expect("the scratch folder is writable");
-    let [qpos, qvel] = [vec![0.0; spec.qpos_dim], vec![0.0; spec.qvel_dim]];
-    for (episode, step) in (0..10).flat_map(|episode| (0..300).map(move |step| (episode, step))) {
-        let wave = |at: usize, i: usize| ((episode * 7 + at + 3 * i) as f64 * 0.1).sin();
-        let [now, next] = [step, step + 1].map(|at| Vec::from_iter((0..spec.observation_dim).map(|i| wave(at, i))));
-        let action = Vec::from_iter((0..spec.action_dim).map(|i| 0.9 * ((episode + 2 * step + i) as f64).cos()));
-        let row = Row {
-            observation: &now,
-            action: &action,
-            next_observation: &next,
-            reward: 1.0 + 0.1 * episode as f64 + action[0],
-            terminal: false,
-            timeout: step == 299,
-            qpos: &qpos,
-            qvel: &qvel,
-        };
-        writer.push(&row).expect("the row has the environment's sizes");
-    }
-    let metadata = Metadata { algorithm: "made up", iteration: 0, seed: 0 };
-    writer.finish(&metadata).expect("the scratch folder is writable");
-}

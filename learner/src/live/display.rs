@@ -12,8 +12,6 @@ use super::metrics::Metrics;
 const REDRAW: Duration = Duration::from_millis(250);
 /// How often a log gets a line.
 const LINE: Duration = Duration::from_secs(5);
-/// Window over which the rate is measured.
-const RATE_WINDOW: Duration = Duration::from_secs(15);
 /// How long training runs before the forecast of its duration.
 const ESTIMATE: Duration = Duration::from_secs(3);
 /// How many of the newest evaluations are shown.
@@ -23,9 +21,11 @@ const SCORES_SHOWN: usize = 3;
 pub(crate) struct Display {
     metrics: Metrics,
     steps: u64,
-    /// `None` if stderr is no terminal, or one that cannot draw (`TERM=dumb`).
-    bar: Option<ProgressBar>,
-    samples: VecDeque<(Instant, u64)>,
+    /// Hidden if stderr is no terminal, or one that cannot draw (`TERM=dumb`). Measures the rate all the same.
+    bar: ProgressBar,
+    begin: Instant,
+    /// Gradient steps that were done before.
+    first: u64,
     /// Newest last: gradient step and mean score.
     scores: VecDeque<(u64, f64)>,
     last_line: Instant,
@@ -41,15 +41,11 @@ impl Display {
         if let Ok(style) = ProgressStyle::with_template("{bar:40} {pos}/{len} gradient steps\n{msg}") {
             bar.set_style(style);
         }
-        Self {
-            metrics,
-            steps,
-            bar: Some(bar).filter(|bar| !bar.is_hidden()),
-            samples: VecDeque::new(),
-            scores: VecDeque::new(),
-            last_line: Instant::now(),
-            estimated: false,
-        }
+        let (first, now) = (metrics.training.gradient_steps.get(), Instant::now());
+        bar.set_position(first);
+        bar.reset_eta();
+        let scores = VecDeque::new();
+        Self { metrics, steps, bar, begin: now, first, scores, last_line: now, estimated: false }
     }
 
     /// How often [`tick`](Self::tick) wants to be called.
@@ -59,10 +55,7 @@ impl Display {
 
     /// Prints an event as a line.
     pub fn say(&self, text: &str) {
-        match &self.bar {
-            Some(bar) => bar.println(text),
-            None => info!("{text}"),
-        }
+        if self.bar.is_hidden() { info!("{text}") } else { self.bar.println(text) }
     }
 
     /// Adds the result of an evaluation.
@@ -76,57 +69,42 @@ impl Display {
     /// Updates the figures.
     pub fn tick(&mut self, now: Instant) {
         let step = self.metrics.training.gradient_steps.get();
-        let training = step < self.steps;
-        self.samples.push_back((now, step));
-        while self.samples.front().is_some_and(|(then, _)| now.duration_since(*then) > RATE_WINDOW) {
-            self.samples.pop_front();
-        }
+        self.bar.set_position(step);
         self.estimate(step, now);
-        match &self.bar {
-            Some(bar) => {
-                bar.set_position(step);
-                bar.set_message(format!("{}\n{}", self.training_figures(step), self.evaluation_figures()));
-            }
-            None if training && now.duration_since(self.last_line) >= LINE => {
-                self.last_line = now;
-                let percent = 100.0 * step as f64 / self.steps as f64;
-                let (training, evaluation) = (self.training_figures(step), self.evaluation_figures());
-                info!("step {step}/{} ({percent:.0} %), {training}, {evaluation}", self.steps);
-            }
-            None => {}
+        let (training, evaluation) = (self.training_figures(step), self.evaluation_figures());
+        if !self.bar.is_hidden() {
+            self.bar.set_message(format!("{training}\n{evaluation}"));
+        } else if step < self.steps && now.duration_since(self.last_line) >= LINE {
+            self.last_line = now;
+            let percent = 100.0 * step as f64 / self.steps as f64;
+            info!("step {step}/{} ({percent:.0} %), {training}, {evaluation}", self.steps);
         }
     }
 
     /// Prints once how long training will take, if that is more than a minute: the user may have meant fewer steps.
     fn estimate(&mut self, step: u64, now: Instant) {
-        let Some(&(begin, first)) = self.samples.front() else { return };
-        let rate = self.rate();
-        if self.estimated || now.duration_since(begin) < ESTIMATE || step == first || rate <= 0.0 {
+        if self.estimated || now.duration_since(self.begin) < ESTIMATE || step == self.first {
             return;
         }
         self.estimated = true;
-        let left = Duration::from_secs_f64((self.steps - step.min(self.steps)) as f64 / rate);
+        let left = self.bar.eta();
         if left > Duration::from_secs(60) {
-            self.say(&format!("{rate:.1} steps/s: this takes about {}", HumanDuration(left)));
+            self.say(&format!("{:.1} steps/s: this takes about {}", self.bar.per_sec(), HumanDuration(left)));
         }
     }
 
     /// Removes the bar.
-    pub fn finish(&mut self) {
-        if let Some(bar) = self.bar.take() {
-            bar.finish_and_clear();
-        }
+    pub fn finish(&self) {
+        self.bar.finish_and_clear();
     }
 
     fn training_figures(&self, step: u64) -> String {
         let training = &self.metrics.training;
         let mut parts = Vec::new();
         if step < self.steps {
-            let rate = self.rate();
-            parts.push(format!("{rate:.1} steps/s"));
-            if rate > 0.0 {
-                let left = Duration::from_secs_f64((self.steps - step) as f64 / rate);
-                parts.push(format!("{} left", HumanDuration(left)));
+            parts.push(format!("{:.1} steps/s", self.bar.per_sec()));
+            if step > self.first {
+                parts.push(format!("{} left", HumanDuration(self.bar.eta())));
             }
         }
         let shown = training.algorithm.iter().filter(|(metric, _)| !metric.label.is_empty());
@@ -145,12 +123,6 @@ impl Display {
             parts.push(format!("scores {}", scores.join(", ")));
         }
         parts.join(", ")
-    }
-
-    fn rate(&self) -> f64 {
-        let (Some((start, first)), Some((end, last))) = (self.samples.front(), self.samples.back()) else { return 0.0 };
-        let seconds = end.duration_since(*start).as_secs_f64();
-        if seconds > 0.0 { (last - first) as f64 / seconds } else { 0.0 }
     }
 }
 

@@ -35,6 +35,3 @@ fn gpu() -> anyhow::Result<candle_core::Device> {
     };
     candle_core::Device::new_cuda(0).context("this learner cannot train on a GPU here").hint(hint)
 }
-
-#[cfg(test)]
-mod tests;

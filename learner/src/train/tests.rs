@@ -6,7 +6,7 @@ use std::time::Duration;
 
 use candle_core::Device;
 use quad_algorithms::{Agent, Algorithm, Context, Definition, Measured, Parts, Reporting};
-use quad_dataset::{BatchSampler, D4rlWriter, Metadata, ReadOptions, RewardRule, Row, Scale, Transitions, environment};
+use quad_dataset::{BatchSampler, ReadOptions, RewardRule, Scale, Transitions, environment};
 use quad_policy::{PolicyConfig, Precision, Tensors};
 use quad_protocol::Origin;
 use quad_run::config::hyperparameters::algorithm as definition;
@@ -19,6 +19,10 @@ use super::price::mean_step;
 use super::results::{self, Outcome};
 use super::steps::{Outlets, Plan, TrainError, train};
 use super::{Registrar, TrainingMetrics};
+
+#[path = "../../../tests/fixtures/hopper.rs"]
+mod hopper;
+use hopper::write_hopper;
 
 /// What a run has handed over.
 struct Result {
@@ -38,22 +42,7 @@ fn transitions() -> Transitions {
     let folder = tempfile::tempdir().unwrap();
     let path = folder.path().join("tiny.hdf5");
     let hopper = environment::find("hopper").unwrap();
-    let mut writer = D4rlWriter::create(&path, hopper).unwrap();
-    for step in 0..100 {
-        let observation = |step: usize| Vec::from_iter((0..11).map(|i| ((step + 3 * i) as f64 * 0.1).sin()));
-        let row = Row {
-            observation: &observation(step),
-            action: &[0.1, -0.2, 0.3],
-            next_observation: &observation(step + 1),
-            reward: if step < 50 { 1.0 } else { 2.0 },
-            terminal: false,
-            timeout: step % 50 == 49,
-            qpos: &[0.0; 6],
-            qvel: &[0.0; 6],
-        };
-        writer.push(&row).unwrap();
-    }
-    writer.finish(&Metadata { algorithm: "made up", iteration: 0, seed: 0 }).unwrap();
+    write_hopper(&path, 2, 50);
     Transitions::read(
         &path,
         &ReadOptions { environment: Some(hopper), reward: RewardRule::Locomotion, scale: Scale::default() },

@@ -1,9 +1,8 @@
 //! A run that plans more than any memory holds: it is to go on until its user stops it.
 
-use std::process::Command;
-
 use serde_json::{Value, json};
 
+use crate::bounded;
 use crate::run::Run;
 
 #[test]
@@ -18,10 +17,8 @@ fn looking_at_it_costs_no_more_than_looking_at_what_it_has() {
     (0..1000).for_each(|seed| run.score(1, seed, 5.0, "00"));
     run.write(folder.path());
     let look = |arguments: &[&str]| {
-        // Of memory, a thousandth of what a list of the evaluations would take.
-        let mut command = Command::new("sh");
-        command.args(["-c", "ulimit -v 8000000; exec \"$0\" \"$@\"", env!("CARGO_BIN_EXE_learner")]).args(arguments);
-        String::from_utf8(command.arg(folder.path()).output().unwrap().stdout).unwrap()
+        let output = bounded(&[arguments, &[folder.path().to_str().unwrap()]].concat());
+        String::from_utf8(output.stdout).unwrap()
     };
     let report: Value = serde_json::from_str(&look(&["report", "--json"])).unwrap();
     assert_eq!(report["runs"][0]["episodes_missing"], json!(999_999_999_999_999_000i64));

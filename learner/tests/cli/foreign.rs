@@ -5,7 +5,7 @@ use std::os::unix::fs::symlink;
 use std::process::Command;
 
 use crate::run::Run;
-use crate::{learner, printed};
+use crate::{bounded, learner, printed};
 
 #[test]
 fn a_report_takes_in_films_and_nothing_else() {
@@ -69,16 +69,7 @@ fn what_is_no_file_holds_up_nobody_who_looks_at_the_run() {
                 false => symlink("/dev/zero", run.join(name)).unwrap(),
             }
             for command in ["list", "report"] {
-                let mut look = Command::new("timeout");
-                look.args([
-                    "60",
-                    "sh",
-                    "-c",
-                    "ulimit -v 8000000; exec \"$0\" \"$@\"",
-                    env!("CARGO_BIN_EXE_learner"),
-                    command,
-                ]);
-                let output = look.arg(&run).output().unwrap();
+                let output = bounded(&[command, run.to_str().unwrap()]);
                 assert!(output.status.code().is_some_and(|code| code < 2), "{command} {name}: {output:?}");
             }
         }

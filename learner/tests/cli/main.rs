@@ -5,6 +5,8 @@ mod damaged;
 mod dry_run;
 mod endless;
 mod foreign;
+#[path = "../../../tests/fixtures/hopper.rs"]
+mod hopper;
 mod list;
 mod online;
 mod presets;
@@ -17,10 +19,14 @@ mod verify;
 use std::path::Path;
 use std::process::{Command, Output};
 
-use quad_dataset::{D4rlWriter, Metadata, Row, environment};
-
 fn learner(arguments: &[&str]) -> Output {
     Command::new(env!("CARGO_BIN_EXE_learner")).args(arguments).output().unwrap()
+}
+
+/// As `learner`, with a minute, and of memory a thousandth of what a list of a trillion evaluations would take.
+fn bounded(arguments: &[&str]) -> Output {
+    let script = "ulimit -v 8000000; exec timeout 60 \"$0\" \"$@\"";
+    Command::new("sh").args(["-c", script, env!("CARGO_BIN_EXE_learner")]).args(arguments).output().unwrap()
 }
 
 /// What a command prints that must succeed.
@@ -32,20 +38,5 @@ fn printed(arguments: &[&str]) -> String {
 
 /// A small file of Hopper.
 fn write_dataset(path: &Path) {
-    let mut writer = D4rlWriter::create(path, environment::find("hopper").unwrap()).unwrap();
-    for step in 0..100 {
-        let observation = |step: usize| [(step as f64 * 0.1).sin(); 11];
-        let row = Row {
-            observation: &observation(step),
-            action: &[0.1, -0.2, 0.3],
-            next_observation: &observation(step + 1),
-            reward: if step < 50 { 1.0 } else { 2.0 },
-            terminal: false,
-            timeout: step % 50 == 49,
-            qpos: &[0.0; 6],
-            qvel: &[0.0; 6],
-        };
-        writer.push(&row).unwrap();
-    }
-    writer.finish(&Metadata { algorithm: "made up", iteration: 0, seed: 0 }).unwrap();
+    hopper::write_hopper(path, 2, 50);
 }

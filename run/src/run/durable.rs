@@ -1,19 +1,18 @@
 //! Files that are whole whatever happens: the old contents or the new ones, also after a power cut.
 
-use std::ffi::OsString;
 use std::fs::{self, File};
 use std::io::{self, Write};
-use std::path::{Path, PathBuf};
+use std::path::Path;
 
 use super::error::{RunDirError, io_error};
 
 /// Ending of a file that is being written.
-const PARTIAL: &str = ".partial";
+const PARTIAL: &str = "partial";
 
 /// Replaces the file `target`: written beside it, synchronised, renamed, and the folder synchronised, without which a power
 /// cut could undo the renaming.
 pub(super) fn replace(target: &Path, bytes: &[u8]) -> Result<(), RunDirError> {
-    let partial = partial(target);
+    let partial = target.with_added_extension(PARTIAL);
     write_synchronised(&partial, bytes)
         .and_then(|()| fs::rename(&partial, target))
         .and_then(|()| synchronise_folder(target))
@@ -22,12 +21,6 @@ pub(super) fn replace(target: &Path, bytes: &[u8]) -> Result<(), RunDirError> {
             fs::remove_file(&partial).ok();
         })
         .map_err(io_error("write", target))
-}
-
-fn partial(target: &Path) -> PathBuf {
-    let mut name = OsString::from(target.file_name().unwrap_or_default());
-    name.push(PARTIAL);
-    target.with_file_name(name)
 }
 
 /// Opens a file for reading. In a folder that another user made, a pipe or a device in its place would have no end.
@@ -40,7 +33,7 @@ pub(crate) fn open_file(path: &Path) -> io::Result<File> {
 pub(super) fn remove_partial_files(folder: &Path) {
     let Ok(entries) = fs::read_dir(folder) else { return };
     for entry in entries.flatten() {
-        let is_partial = entry.file_name().to_string_lossy().ends_with(PARTIAL);
+        let is_partial = entry.path().extension().is_some_and(|ending| ending == PARTIAL);
         if is_partial && entry.file_type().is_ok_and(|kind| kind.is_file() || kind.is_symlink()) {
             fs::remove_file(entry.path()).ok();
         }

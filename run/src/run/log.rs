@@ -35,9 +35,9 @@ impl Log {
         // No link: in a folder that another user made, it may lead to any file of its reader's, which would be cut.
         let no_link = OFlags::NOFOLLOW.bits() as i32;
         let opened = OpenOptions::new().create(true).read(true).append(true).custom_flags(no_link).open(&path);
-        let mut file = opened.map_err(io_error("open", &path))?;
-        let whole = whole_lines(&mut file).map_err(io_error("read", &path))?;
-        let mut log = Self { path, file, length: whole, torn: true, lock };
+        let file = opened.map_err(io_error("open", &path))?;
+        let mut log = Self { path, file, length: 0, torn: true, lock };
+        log.length = whole_lines(&log.bytes()?) as u64;
         // Lines that a killed process did not synchronise count from now on.
         let durable = log.mend().and_then(|()| log.synchronise()).and_then(|()| synchronise_folder(&log.path));
         durable.map_err(io_error("open", &log.path))?;
@@ -98,7 +98,6 @@ impl Log {
         self.mend().map_err(io_error("write", &self.path))
     }
 
-    /// The whole lines.
     fn bytes(&mut self) -> Result<Vec<u8>, RunDirError> {
         let mut bytes = Vec::new();
         let read = self.file.seek(SeekFrom::Start(0)).and_then(|_| self.file.read_to_end(&mut bytes));
@@ -120,25 +119,12 @@ pub fn new_lines(path: &Path, read: &mut u64) -> io::Result<Vec<u8>> {
     let mut lines = Vec::new();
     file.seek(SeekFrom::Start(*read))?;
     file.read_to_end(&mut lines)?;
-    lines.truncate(lines.iter().rposition(|&byte| byte == b'\n').map_or(0, |last| last + 1));
+    lines.truncate(whole_lines(&lines));
     *read += lines.len() as u64;
     Ok(lines)
 }
 
-/// Length of the whole lines of a file, bytes.
-fn whole_lines(file: &mut File) -> io::Result<u64> {
-    const BLOCK: u64 = 1 << 16;
-    let mut end = file.metadata()?.len();
-    let mut block = Vec::new();
-    while end > 0 {
-        let start = end.saturating_sub(BLOCK);
-        file.seek(SeekFrom::Start(start))?;
-        block.clear();
-        Read::take(&mut *file, end - start).read_to_end(&mut block)?;
-        if let Some(last) = block.iter().rposition(|&byte| byte == b'\n') {
-            return Ok(start + last as u64 + 1);
-        }
-        end = start;
-    }
-    Ok(0)
+/// Length of the whole lines, bytes.
+fn whole_lines(text: &[u8]) -> usize {
+    text.iter().rposition(|&byte| byte == b'\n').map_or(0, |last| last + 1)
 }

@@ -43,7 +43,7 @@ fn endure(faults: &[Fault], count: u64) {
     }
     let patience = 2 * PATIENCE + begin.elapsed();
     eventually("the run is over", patience, || system.is_over().then_some(()));
-    system.learner.assert_complete(&setting);
+    system.learner.assert_complete();
     calm.process.assert_succeeds(patience);
     let found = system.learner.assert_same_as(&calm);
     eprintln!("{injected} faults in {:.0?}: {:?}\n{found}", begin.elapsed(), system.faults);

@@ -61,7 +61,7 @@ async fn a_full_disk_delays_snapshots_scores_and_checkpoints_until_there_is_room
 
     disk.clear();
     learner.process.wait_for_log("the run can be saved again", PATIENCE);
-    learner.assert_completes(&setting, PATIENCE);
+    learner.assert_completes(PATIENCE);
     let published = published.lock().unwrap();
     assert!(published.len() > 2 && published.iter().all(|(_, kept)| *kept), "published before written: {published:?}");
 }
@@ -83,7 +83,7 @@ fn scores_wait_for_a_disk_that_is_full_and_that_is_told() {
 
     disk.clear();
     learner.process.wait_for_log("scores can be saved again", PATIENCE);
-    learner.assert_completes(&setting, PATIENCE);
+    learner.assert_completes(PATIENCE);
     let measured = http::sum(&http::metrics(&evaluator.metrics()).unwrap(), "quad_evaluator_episodes_total", "");
     assert_eq!(measured, 8.0, "nothing is measured twice");
 }

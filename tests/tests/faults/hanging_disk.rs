@@ -64,7 +64,7 @@ fn a_disk_that_hangs_holds_up_neither_training_nor_the_end() {
     fs::remove_file(pipe(&learner, next)).unwrap();
     let mut learner = scratch.learner_with("run", SETTING, &LISTEN);
     let _evaluator = scratch.evaluator("one", &learner.endpoint());
-    learner.assert_completes(&SETTING, PATIENCE);
+    learner.assert_completes(PATIENCE);
 }
 
 #[tokio::test(flavor = "multi_thread")]

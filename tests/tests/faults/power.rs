@@ -102,10 +102,10 @@ impl System {
     /// Lets the run end, and compares it with one that nothing happened to.
     fn finish(self) {
         let mut learner = self.learner();
-        learner.assert_completes(&self.setting, 3 * PATIENCE);
+        learner.assert_completes(3 * PATIENCE);
         let mut calm = self.scratch.learner("calm", self.setting);
         let _crowd = self.runtime.block_on(Crowd::connect(2, EPISODE, &name("calm"), &calm.endpoint()));
-        calm.assert_completes(&self.setting, 3 * PATIENCE);
+        calm.assert_completes(3 * PATIENCE);
         learner.assert_same_as(&calm);
         // A run that is complete is so at once.
         let mut again = self.learner();

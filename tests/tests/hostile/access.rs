@@ -24,7 +24,7 @@ async fn a_run_completes_through_the_shipped_router() {
     let _evaluator = scratch.evaluator_with("trusted", &arguments.each_ref().map(String::as_str));
     let arguments = connect("learner");
     let mut learner = scratch.learner_with("run", SHORT, &arguments.each_ref().map(String::as_str));
-    learner.assert_completes(&SHORT, PATIENCE);
+    learner.assert_completes(PATIENCE);
 }
 
 #[tokio::test(flavor = "multi_thread")]

@@ -1,13 +1,14 @@
 //! Datasets by name, as they are seen on a command line. How a file is fetched is tested beside the code that does it.
 
 use std::fs;
+use std::net::TcpStream;
 use std::path::Path;
 use std::process::{Command, Output};
 
-use quad_tests::http::FileServer;
-use quad_tests::process::binary;
+use quad_tests::process::{Process, binary};
 use quad_tests::setting::SHORT;
-use quad_tests::system::Scratch;
+use quad_tests::system::{Scratch, free_port};
+use quad_tests::{PATIENCE, eventually, peers};
 
 /// Runs a learner whose cache folder is `cache`. Nothing but this machine can be reached: port 9, which is closed,
 /// is the proxy for everything else.
@@ -33,16 +34,23 @@ fn failure(output: &Output) -> String {
 fn a_run_by_name_fetches_its_dataset_once_and_records_its_checksum() {
     let scratch = Scratch::new();
     let cache = scratch.path().join("cache");
+    let Some(python) = peers::python(&["http.server"]) else { return };
     // A dataset of whose file only the name is known, so that any HDF5 file will do.
-    let content = fs::read(scratch.dataset()).unwrap();
-    let server = FileServer::start("hopper_random-v2.hdf5", content);
+    let (folder, port) = (scratch.path().join("mirror"), free_port());
+    fs::create_dir(&folder).unwrap();
+    fs::copy(scratch.dataset(), folder.join("hopper_random-v2.hdf5")).unwrap();
+    let mut serve = Command::new(python);
+    serve.args(["-m", "http.server", "--bind", "127.0.0.1", &port.to_string()]).current_dir(folder);
+    let server = Process::start("mirror", scratch.path(), serve);
+    eventually("the mirror listens", PATIENCE, || TcpStream::connect(("127.0.0.1", port)).ok());
+    let (url, requests) = (format!("http://127.0.0.1:{port}"), || server.log().matches("GET /").count());
     let preset = scratch.preset("tiny", SHORT);
     let file = cache.join("hopper_random-v2.hdf5");
     for run in ["first", "second"] {
         let run_dir = scratch.path().join(run);
         let paths = ["--preset", preset.to_str().unwrap(), "--run-dir", run_dir.to_str().unwrap()];
         let rest = ["--dataset", "hopper-random-v2", "--eval-interval", "0"];
-        let output = learner(&cache, &server.url, &[&["train"], &paths[..], &rest].concat());
+        let output = learner(&cache, &url, &[&["train"], &paths[..], &rest].concat());
         assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
         let config = fs::read_to_string(run_dir.join("config.toml")).unwrap();
         let sha256 = stdout(&Command::new("sha256sum").arg(&file).output().unwrap());
@@ -53,11 +61,11 @@ fn a_run_by_name_fetches_its_dataset_once_and_records_its_checksum() {
         ] {
             assert!(config.lines().any(|found| found == line), "no {line} in:\n{config}");
         }
-        assert_eq!(server.requests(), 1, "the second run finds it in the cache");
+        assert_eq!(requests(), 1, "the second run finds it in the cache");
     }
-    let fetched = learner(&cache, &server.url, &["datasets", "fetch", "hopper-random-v2"]);
+    let fetched = learner(&cache, &url, &["datasets", "fetch", "hopper-random-v2"]);
     assert_eq!(stdout(&fetched).trim_end(), file.to_str().unwrap());
-    assert_eq!(server.requests(), 1);
+    assert_eq!(requests(), 1);
 }
 
 #[test]
@@ -96,9 +104,9 @@ fn the_list_says_what_there_is_and_what_is_here() {
 #[test]
 fn what_makes_no_sense_is_refused_before_anything_is_fetched() {
     let folder = tempfile::tempdir().unwrap();
-    let server = FileServer::start("", Vec::new());
-    let train = |task, dataset| learner(folder.path(), &server.url, &["train", "--task", task, "--dataset", dataset]);
-    let fetch = |cache: &Path, dataset| learner(cache, &server.url, &["datasets", "fetch", dataset]);
+    let nowhere = "http://127.0.0.1:9";
+    let train = |task, dataset| learner(folder.path(), nowhere, &["train", "--task", task, "--dataset", dataset]);
+    let fetch = |cache: &Path, dataset| learner(cache, nowhere, &["datasets", "fetch", dataset]);
     for (output, words) in [
         (train("hopper-demo", "hopper-medium-reply-v2"), "hopper-medium-replay-v2"),
         (train("hopper-demo", "walker2d-medium-v2"), "is a dataset of walker2d, but the policy is for hopper"),
@@ -110,5 +118,4 @@ fn what_makes_no_sense_is_refused_before_anything_is_fetched() {
         let text = failure(&output);
         assert!(text.contains(words), "{text}");
     }
-    assert_eq!(server.requests(), 0);
 }

@@ -58,18 +58,6 @@ fn a_robot_that_we_do_not_know_is_learnt_from() {
 }
 
 #[test]
-fn nothing_good_comes_of_rewards_that_are_all_alike() {
-    let folder = tempfile::tempdir().unwrap();
-    let (dataset, run_dir) = (folder.path().join("robot.hdf5"), folder.path().join("robot"));
-    write_log(&dataset, 1.0);
-    let rewards = hdf5::File::open_rw(&dataset).unwrap().dataset("rewards").unwrap();
-    rewards.write(&Array1::<i64>::zeros(1000)).unwrap();
-    drop(rewards);
-    let warned = said(&train(&dataset, &run_dir, &[]), 0);
-    assert!(warned.contains("WARN") && warned.contains("nothing distinguishes good from bad"), "{warned}");
-}
-
-#[test]
 fn a_robot_whose_actions_are_large_is_learnt_from_in_its_own_units() {
     let folder = tempfile::tempdir().unwrap();
     let (dataset, run_dir) = (folder.path().join("robot.hdf5"), folder.path().join("robot"));

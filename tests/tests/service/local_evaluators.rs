@@ -37,12 +37,12 @@ fn at_work(learner: &Learner) -> Vec<u32> {
 }
 
 #[test]
-fn one_command_trains_and_evaluates() {
+fn one_command_trains_and_evaluates_also_beside_another_without_being_told_ports() {
     let scratch = Scratch::new();
     let mut by_default = scratch.learner_with("default", SHORT, &[]);
-    by_default.assert_completes(&SHORT, PATIENCE);
-    let mut learner = learner(&scratch, SHORT);
-    learner.assert_completes(&SHORT, PATIENCE);
+    let mut learner = scratch.learner_with("run", SHORT, &["--evaluators", "2"]);
+    by_default.assert_completes(PATIENCE);
+    learner.assert_completes(PATIENCE);
     for number in [1, 2] {
         let log = fs::read_to_string(learner.run_dir.join(format!("evaluator-{number}.log"))).unwrap();
         assert!(log.contains("ready to serve") && log.contains("leaving"), "{log}");
@@ -88,7 +88,7 @@ async fn those_of_two_learners_at_one_router_have_names_of_their_own() {
     let _router = router(&endpoint).await;
     let start = |run| scratch.learner_with(run, SHORT, &["--connect", &endpoint, "--evaluators", "1"]);
     for mut learner in ["one", "two"].map(start) {
-        learner.assert_completes(&SHORT, PATIENCE);
+        learner.assert_completes(PATIENCE);
         assert!(!learner.process.log().contains("asks for a job while it has one"), "{}", learner.process.log());
     }
     let names = ["one", "two"].map(|run| {
@@ -106,15 +106,5 @@ fn certificates_that_only_the_environment_names_are_for_other_networks() {
         let launcher = ["env".to_owned(), format!("QUAD_CERTIFICATES={folder}")];
         let learner = scratch.learner_through(&launcher, "run", ENDLESS, &flags);
         learner.process.wait_for_log("run run is at tcp/", PATIENCE);
-    }
-}
-
-#[test]
-fn two_learners_share_a_machine_without_being_told_ports() {
-    let scratch = Scratch::new();
-    let start = |run| scratch.learner_with(run, SHORT, &["--evaluators", "1"]);
-    let mut learners = [start("one"), start("two")];
-    for learner in &mut learners {
-        learner.assert_completes(&SHORT, PATIENCE);
     }
 }

@@ -50,7 +50,7 @@ fn a_browser_compares_finished_runs() {
     let scratch = Scratch::new();
     for name in ["one", "other"] {
         let flags = ["--listen", "tcp/127.0.0.1:0", "--evaluators", "1"];
-        scratch.learner_with(&format!("runs/{name}"), SHORT, &flags).assert_completes(&SHORT, PATIENCE);
+        scratch.learner_with(&format!("runs/{name}"), SHORT, &flags).assert_completes(PATIENCE);
     }
     // What a folder is called is text.
     let runs = scratch.path().join("runs");

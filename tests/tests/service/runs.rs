@@ -38,7 +38,7 @@ fn one_evaluator_serves_two_learners_that_listen_themselves() {
     let [one, two] = learners.each_ref().map(|learner| learner.endpoint());
     let _evaluator = scratch.evaluator_with("shared", &["--connect", &one, "--connect", &two]);
     for learner in &mut learners {
-        learner.assert_completes(&SHORT, PATIENCE);
+        learner.assert_completes(PATIENCE);
     }
 }
 
@@ -52,7 +52,7 @@ fn an_evaluator_waits_for_its_learner_and_serves_the_next_one() {
     first.wait_for_scores(0);
     first.process.kill();
     let mut second = scratch.learner_with("second", SHORT, &["--listen", &endpoint]);
-    second.assert_completes(&SHORT, PATIENCE);
+    second.assert_completes(PATIENCE);
 }
 
 #[tokio::test(flavor = "multi_thread")]
@@ -73,7 +73,7 @@ async fn scores_measured_while_cut_off_are_delivered_to_the_learners_next_life()
 
     let _session = router(&endpoint).await;
     let mut second = scratch.learner_with("run", setting, &["--connect", &endpoint]);
-    second.assert_completes(&setting, PATIENCE);
+    second.assert_completes(PATIENCE);
     let page = http::metrics(&evaluator.metrics()).unwrap();
     let measured = http::sum(&page, "quad_evaluator_episodes_total", "");
     assert_eq!(measured, f64::from(setting.episodes), "nothing was measured twice");

@@ -18,16 +18,3 @@ fn only_this_machine_sees_the_metrics_unless_told_otherwise() {
     let Command::Train(train) = parse(&[]).unwrap().command else { panic!("not train") };
     assert!(train.http.ip().is_loopback(), "{}", train.http);
 }
-
-#[test]
-fn what_is_scaled_is_a_list_of_known_names() {
-    let changes = |flags: &[&str]| match parse(flags).unwrap().command {
-        Command::Train(train) => train.changes(),
-        _ => panic!("not train"),
-    };
-    let expected = toml::toml! { dataset = "d.hdf5" scale = ["states", "actions"] };
-    assert_eq!(changes(&["--scale", "states,actions"]), expected);
-    assert_eq!(changes(&["--scale", "states", "--scale", "actions"]), expected);
-    let error = parse(&["--scale", "states,rewards"]).unwrap_err().to_string();
-    assert!(error.contains("invalid value 'rewards'") && error.contains("actions,states"), "{error}");
-}

@@ -1,4 +1,4 @@
-//! What tests of several modules write into run folders.
+//! What tests write into run folders; the learner's have them, too.
 
 use quad_run::config::{RunConfig, resolve};
 use quad_run::run::ScoreLine;
