@@ -4,7 +4,9 @@ use std::net::SocketAddr;
 use std::path::PathBuf;
 
 use clap::{Args, value_parser};
+use quad_run::config::tables::parse_assignment;
 use quad_runtime::parse_endpoint;
+use toml::Table;
 
 pub(super) const EXAMPLES: &str = "\
 Examples:
@@ -13,6 +15,12 @@ Examples:
 
   # List the runs and their states.
   learner sweep studies/demo.toml --list
+
+  # The runs of one task and seed: what one machine trains overnight.
+  learner sweep studies/table1.toml --only task=hopper-medium-v2 --only seed=0
+
+  # All runs, but short ones, into a folder of their own.
+  learner sweep studies/table1.toml short --set steps=200 --set eval_interval=100
 
   # A third of the runs, on each of three machines.
   learner sweep studies/demo.toml --shard 1/3
@@ -37,6 +45,12 @@ pub struct SweepArgs {
     /// Print number, name and state of each run, and start none
     #[arg(long)]
     pub list: bool,
+    /// Train only runs with this value of an axis: task=hopper-*, seed=0; repeatable: one of an axis's values, and for all axes
+    #[arg(long, value_name = "AXIS=VALUE", value_parser = parse_assignment)]
+    pub only: Vec<Table>,
+    /// Change a key in all runs: steps=200; repeatable. Runs of other settings need another DIR
+    #[arg(long, value_name = "KEY=VALUE", value_parser = parse_assignment)]
+    pub set: Vec<Table>,
     /// Train only the run with this number, as --list prints it
     #[arg(long, value_name = "N", conflicts_with = "shard")]
     pub index: Option<usize>,
@@ -68,9 +82,9 @@ pub struct Shard {
 }
 
 impl Shard {
-    /// Whether this part includes the run of this number.
-    pub fn has(self, index: usize) -> bool {
-        index % self.parts == self.part
+    /// Whether this part includes the run at this place among all, from 0.
+    pub fn has(self, place: usize) -> bool {
+        place % self.parts == self.part
     }
 }
 

@@ -24,7 +24,7 @@ type Runs = Vec<(PlannedRun, State)>;
 
 /// Runs the sweep; a run that is not complete is an error.
 pub fn sweep(args: &SweepArgs) -> anyhow::Result<()> {
-    let study = Study::read(&args.study)?;
+    let study = Study::read(&args.study, &args.only, &args.set)?;
     let folder = args.runs.join(&study.name);
     let runs = chosen(&study, args, &folder)?;
     if args.list {
@@ -48,7 +48,7 @@ pub fn sweep(args: &SweepArgs) -> anyhow::Result<()> {
 fn lock(args: &SweepArgs, folder: &Path) -> anyhow::Result<Lock> {
     fs::create_dir_all(folder).with_context(|| format!("cannot make the folder {}", folder.display()))?;
     let path = folder.join("sweep.lock");
-    let is_part = args.index.is_some() || args.shard.is_some();
+    let is_part = args.index.is_some() || args.shard.is_some() || !args.only.is_empty();
     let lock = if is_part { Lock::share(&path) } else { Lock::take(&path) };
     let hint = "wait for its end; --list prints how far it is, --shard shares a study among machines";
     lock.map_err(|error| match error {
@@ -59,16 +59,14 @@ fn lock(args: &SweepArgs, folder: &Path) -> anyhow::Result<Lock> {
 
 /// The runs that the command line selects, and their states.
 fn chosen(study: &Study, args: &SweepArgs, folder: &Path) -> anyhow::Result<Runs> {
-    let runs = study.runs.len();
-    if let Some(index) = args.index.filter(|index| *index >= runs) {
-        let error = anyhow!("there is no run {index}; the study has {runs}, from 0 to {}", runs - 1);
-        return Err(hinted(error, "--list prints them"));
+    if let Some(index) = args.index.filter(|index| study.runs.iter().all(|run| run.index != *index)) {
+        return Err(hinted(anyhow!("there is no run {index}"), "--list prints them"));
     }
-    let is_chosen = |run: &&PlannedRun| {
-        args.index.is_none_or(|index| run.index == index) && args.shard.is_none_or(|shard| shard.has(run.index))
+    let is_chosen = |(place, run): &(usize, &PlannedRun)| {
+        args.index.is_none_or(|index| run.index == index) && args.shard.is_none_or(|shard| shard.has(*place))
     };
-    let with_state = |run: &PlannedRun| Ok((run.clone(), run.state(&folder.join(&run.name))?));
-    study.runs.iter().filter(is_chosen).map(with_state).collect()
+    let with_state = |(_, run): (usize, &PlannedRun)| Ok((run.clone(), run.state(&folder.join(&run.name))?));
+    study.runs.iter().enumerate().filter(is_chosen).map(with_state).collect()
 }
 
 fn list(runs: &Runs) -> String {

@@ -34,8 +34,9 @@ fn of_task(kind: &str, task: &str) -> String {
     format!("{kind}-{}", task.replace(|c: char| !is_plain(c), "-"))
 }
 
-/// All pictures of a report, each with a name for its file: the learning curves of each task, and its scores over the
-/// hyper-parameter that an algorithm names, such as τ, where runs differ in it; the performance profiles of all tasks.
+/// All pictures of a report, each with a name for its file: the learning curves of each task; the scores over the
+/// hyper-parameter that an algorithm names, such as τ, where runs differ in it, all tasks in one picture; the performance
+/// profiles of all tasks.
 pub fn all(report: &Report) -> Vec<(String, Picture)> {
     if let [run] = &report.runs[..] {
         return vec![(of_task("curve", &run.task), of_run(run))];
@@ -45,16 +46,13 @@ pub fn all(report: &Report) -> Vec<(String, Picture)> {
         by_task.entry(&group.task).or_default().push(group);
     }
     let mut pictures = vec![("profile".to_owned(), profiles(report))];
-    for (task, groups) in by_task {
-        pictures.push((of_task("curve", task), curves(task, &groups)));
-        for Definition { name, report, .. } in ALGORITHMS {
-            if let Some(axis) = report.axis {
-                let of_algorithm = Vec::from_iter(groups.iter().copied().filter(|group| group.algorithm == name));
-                pictures.push((of_task(axis.key, task), over(axis, task, &of_algorithm)));
-            }
-        }
+    for (task, groups) in &by_task {
+        pictures.push((of_task("curve", task), curves(task, groups)));
     }
-    pictures.retain(|(_, picture)| picture.lines.iter().any(|line| !line.points.is_empty()));
+    for Definition { name, report, .. } in ALGORITHMS {
+        pictures.extend(report.axis.map(|axis| (axis.key.to_owned(), over_of_tasks(axis, name, &by_task))));
+    }
+    pictures.retain(|(_, picture)| !picture.is_empty());
     pictures
 }
 
@@ -129,8 +127,21 @@ fn profiles(report: &Report) -> Picture {
     }
 }
 
-/// Scores of complete runs over a hyper-parameter, a line for each set of other settings that has several values of it. Over τ it
-/// is what Figures 3 and 4 of the paper show.
+/// Scores over a hyper-parameter of an algorithm, a panel for each task whose runs differ in it. Over τ it is what Figures 3 and 4
+/// of the paper show.
+fn over_of_tasks(axis: Axis, algorithm: &str, by_task: &BTreeMap<&str, Vec<&GroupReport>>) -> Picture {
+    let of_task = |(task, groups): (&&str, &Vec<&GroupReport>)| {
+        let groups = Vec::from_iter(groups.iter().copied().filter(|group| group.algorithm == algorithm));
+        over(axis, task, &groups)
+    };
+    let mut panels = Vec::from_iter(by_task.iter().map(of_task).filter(|panel| !panel.is_empty()));
+    match panels.len() {
+        1 => panels.remove(0),
+        _ => Picture { title: format!("Scores over {}: {BAND}", axis.symbol), panels, ..Picture::default() },
+    }
+}
+
+/// Scores of complete runs over a hyper-parameter, a line for each set of other settings that has several values of it.
 fn over(axis: Axis, task: &str, groups: &[&GroupReport]) -> Picture {
     let key = format!("agent.{}", axis.key);
     let mut lines: BTreeMap<Settings, Vec<(f64, &GroupReport)>> = BTreeMap::new();
@@ -152,7 +163,7 @@ fn over(axis: Axis, task: &str, groups: &[&GroupReport]) -> Picture {
         }
     };
     Picture {
-        title: format!("{task} over {}: {BAND}", axis.symbol),
+        title: format!("{task} over {}", axis.symbol),
         x: axis.symbol,
         is_power: true,
         y: groups.first().map_or("", |group| group.measure()).to_owned(),

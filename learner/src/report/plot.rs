@@ -12,6 +12,8 @@ use plotters::style::register_font;
 use quad_run::results::statistics::Estimate;
 
 const SIZE: (u32, u32) = (900, 540);
+/// Of a picture's panels, so many stand side by side; each is half as wide and high as a picture.
+const COLUMNS: usize = 3;
 /// Pixels of a PNG for each of an SVG.
 const FINER: u32 = 2;
 /// Points of a line that are shown as such.
@@ -45,6 +47,8 @@ pub struct Picture {
     /// Dashed lines at some y, each with its name.
     pub references: Vec<(String, f64)>,
     pub lines: Vec<Line>,
+    /// Pictures that stand in it side by side, in place of lines of its own.
+    pub panels: Vec<Self>,
 }
 
 /// A line through points by x, and a band between the ends of their intervals where they have some.
@@ -64,7 +68,7 @@ impl Picture {
     /// It cannot be drawn.
     pub fn svg(&self) -> anyhow::Result<String> {
         let mut svg = String::new();
-        let drawn = self.drawable().draw(SVGBackend::with_string(&mut svg, SIZE).into_drawing_area(), 1);
+        let drawn = self.drawable().draw(SVGBackend::with_string(&mut svg, self.size()).into_drawing_area(), 1);
         drawn.map_err(|error| anyhow!("cannot draw {}: {error}", self.title))?;
         Ok(svg)
     }
@@ -82,7 +86,8 @@ impl Picture {
     /// # Errors
     /// The file cannot be written.
     pub fn write_png(&self, path: &Path) -> anyhow::Result<()> {
-        let (width, height) = (SIZE.0 * FINER, SIZE.1 * FINER);
+        let (width, height) = self.size();
+        let (width, height) = (width * FINER, height * FINER);
         let mut pixels = vec![0; (width * height * 3) as usize];
         let drawn =
             self.drawable().draw(BitMapBackend::with_buffer(&mut pixels, (width, height)).into_drawing_area(), FINER);
@@ -94,10 +99,30 @@ impl Picture {
         replace(path, &file)
     }
 
+    /// Whether there is nothing to be seen in it.
+    pub fn is_empty(&self) -> bool {
+        self.lines.iter().all(|line| line.points.is_empty()) && self.panels.iter().all(Self::is_empty)
+    }
+
+    /// Columns and rows of its panels.
+    fn grid(&self) -> (usize, usize) {
+        let columns = self.panels.len().min(COLUMNS);
+        (columns, self.panels.len().div_ceil(COLUMNS))
+    }
+
+    /// Width and height.
+    fn size(&self) -> (u32, u32) {
+        match self.grid() {
+            (0, _) => SIZE,
+            (columns, rows) => (SIZE.0 / 2 * columns as u32, SIZE.1 / 2 * rows as u32),
+        }
+    }
+
     /// Without what cannot be drawn.
     fn drawable(&self) -> Self {
         let is_near = |value: &f64| value.abs() < FARTHEST;
         let mut picture = self.clone();
+        picture.panels.iter_mut().for_each(|panel| *panel = panel.drawable());
         picture.references.retain(|(_, y)| is_near(y));
         for line in &mut picture.lines {
             line.points.retain(|(x, y)| is_near(x) && is_near(&y.value));
@@ -115,6 +140,13 @@ impl Picture {
     {
         LazyLock::force(&FONT);
         root.fill(&WHITE)?;
+        if !self.panels.is_empty() {
+            let (columns, rows) = self.grid();
+            let parts = root.split_evenly((rows, columns));
+            self.panels.iter().zip(parts).try_for_each(|(panel, part)| panel.draw(part, by))?;
+            root.present()?;
+            return Ok(());
+        }
         let font = |size: u32| ("sans-serif", size * by).into_font();
         let [x, y] = self.limits();
         let mut chart = ChartBuilder::on(&root)

@@ -31,6 +31,29 @@ impl Rules<'_> {
     }
 }
 
+/// The values of axes that the command line keeps to: of each axis that it names, one of those that it gives.
+pub(super) struct Narrower(Table);
+
+impl Narrower {
+    pub fn new(only: &[Table]) -> Self {
+        let mut values = Table::new();
+        for (key, value) in only.iter().flat_map(tables::keys) {
+            if let Value::Array(several) = values.entry(key).or_insert_with(|| Value::Array(Vec::new())) {
+                several.push(value.clone());
+            }
+        }
+        Self(values)
+    }
+
+    pub fn allows(&self, combination: &Combination<'_>) -> bool {
+        all_fit(&self.0, combination)
+    }
+
+    pub fn wrong(&self, combinations: &[Combination<'_>]) -> Vec<String> {
+        wrong(&self.0, combinations).map(|wrong| format!("--only {wrong}")).into_iter().collect()
+    }
+}
+
 fn wrong(rule: &Table, combinations: &[Combination<'_>]) -> Option<String> {
     let axes: Vec<&str> = combinations.first().into_iter().flatten().map(|(key, _)| *key).collect();
     if let Some((key, _)) = tables::keys(rule).iter().find(|(key, _)| !axes.contains(&&**key)) {

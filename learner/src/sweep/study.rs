@@ -16,7 +16,7 @@ use tracing::warn;
 
 use super::axes::{Combination, axes, combinations};
 use super::names;
-use super::rules::Rules;
+use super::rules::{Narrower, Rules};
 use crate::data::Source;
 
 /// Keys that are no keys of an experiment: the first two say what a run begins from, the third names a table of changes.
@@ -113,11 +113,12 @@ impl PlannedRun {
 }
 
 impl Study {
-    /// Reads a file and resolves every run as `learner train` would.
+    /// Reads a file and resolves every run as `learner train` would. `only` has values of axes, one of which a run must have of
+    /// each that is named; `set` has keys that all runs change.
     ///
     /// # Errors
     /// Everything that is wrong in it, at once.
-    pub fn read(path: &Path) -> anyhow::Result<Self> {
+    pub fn read(path: &Path, only: &[Table], set: &[Table]) -> anyhow::Result<Self> {
         let text =
             std::fs::read_to_string(path).with_context(|| format!("cannot read {}", path.display())).hint(HELP)?;
         let cannot = || format!("{} cannot be used", path.display());
@@ -127,26 +128,28 @@ impl Study {
             let advice = advice.iter().map(String::as_str).chain([HELP]).collect::<Vec<_>>().join("; ");
             hinted(anyhow!("{}:\n  {}", cannot(), what.join("\n  ")), advice)
         };
-        let runs = file.runs().map_err(refuse)?;
+        let runs = file.runs(only, set).map_err(refuse)?;
         Ok(Self { name, about: file.about, runs })
     }
 }
 
 impl File {
-    fn runs(&self) -> Result<Vec<PlannedRun>, Wrong> {
+    fn runs(&self, only: &[Table], set: &[Table]) -> Result<Vec<PlannedRun>, Wrong> {
         let axes = axes(&self.axes)?;
         let all = combinations(&axes);
         let rules = Rules { only: &self.only, except: &self.except };
-        let wrong = rules.wrong(&all);
+        let narrower = Narrower::new(only);
+        let wrong = [rules.wrong(&all), narrower.wrong(&all)].concat();
         if !wrong.is_empty() {
             return Err(wrong.into());
         }
-        let allowed: Vec<_> = all.into_iter().filter(|combination| rules.allow(combination)).collect();
+        let allowed = all.into_iter().filter(|combination| rules.allow(combination)).enumerate();
+        let allowed = Vec::from_iter(allowed.filter(|(_, combination)| narrower.allows(combination)));
         let (mut runs, mut wrong) = (Vec::<PlannedRun>::new(), BTreeMap::<String, Vec<String>>::new());
         let mut advice = BTreeSet::new();
-        for (index, combination) in allowed.iter().enumerate() {
-            let name = names::name(combination);
-            match self.run(index, name.clone(), combination) {
+        for (index, combination) in allowed {
+            let name = names::name(&combination);
+            match self.run(index, name.clone(), &combination, set) {
                 Ok(run) if runs.iter().any(|other| other.name == run.name) => {
                     wrong.entry("two runs have this name".to_owned()).or_default().push(name);
                 }
@@ -164,9 +167,15 @@ impl File {
         if what.is_empty() { Ok(runs) } else { Err(Wrong { what, advice }) }
     }
 
-    fn run(&self, index: usize, name: String, combination: &Combination<'_>) -> anyhow::Result<PlannedRun> {
+    fn run(
+        &self,
+        index: usize,
+        name: String,
+        combination: &Combination<'_>,
+        set: &[Table],
+    ) -> anyhow::Result<PlannedRun> {
         Name::new(&name).hint("name long values by an axis `method`, which has a table of changes for each name")?;
-        let mut changes = self.changes(combination)?;
+        let mut changes = self.changes(combination, set)?;
         let begin: Vec<Value> = BEGIN.iter().filter_map(|key| changes.remove(*key)).collect();
         let [Value::String(preset)] = &begin[..] else {
             return Err(anyhow!("it needs one of task and preset")).hint("[run] may have it, or an axis");
@@ -178,13 +187,15 @@ impl File {
         Ok(PlannedRun { index, name, preset: preset.clone(), changes, experiment, source })
     }
 
-    /// What a combination changes: its values, over those of its method, over those that all runs share.
-    fn changes(&self, combination: &Combination<'_>) -> anyhow::Result<Table> {
+    /// What a combination changes: its values and those of the command line, over those of its method, over those that all
+    /// runs share.
+    fn changes(&self, combination: &Combination<'_>, command_line: &[Table]) -> anyhow::Result<Table> {
         let method =
             combination.iter().find(|(key, _)| *key == METHOD).map(|(_, value)| self.method(value)).transpose()?;
         let mut changes = Table::new();
-        for (table, source) in [(Some(&self.run), "[run]"), (method, "its method")] {
-            for (key, value) in table.into_iter().flat_map(tables::keys) {
+        let tables = [(&self.run, "[run]")].into_iter().chain(method.map(|method| (method, "its method")));
+        for (table, source) in tables.chain(command_line.iter().map(|table| (table, "--set"))) {
+            for (key, value) in tables::keys(table) {
                 let twice = combination.iter().any(|(axis, _)| *axis == key);
                 ensure!(!twice, "{key} is an axis, and {source} has it, too");
                 set(&mut changes, &key, value);

@@ -4,11 +4,18 @@ use super::*;
 
 /// A file with these axes and rules, read.
 fn read(rest: &str) -> anyhow::Result<Study> {
+    read_as(rest, &[], &[])
+}
+
+/// A file with these axes and rules, read with these flags.
+fn read_as(rest: &str, only: &[&str], set: &[&str]) -> anyhow::Result<Study> {
+    let [only, set] =
+        [only, set].map(|words| Vec::from_iter(words.iter().map(|word| tables::parse_assignment(word).unwrap())));
     let folder = tempfile::tempdir().unwrap();
     let path = folder.path().join("mine.toml");
     let text = "about = 'a question'\nrun = { dataset = 'x.hdf5', steps = 7 }\n";
     std::fs::write(&path, text.to_owned() + rest).unwrap();
-    Study::read(&path)
+    Study::read(&path, &only, &set)
 }
 
 fn names(rest: &str) -> Vec<String> {
@@ -100,6 +107,33 @@ fn all_that_is_wrong_is_told_at_once() {
 }
 
 #[test]
+fn the_command_line_keeps_to_some_runs_and_changes_all_of_them() {
+    let axes =
+        format!("[axes]\ntask = ['hopper-demo', 'walker2d-demo']\nmethod = ['none', 'iql']\nseed = [0, 1]\n{METHODS}");
+    let study = read_as(&axes, &["task=hopper-*", "seed=1", "seed=2"], &["steps=9", "agent.gamma=0.5"]).unwrap();
+    let runs = study.runs.iter().map(|run| (run.index, &*run.name, run.experiment.steps));
+    let runs = Vec::from_iter(runs);
+    assert_eq!(runs, [(4, "hopper-demo-none-seed1", 9), (5, "hopper-demo-iql-seed1", 9)]);
+    assert_eq!(study.runs[1].experiment.agent["gamma"].as_float(), Some(0.5));
+    let error = read_as(&axes, &["sede=1"], &["seed=3"]).unwrap_err().to_string();
+    assert!(error.contains("--only names sede, which is no axis"), "{error}");
+    let error = read_as(&axes, &[], &["seed=3"]).unwrap_err().to_string();
+    assert!(error.contains("seed is an axis, and --set has it, too"), "{error}");
+}
+
+/// How many runs the paper's studies have: Table 1 without two methods in mazes, Table 2's two on seven tasks, five values of τ.
+#[test]
+fn the_paper_s_studies_are_what_it_trains() {
+    let folder = Path::new(env!("CARGO_MANIFEST_DIR")).join("../studies");
+    for (name, runs) in [("table1", (15 * 12 - 6 * 2) * 4), ("table2", 7 * 2 * 4), ("tau", 15 * 5 * 4)] {
+        let study = Study::read(&folder.join(name).with_extension("toml"), &[], &[]).unwrap();
+        assert_eq!(study.runs.len(), runs, "{name}");
+        // Each begins from the paper's own settings of its task.
+        assert!(study.runs.iter().all(|run| run.experiment.steps >= 100_000), "{name}");
+    }
+}
+
+#[test]
 fn the_example_of_the_documentation_is_a_study() {
     let page = include_str!("../../../../studies/README.md");
     let (_, example) = page.split_once("```toml\n").unwrap();
@@ -107,5 +141,5 @@ fn the_example_of_the_documentation_is_a_study() {
     let path = folder.path().join("example.toml");
     std::fs::write(&path, example.split_once("```").unwrap().0).unwrap();
     // Of 3 tasks, 2 methods, 2 values of τ and 3 seeds, without dac in the maze, and with one τ for dac.
-    assert_eq!(Study::read(&path).unwrap().runs.len(), (2 * (1 + 2) + 2) * 3);
+    assert_eq!(Study::read(&path, &[], &[]).unwrap().runs.len(), (2 * (1 + 2) + 2) * 3);
 }
