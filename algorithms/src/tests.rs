@@ -196,6 +196,24 @@ fn a_nan_is_never_dropped() {
 }
 
 #[test]
+fn a_hyper_parameter_that_is_refused_is_named() {
+    for definition in ALGORITHMS {
+        let Some(toml::Value::Table(agent)) = Values::of(&definition).unwrap().for_task(None).remove("agent") else {
+            panic!("{} has no values", definition.name)
+        };
+        for key in agent.keys().filter(|key| agent[*key].is_float()) {
+            let mut changed = agent.clone();
+            changed.insert(key.clone(), "much".into());
+            let error = (definition.check)(&changed).unwrap_err().to_string();
+            assert!(error.starts_with(&format!("agent.{key}: ")), "{} {key}: {error}", definition.name);
+            changed.remove(key);
+            let error = (definition.check)(&changed).unwrap_err().to_string();
+            assert!(error.contains(&format!("missing field `{key}`")), "{} {key}: {error}", definition.name);
+        }
+    }
+}
+
+#[test]
 fn metric_names_are_prometheus_names_and_distinct() {
     for definition in ALGORITHMS {
         let mut names: Vec<_> = definition.metrics.iter().map(|metric| metric.name).collect();
