@@ -73,7 +73,7 @@ impl AlgorithmError {
 #[derive(Debug, thiserror::Error)]
 pub enum AgentError {
     /// One too many, one too few, or of the wrong type.
-    #[error("{0}")]
+    #[error("[agent]: {0}")]
     Parse(#[from] toml::de::Error),
     /// One is outside its range.
     #[error("agent.{field} is {value}, but must be {range}")]

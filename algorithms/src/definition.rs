@@ -2,7 +2,7 @@
 
 use std::collections::BTreeMap;
 
-use serde::de::{DeserializeOwned, Error};
+use serde::de::DeserializeOwned;
 use serde::{Serialize, Serializer};
 
 use super::algorithm::{AgentError, Algorithm, AlgorithmError};
@@ -111,19 +111,7 @@ impl Serialize for Summary {
 
 /// Reads a table of hyper-parameters, whose types say their ranges.
 pub(super) fn read<T: DeserializeOwned>(table: &toml::Table) -> Result<T, AgentError> {
-    let refused = |table: toml::Table| T::deserialize(table).map_err(|error| error.message().to_owned());
-    T::deserialize(table.clone()).map_err(|error| {
-        let message = error.message();
-        // Serde forgets which key of a flattened struct was refused: it is the one that is refused alone, too.
-        let is_it = |(key, value): &(&String, &toml::Value)| {
-            let alone = toml::Table::from_iter([((*key).clone(), (*value).clone())]);
-            refused(alone).is_err_and(|alone| alone == message)
-        };
-        match Vec::from_iter(table.iter().filter(is_it))[..] {
-            [(key, _)] => toml::de::Error::custom(format_args!("agent.{key}: {message}")).into(),
-            _ => error.into(),
-        }
-    })
+    Ok(T::deserialize(table.clone())?)
 }
 
 /// The check of hyper-parameters whose types say their ranges.

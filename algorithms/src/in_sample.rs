@@ -2,9 +2,9 @@
 //! critics' smaller value, a Gaussian policy is cloned from the data with weights, and twin critics move towards r + γ·V(s').
 //! An algorithm of this kind is its [`Losses`].
 
-use super::algorithm::{Algorithm, Measured, measured, smaller};
+use super::algorithm::{AgentError, Algorithm, Measured, measured, smaller};
 use super::context::{Context, Minibatch};
-use super::definition::{Metric, metrics};
+use super::definition::{self, Metric, metrics};
 use super::gaussian::Gaussian;
 use super::hyperparameters::{Positive, Rate, Share};
 use super::parts::Parts;
@@ -12,6 +12,7 @@ use super::trained::{Trained, ensemble};
 use candle_core::{DType, Result, Tensor};
 use quad_policy::{AdamStep, Ensemble, EnsembleShape, MlpConfig, PolicyConfig, Tensors, Weighted, cosine_decay};
 use serde::Deserialize;
+use serde::de::DeserializeOwned;
 
 /// Critics, of whose values the smaller counts.
 const CRITICS: usize = 2;
@@ -58,6 +59,13 @@ pub(super) struct Common {
     value_learning_rate: Positive,
     /// EMA rate of the target critics.
     ema_rate: Rate,
+}
+
+/// Reads a table of hyper-parameters with [`Common`]'s among them. Serde does not say which key of a flattened struct is refused,
+/// so these are read by themselves first.
+pub(super) fn read<T: DeserializeOwned>(table: &toml::Table) -> std::result::Result<T, AgentError> {
+    definition::readable::<Common>(table)?;
+    definition::read(table)
 }
 
 /// The equations of one algorithm; its hyper-parameters hold them.

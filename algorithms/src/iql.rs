@@ -7,9 +7,9 @@
 #[path = "golden/iql.rs"]
 mod golden;
 
-use super::definition::{Definition, Metric, Reporting, read, readable};
+use super::definition::{Definition, Metric, Reporting};
 use super::hyperparameters::{Positive, Quantile};
-use super::in_sample::{COSINE, Common, Helps, InSample, Losses, table};
+use super::in_sample::{COSINE, Common, Helps, InSample, Losses, read, table};
 use candle_core::{DType, Result, Tensor};
 use serde::Deserialize;
 
@@ -19,7 +19,7 @@ pub(super) const DEFINITION: Definition = Definition {
     settings: include_str!("../../presets/iql.toml"),
     metrics: METRICS,
     report: Reporting::PLAIN,
-    check: readable::<Config>,
+    check: |table| read::<Config>(table).map(drop),
     start: |table, context| Ok(Box::new(InSample::new(read::<Config>(table)?, context)?)),
 };
 

@@ -8,9 +8,9 @@
 #[path = "golden/ivr.rs"]
 mod golden;
 
-use super::definition::{Definition, Metric, Reporting, Variant, read, readable};
+use super::definition::{Definition, Metric, Reporting, Variant};
 use super::hyperparameters::Positive;
-use super::in_sample::{COSINE, Common, Helps, InSample, Losses, scale_down, table};
+use super::in_sample::{COSINE, Common, Helps, InSample, Losses, read, scale_down, table};
 use candle_core::{Result, Tensor};
 use serde::Deserialize;
 
@@ -23,7 +23,7 @@ pub(super) const DEFINITION: Definition = Definition {
         variant: Some(Variant { key: "divergence", called: |divergence| format!("ivr {divergence}") }),
         ..Reporting::PLAIN
     },
-    check: readable::<Config>,
+    check: |table| read::<Config>(table).map(drop),
     start: |table, context| Ok(Box::new(InSample::new(read::<Config>(table)?, context)?)),
 };
 

@@ -8,9 +8,9 @@
 mod golden;
 
 use super::context::{Context, Minibatch};
-use super::definition::{Definition, Metric, Reporting, read, readable};
+use super::definition::{Definition, Metric, Reporting};
 use super::hyperparameters::{Count, NotNegative, Positive};
-use super::in_sample::{Common, Helps, InSample, Losses, scale_down, table};
+use super::in_sample::{Common, Helps, InSample, Losses, read, scale_down, table};
 use super::random::{Purpose, stream};
 use candle_core::{Result, Tensor};
 use rand::Rng;
@@ -23,7 +23,7 @@ pub(super) const DEFINITION: Definition = Definition {
     settings: include_str!("../../presets/xql.toml"),
     metrics: METRICS,
     report: Reporting::PLAIN,
-    check: readable::<Config>,
+    check: |table| read::<Config>(table).map(drop),
     start: |table, context| Ok(Box::new(InSample::new(read::<Config>(table)?, context)?)),
 };
 
