@@ -7,8 +7,8 @@ use std::sync::atomic::{AtomicUsize, Ordering::Relaxed};
 use candle_core::{Device, Tensor};
 use quad_policy::{
     Choice, DiffusionPolicy, DiffusionShape, Ensemble, GaussianPolicy, GaussianShape, Header, Layout, MlpConfig,
-    NoisePredictor, Policy, PolicyConfig, Precision, Rule, SquashedPolicy, SquashedShape, Tensors, Weights,
-    load_policy,
+    NoisePredictor, Policy, PolicyConfig, Precision, Rule, ScoreNetwork, ScorePolicy, ScorePolicyShape, ScoreShape,
+    SquashedPolicy, SquashedShape, Tensors, Weights, load_policy,
 };
 
 /// What is not counted, such as the embedding of each denoising step: little of what an evaluator gives, bytes.
@@ -74,11 +74,22 @@ fn squashed(hidden: usize, norm: bool) -> Box<dyn Policy> {
     loaded(PolicyConfig::Squashed { shape, choice }, &SquashedPolicy::tensors(&actor, &critics).unwrap())
 }
 
+fn score(widths: &[usize], candidates: u32) -> Box<dyn Policy> {
+    let actor = MlpConfig::mish(widths);
+    let critic = MlpConfig::mish(&[8]);
+    let shape = ScorePolicyShape { observation_dim: 11, action_dim: 3, actor, critic, evaluations: 4 };
+    let frequencies = Tensor::zeros(ScoreShape::FREQUENCIES, candle_core::DType::F32, &Device::Cpu).unwrap();
+    let actor = ScoreNetwork::new(shape.actor(), zeros(shape.actor().layout()), frequencies);
+    let critic = Ensemble::new(shape.critic(), zeros(shape.critic().layout()), Precision::F32);
+    let tensors = ScorePolicy::tensors(&actor, &critic).unwrap();
+    loaded(PolicyConfig::Score { shape, choice: Choice::best_of(candidates) }, &tensors)
+}
+
 #[test]
 fn actions_take_no_more_memory_than_was_said() {
     let best_of = Choice::best_of;
     let nearest = Choice { rule: Rule::Nearest, ..best_of(1000) };
-    let cases: [(&str, Box<dyn Policy>, usize); 8] = [
+    let cases: [(&str, Box<dyn Policy>, usize); 10] = [
         ("the paper's", diffusion(256, 10, 5, best_of(50)), 10),
         ("many critics", diffusion(1, 4096, 1, best_of(32)), 64),
         ("many steps", diffusion(4, 1, 1000, best_of(8)), 256),
@@ -87,6 +98,8 @@ fn actions_take_no_more_memory_than_was_said() {
         ("a Gaussian", gaussian(256), 256),
         ("a squashed Gaussian", squashed(4, false), 64),
         ("critics with a norm", squashed(64, true), 10),
+        ("a score network", score(&[512, 256, 128], 32), 10),
+        ("a score network of one block", score(&[64], 1000), 64),
     ];
     for (name, policy, n) in cases {
         let said = policy.memory(n) as usize;

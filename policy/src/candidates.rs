@@ -112,6 +112,14 @@ impl CandidatePolicy {
     }
 }
 
+/// Writes the mean of the chosen ones among candidates.
+fn mean_of(chosen: &[usize], drawn: &[f32], action: &mut [f32]) {
+    let a = action.len();
+    for (j, x) in action.iter_mut().enumerate() {
+        *x = chosen.iter().map(|place| drawn[place * a + j]).sum::<f32>() / chosen.len() as f32;
+    }
+}
+
 impl Policy for CandidatePolicy {
     fn observation_dim(&self) -> usize {
         self.networks.actor.dims().0
@@ -149,8 +157,7 @@ impl Policy for CandidatePolicy {
         let (drawn, worth) = self.draw(observations, self.noise(states))?;
         let of_each = drawn.chunks_exact(candidates * action_dim).zip(worth.chunks_exact(candidates)).zip(states);
         for (action, ((drawn, worth), state)) in actions.chunks_exact_mut(action_dim).zip(of_each) {
-            let chosen = self.choice.pick(worth, state)?;
-            action.copy_from_slice(&drawn[chosen * action_dim..][..action_dim]);
+            mean_of(&self.choice.pick(worth, state)?, drawn, action);
         }
         check_numbers("a sampled action", actions)
     }

@@ -7,7 +7,7 @@ use serde::{Deserialize, Serialize};
 use std::fmt;
 use std::str::FromStr;
 
-/// How many actions are drawn in each state, and which of them is taken. It travels in a policy's file; an operator may have the
+/// How many actions are drawn in each state, and which of them is taken, or the mean of which. It travels in a policy's file; an operator may have the
 /// policy scored with another.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
@@ -44,7 +44,18 @@ pub enum Rule {
     },
     /// The one whose value Q is nearest to the state's own, V: the largest -(Q - V)² (AlignIQL).
     Nearest,
+    /// The mean of several that are drawn, each once, with probabilities as of [`Self::Softmax`] (SfBC). Values count up to
+    /// forty temperatures above the smallest of as many largest, so that no draw is a certainty too early.
+    Average {
+        /// Temperature in units of the value, above 0.
+        temperature: f32,
+        /// How many are drawn, at least 1; all of fewer candidates.
+        actions: u32,
+    },
 }
+
+/// Temperatures by which values may exceed the smallest of the largest.
+const MOST_ABOVE: f32 = 40.0;
 
 impl Choice {
     /// Most actions drawn in a state: far above any use, low enough for evaluators' memory.
@@ -61,22 +72,31 @@ impl Choice {
     /// A number of candidates or a temperature out of range.
     pub fn check(&self) -> Result<(), PolicyError> {
         check_range("candidates", self.candidates as usize, Self::MOST_CANDIDATES as usize)?;
+        if let Rule::Average { actions, .. } = self.rule {
+            check_range("actions", actions as usize, Self::MOST_CANDIDATES as usize)?;
+        }
         match self.rule {
-            Rule::Softmax { temperature } if !(temperature > 0.0 && temperature.is_finite()) => {
+            Rule::Softmax { temperature } | Rule::Average { temperature, .. }
+                if !(temperature > 0.0 && temperature.is_finite()) =>
+            {
                 Err(PolicyError::Temperature(temperature))
             }
             _ => Ok(()),
         }
     }
 
-    /// Which of a state's candidates is taken. `worth` has what the rule compares of each: its value, or -(Q - V)².
-    pub(crate) fn pick(&self, worth: &[f32], state: &mut EpisodeState) -> Result<usize, PolicyError> {
+    /// Which of a state's candidates are taken: one, or several of which the mean is the action. `worth` has what the rule
+    /// compares of each: its value, or -(Q - V)².
+    pub(crate) fn pick(&self, worth: &[f32], state: &mut EpisodeState) -> Result<Vec<usize>, PolicyError> {
         if worth.iter().any(|worth| worth.is_nan()) {
             return Err(PolicyError::NotANumber("the value of a candidate"));
         }
         Ok(match self.rule {
-            Rule::Softmax { temperature } if worth.len() > 1 => draw(worth, temperature, state.uniform()),
-            _ => best(worth),
+            Rule::Softmax { temperature } if worth.len() > 1 => vec![draw(worth, temperature, state.uniform())],
+            Rule::Average { temperature, actions } if worth.len() > 1 => {
+                draw_several(worth, temperature, actions as usize, state)
+            }
+            _ => vec![best(worth)],
         })
     }
 }
@@ -119,6 +139,22 @@ fn draw(worth: &[f32], temperature: f32, uniform: f64) -> usize {
     place.unwrap_or(best(worth))
 }
 
+/// So many places, or all of fewer, each once, with a probability among those left as [`draw`] has it.
+fn draw_several(worth: &[f32], temperature: f32, count: usize, state: &mut EpisodeState) -> Vec<usize> {
+    let count = count.min(worth.len());
+    let mut sorted = worth.to_vec();
+    sorted.sort_unstable_by(|x, y| y.total_cmp(x));
+    let most = sorted[count - 1] + MOST_ABOVE * temperature;
+    let mut left: Vec<f32> = worth.iter().map(|worth| worth.min(most)).collect();
+    let mut places: Vec<usize> = (0..worth.len()).collect();
+    let mut one = || {
+        let drawn = draw(&left, temperature, state.uniform());
+        left.remove(drawn);
+        places.remove(drawn)
+    };
+    (0..count).map(|_| one()).collect()
+}
+
 impl FromStr for Reduce {
     type Err = de::value::Error;
 
@@ -130,14 +166,31 @@ impl FromStr for Reduce {
 impl FromStr for Rule {
     type Err = &'static str;
 
-    /// `best`, `nearest`, or `softmax:` and a temperature.
+    /// As [`Display`](fmt::Display) writes it.
     fn from_str(text: &str) -> Result<Self, Self::Err> {
-        let temperature = text.strip_prefix("softmax:").and_then(|number| number.parse().ok());
-        match (text, temperature) {
-            ("best", _) => Ok(Self::Best),
-            ("nearest", _) => Ok(Self::Nearest),
-            (_, Some(temperature)) => Ok(Self::Softmax { temperature }),
-            _ => Err("one of best, softmax:TEMPERATURE and nearest"),
+        let expected = "one of best, softmax:TEMPERATURE, average:TEMPERATURE:ACTIONS and nearest";
+        let temperature = |text: &str| text.parse().map_err(|_| expected);
+        match text.split(':').collect::<Vec<_>>()[..] {
+            ["best"] => Ok(Self::Best),
+            ["nearest"] => Ok(Self::Nearest),
+            ["softmax", number] => Ok(Self::Softmax { temperature: temperature(number)? }),
+            ["average", number, actions] => {
+                let actions = actions.parse().map_err(|_| expected)?;
+                Ok(Self::Average { temperature: temperature(number)?, actions })
+            }
+            _ => Err(expected),
+        }
+    }
+}
+
+/// As an operator writes it: `best`, `softmax:0.1`, `average:0.01:4`, `nearest`.
+impl fmt::Display for Rule {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match self {
+            Self::Best => f.write_str("best"),
+            Self::Softmax { temperature } => write!(f, "softmax:{temperature}"),
+            Self::Nearest => f.write_str("nearest"),
+            Self::Average { temperature, actions } => write!(f, "average:{temperature}:{actions}"),
         }
     }
 }
@@ -150,10 +203,8 @@ impl fmt::Display for Choice {
             return f.write_str("1 candidate");
         }
         write!(f, "{candidates} candidates")?;
-        match rule {
-            Rule::Best => {}
-            Rule::Softmax { temperature } => write!(f, ", softmax:{temperature}")?,
-            Rule::Nearest => f.write_str(", nearest")?,
+        if *rule != Rule::Best {
+            write!(f, ", {rule}")?;
         }
         if *value == Reduce::Min { f.write_str(", min") } else { Ok(()) }
     }
@@ -161,77 +212,4 @@ impl fmt::Display for Choice {
 
 #[cfg(test)]
 #[allow(clippy::unwrap_used)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn a_choice_is_read_as_it_is_written() {
-        let softmax = Rule::Softmax { temperature: 0.1 };
-        for (rule, json, text) in [
-            (Rule::Best, r#""best""#, "best"),
-            (softmax, r#"{"softmax":{"temperature":0.1}}"#, "softmax:0.1"),
-            (Rule::Nearest, r#""nearest""#, "nearest"),
-        ] {
-            assert_eq!(serde_json::to_string(&rule).unwrap(), json);
-            assert_eq!(serde_json::from_str::<Rule>(json).unwrap(), rule);
-            assert_eq!(text.parse::<Rule>().unwrap(), rule);
-        }
-        assert!("softmax".parse::<Rule>().is_err() && "softmax:warm".parse::<Rule>().is_err());
-        let choice = Choice { rule: softmax, value: Reduce::Min, ..Choice::best_of(50) };
-        assert_eq!(choice.to_string(), "50 candidates, softmax:0.1, min");
-        assert_eq!(Choice { candidates: 1, ..choice }.to_string(), "1 candidate");
-    }
-
-    #[test]
-    fn critics_are_reduced_and_none_hides_a_nan() {
-        let values = [1.0, 5.0, 3.0, 4.0];
-        assert_eq!(Reduce::Mean.reduce(&values, 2), [2.0, 4.5]);
-        assert_eq!(Reduce::Min.reduce(&values, 2), [1.0, 4.0]);
-        for reduce in [Reduce::Mean, Reduce::Min] {
-            for values in [[f32::NAN, 0.0], [0.0, f32::NAN]] {
-                assert!(reduce.reduce(&values, 1)[0].is_nan());
-            }
-        }
-    }
-
-    #[test]
-    fn the_first_of_the_best_is_taken() {
-        let pick = |worth: &[f32]| Choice::best_of(3).pick(worth, &mut EpisodeState::new(0));
-        assert_eq!(pick(&[1.0, 2.0, 2.0]).unwrap(), 1);
-        assert_eq!(pick(&[f32::NEG_INFINITY; 3]).unwrap(), 0);
-        assert!(pick(&[0.0, f32::NAN, 1.0]).is_err());
-    }
-
-    /// So many draws of each place that its share is within 0.02 of its probability, at any size of the values.
-    #[test]
-    fn softmax_draws_by_its_probabilities() {
-        const DRAWS: usize = 20_000;
-        let mut state = EpisodeState::new(3);
-        for (scale, temperature) in [(1.0, 2.0), (1e30, 2e30), (1e-30, 2e-30)] {
-            let choice = Choice { rule: Rule::Softmax { temperature }, ..Choice::best_of(4) };
-            choice.check().unwrap();
-            let values = [1.0, -2.0, 3.0, f32::NEG_INFINITY].map(|value: f32| value * scale);
-            let mut counts = [0; 4];
-            (0..DRAWS).for_each(|_| counts[choice.pick(&values, &mut state).unwrap()] += 1);
-            let weights = [1.0, -2.0, 3.0, f64::NEG_INFINITY].map(|value| (value / 2.0).exp());
-            for (count, weight) in counts.iter().zip(weights) {
-                let (share, expected) = (f64::from(*count) / DRAWS as f64, weight / weights.iter().sum::<f64>());
-                assert!((share - expected).abs() < 0.02, "{share} for {expected} at {scale}");
-            }
-        }
-        let cold = Choice { rule: Rule::Softmax { temperature: f32::MIN_POSITIVE }, ..Choice::best_of(3) };
-        assert_eq!(cold.pick(&[f32::MAX, f32::MIN, 0.0], &mut state).unwrap(), 0);
-        assert_eq!(cold.pick(&[0.0, f32::INFINITY, f32::NEG_INFINITY], &mut state).unwrap(), 1);
-    }
-
-    #[test]
-    fn a_choice_out_of_range_is_refused() {
-        for candidates in [0, 10_001, u32::MAX] {
-            assert!(matches!(Choice::best_of(candidates).check(), Err(PolicyError::Range { .. })));
-        }
-        for temperature in [0.0, -1.0, f32::NAN, f32::INFINITY] {
-            let choice = Choice { rule: Rule::Softmax { temperature }, ..Choice::best_of(2) };
-            assert!(matches!(choice.check(), Err(PolicyError::Temperature(_))), "{temperature}");
-        }
-    }
-}
+mod tests;

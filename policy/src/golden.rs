@@ -74,7 +74,7 @@ fn golden_choices() {
         let numbers = |name: &str| golden.input(name, &Device::Cpu).flatten_all().unwrap().to_vec1::<f32>().unwrap();
         let (observations, noise) = (numbers("select_observations"), numbers("select_noise"));
         let (drawn, values) = policy.draw(&observations, noise).unwrap();
-        let chosen = |values| choice.pick(values, &mut policy.begin(0)).unwrap();
+        let chosen = |values| choice.pick(values, &mut policy.begin(0)).unwrap()[0];
         let chosen: Vec<usize> = values.chunks_exact(candidates).map(chosen).collect();
         let drawn: Vec<&[f32]> = drawn.chunks_exact(policy.action_dim()).collect();
         let taken = chosen.iter().enumerate().map(|(i, chosen)| drawn[i * candidates + chosen]);

@@ -7,6 +7,7 @@ use crate::gaussian::{GaussianPolicy, GaussianShape};
 use crate::policy::Policy;
 use crate::precision::Precision;
 use crate::scaled::scaled;
+use crate::score::{ScorePolicy, ScorePolicyShape};
 use crate::squashed::{SquashedPolicy, SquashedShape};
 use crate::weights::{Tensors, check_finite};
 use candle_core::Device;
@@ -45,6 +46,13 @@ pub enum PolicyConfig {
     Gaussian {
         /// Shape of its network.
         shape: GaussianShape,
+    },
+    /// Some of several samples of a score network.
+    Score {
+        /// Shape of its networks.
+        shape: ScorePolicyShape,
+        /// Which samples they are.
+        choice: Choice,
     },
 }
 
@@ -98,6 +106,7 @@ pub fn load_policy(file: &[u8], precision: Precision) -> Result<Box<dyn Policy>,
             Box::new(SquashedPolicy::load(&shape, choice, &mut tensors, precision)?)
         }
         PolicyConfig::Gaussian { shape } => Box::new(GaussianPolicy::load(shape, &mut tensors)?),
+        PolicyConfig::Score { shape, choice } => Box::new(ScorePolicy::load(shape, choice, &mut tensors, precision)?),
     };
     match tensors.into_keys().next() {
         Some(name) => Err(PolicyError::Unexpected(name)),

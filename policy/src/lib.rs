@@ -9,11 +9,14 @@
 //! - [`Ensemble`] (`ensemble`): such networks as critics, value functions or means; [`NoisePredictor`] (`noise_predictor`):
 //!   ε_θ; [`Denoiser`] (`edm`), told of noise by a real number; [`Schedule`] (`schedule`): the noise schedule and one reverse step. `sampler` and `action_gradients` go through
 //!   whole networks tile by tile.
+//! - [`ScoreNetwork`] (`score_network`): residual blocks of single layers (`dense`), the noise in continuous time, sampled by
+//!   [`DpmSolver`] (`dpm_solver`).
 //! - [`Weights`] (`weights`): a network's weights as one vector with named tensors in it; [`Gradients`] (`gradient`) of a loss
 //!   with respect to them; [`Adam`] (`optimiser`).
 //! - [`Policy`] (`policy`): what any policy can do; [`EpisodeState`] (`episode`): what it carries through an episode. `kind`
-//!   reads one from a file whose [`Header`] says what it is: [`DiffusionPolicy`] (`diffusion`) and [`SquashedPolicy`]
-//!   (`squashed`) take one of N_a samples (`candidates`) by their [`Choice`] (`choice`), [`GaussianPolicy`] (`gaussian`) a mean; one with a [`Scaling`] is asked in its user's units (`scaled`).
+//!   reads one from a file whose [`Header`] says what it is: [`DiffusionPolicy`] (`diffusion`), [`SquashedPolicy`]
+//!   (`squashed`) and [`ScorePolicy`] (`score`) take one of N_a samples (`candidates`), or the mean of some, by their [`Choice`]
+//!   (`choice`), [`GaussianPolicy`] (`gaussian`) a mean; one with a [`Scaling`] is asked in its user's units (`scaled`).
 //! - [`Precision`] (`precision`): how exactly networks are evaluated that no gradient is taken of.
 //! - Below: `layers` (where each layer lies in the vector), `network` (one network on one tile of rows, over the crate
 //!   `kernels`), `saved` and `kept_gradient` (what forward and backward passes leave), `operation` (candle's custom
@@ -28,7 +31,9 @@ mod action_gradients;
 mod candidates;
 mod choice;
 mod composed;
+mod dense;
 mod diffusion;
+mod dpm_solver;
 mod edm;
 mod ensemble;
 mod episode;
@@ -60,6 +65,8 @@ mod sampler;
 mod saved;
 mod scaled;
 mod schedule;
+mod score;
+mod score_network;
 mod shape;
 mod slices;
 mod squashed;
@@ -69,6 +76,7 @@ mod weights;
 
 pub use choice::{Choice, Reduce, Rule};
 pub use diffusion::{DiffusionPolicy, DiffusionShape};
+pub use dpm_solver::{ContinuousNoise, DpmSolver};
 pub use edm::{Denoiser, DenoiserShape, NoiseLevels};
 pub use ensemble::Ensemble;
 pub use episode::EpisodeState;
@@ -84,6 +92,8 @@ pub use precision::Precision;
 pub use quad_kernels::activation::Activation;
 pub use quad_kernels::scaling::{Affine, Scaling};
 pub use schedule::{Reverse, Schedule};
+pub use score::{ScorePolicy, ScorePolicyShape};
+pub use score_network::{ScoreNetwork, ScoreShape};
 pub use shape::{EnsembleShape, NoiseShape};
 pub use squashed::{SquashedActor, SquashedPolicy, SquashedShape};
 pub use statistics::mean_and_variance;

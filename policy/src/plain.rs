@@ -15,7 +15,7 @@ fn mish(x: &Tensor) -> Result<Tensor> {
     x * (&n / (&n + 2.0)?)?
 }
 
-fn activate(f: Activation, x: &Tensor) -> Result<Tensor> {
+pub(crate) fn activate(f: Activation, x: &Tensor) -> Result<Tensor> {
     match f {
         Activation::Mish => mish(x),
         // A maximum would drop a NaN; zero times x lets none get lost.

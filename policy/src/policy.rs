@@ -50,7 +50,7 @@ pub trait Policy: Send + Sync {
     /// Draws the actions that [`Self::act`] would choose among in each of n states, and says what the critics give each.
     ///
     /// `observations` is `n × observation_dim`, n at least 1; `states` has what the policy carries through each state's episode.
-    /// From equal states, [`Self::act`] takes one of these actions.
+    /// From equal states, [`Self::act`] takes one of these actions, or the mean of some.
     ///
     /// # Errors
     /// It has no critics, an action or its value is not a number, or candle fails.

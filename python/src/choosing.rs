@@ -41,11 +41,7 @@ pub fn choosing(policy: &Arc<dyn Policy>, changes: Changes) -> PyResult<Arc<dyn 
 
 /// A choice as the arguments that ask for it.
 pub fn as_dictionary(py: Python<'_>, choice: Choice) -> PyResult<Bound<'_, PyDict>> {
-    let rule = match choice.rule {
-        Rule::Best => "best".to_owned(),
-        Rule::Softmax { temperature } => format!("softmax:{temperature}"),
-        Rule::Nearest => "nearest".to_owned(),
-    };
+    let rule = choice.rule.to_string();
     let value = match choice.value {
         Reduce::Mean => "mean",
         Reduce::Min => "min",

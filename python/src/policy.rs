@@ -223,6 +223,7 @@ impl PyPolicy {
             PolicyConfig::Diffusion { .. } => "diffusion",
             PolicyConfig::Squashed { .. } => "squashed",
             PolicyConfig::Gaussian { .. } => "gaussian",
+            PolicyConfig::Score { .. } => "score",
         }
     }
 

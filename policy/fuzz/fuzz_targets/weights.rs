@@ -9,8 +9,8 @@ use candle_core::{DType, Device, Tensor};
 use libfuzzer_sys::fuzz_target;
 use quad_policy::{
     Affine, Choice, DiffusionPolicy, DiffusionShape, Ensemble, EnsembleShape, GaussianPolicy, GaussianShape, Header,
-    Layout, MlpConfig, NoisePredictor, PolicyConfig, Precision, Rule, Scaling, SquashedPolicy, SquashedShape, Weights,
-    load_policy,
+    Layout, MlpConfig, NoisePredictor, PolicyConfig, Precision, Rule, Scaling, ScoreNetwork, ScorePolicy, ScorePolicyShape,
+    ScoreShape, SquashedPolicy, SquashedShape, Weights, load_policy,
 };
 
 const STATES: usize = 2;
@@ -51,14 +51,22 @@ fn write_seeds() {
     let choice = Choice { rule: Rule::Softmax { temperature: 0.5 }, ..Choice::best_of(2) };
     let squashed = Header { policy: PolicyConfig::Squashed { shape, choice }, scaling: None, origin: () };
     let squashed = squashed.to_safetensors(&tensors).unwrap();
-    let shape = GaussianShape { observation_dim: 2, action_dim: 1, actor: layers };
+    let shape = GaussianShape { observation_dim: 2, action_dim: 1, actor: layers.clone() };
     let actor = Ensemble::new(shape.actor(), halves(shape.actor().layout()), Precision::F32);
     let tensors = GaussianPolicy::tensors(&actor).unwrap();
+    let score = ScorePolicyShape { observation_dim: 2, action_dim: 1, actor: layers.clone(), critic: layers, evaluations: 2 };
+    let frequencies = Tensor::ones(ScoreShape::FREQUENCIES, DType::F32, &Device::Cpu).unwrap();
+    let network = ScoreNetwork::new(score.actor(), halves(score.actor().layout()), frequencies);
+    let critic = Ensemble::new(score.critic(), halves(score.critic().layout()), Precision::F32);
+    let of_score = ScorePolicy::tensors(&network, &critic).unwrap();
+    let rule = Rule::Average { temperature: 0.5, actions: 2 };
+    let policy = PolicyConfig::Score { shape: score, choice: Choice { rule, ..Choice::best_of(3) } };
+    let score = Header { policy, scaling: None, origin: () }.to_safetensors(&of_score).unwrap();
     let actions = Some(Affine { offset: vec![3.0], scale: vec![2.0] });
     let scaling = Some(Scaling { observations: None, actions });
     let gaussian = Header { policy: PolicyConfig::Gaussian { shape }, scaling, origin: () };
     let gaussian = gaussian.to_safetensors(&tensors).unwrap();
-    let drawn = [("best", best), ("nearest", nearest), ("softmax", softmax), ("squashed", squashed)];
+    let drawn = [("best", best), ("nearest", nearest), ("softmax", softmax), ("squashed", squashed), ("score", score)];
     for (name, file) in drawn.into_iter().chain([("gaussian", gaussian)]) {
         fs::write(corpus.join(name), file).unwrap();
     }
