@@ -5,7 +5,7 @@ use std::sync::Arc;
 use pyo3::exceptions::PyValueError;
 use pyo3::prelude::*;
 use pyo3::types::PyDict;
-use quad_policy::{Choice, Policy, Reduce, Rule};
+use quad_policy::{Choice, Policy, Reduce};
 
 use crate::error::of_policy;
 

@@ -75,8 +75,8 @@ impl PyPolicy {
     /// An array of one axis is one state, and gives one action. float32 arrays whose numbers lie side by side are not copied;
     /// anything else that NumPy takes is converted.
     ///
-    /// candidates: how many actions are drawn in each state. rule: which of them is taken, "best", "softmax:TEMPERATURE" or
-    ///     "nearest". value: what the critics' values of an action count as, "mean" or "min". None: what the file says (`choice`).
+    /// candidates: how many actions are drawn in each state. rule: which of them is taken, "best", "softmax:TEMPERATURE",
+    ///     "average:TEMPERATURE:ACTIONS" (the mean of so many) or "nearest". value: what the critics' values of an action count as, "mean" or "min". None: what the file says (`choice`).
     /// seed: an int: row i draws from seed + i, so that one observation gives what an evaluator does in the first step of the
     ///     episode of that seed. A sequence of n ints: a seed for each row. None: fresh random numbers.
     ///

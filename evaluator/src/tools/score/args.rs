@@ -42,8 +42,8 @@ pub struct ScoreArgs {
     /// [default: the snapshot's]
     #[arg(long, value_name = "N,..", value_delimiter = ',', value_parser = value_parser!(u32).range(1..=MOST_CANDIDATES))]
     pub candidates: Vec<u32>,
-    /// How the policy chooses among the sampled actions: best, softmax:TEMPERATURE (a draw), average:TEMPERATURE:ACTIONS (the mean of so many draws) or nearest (to a value function)
-    /// [default: the snapshot's]
+    /// How the policy chooses among the sampled actions: best, softmax:TEMPERATURE (a draw), average:TEMPERATURE:ACTIONS (the
+    /// mean of so many draws) or nearest (to a value function) [default: the snapshot's]
     #[arg(long, value_name = "RULE")]
     pub rule: Option<Rule>,
     /// How the critics' values of an action are combined: mean or min [default: the snapshot's]
