@@ -1,12 +1,12 @@
 //! A learner under test: its endpoints, its metrics, and what is in the folder of its run.
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 use std::fs;
 use std::path::{Path, PathBuf};
 use std::process::Command;
 use std::time::Duration;
 
-use serde_json::Value;
+use quad_run::run::{RunDir, RunEndpoints, ScoreLine};
 
 use crate::process::{Process, binary};
 use crate::{PATIENCE, eventually, http};
@@ -22,17 +22,17 @@ pub struct Learner {
 impl Learner {
     /// The endpoint that evaluators connect to, once it listens.
     pub fn endpoint(&self) -> String {
-        self.endpoints()["zenoh"][0].as_str().expect("an endpoint is text").to_owned()
+        self.endpoints().zenoh.remove(0)
     }
 
     /// Address of its metrics page.
     pub fn metrics(&self) -> String {
-        self.endpoints()["metrics"].as_str().expect("an address is text").to_owned()
+        self.endpoints().metrics
     }
 
-    fn endpoints(&self) -> Value {
-        let path = self.run_dir.join("endpoints.json");
-        eventually("the learner wrote endpoints.json", PATIENCE, || serde_json::from_slice(&fs::read(&path).ok()?).ok())
+    fn endpoints(&self) -> RunEndpoints {
+        let dir = RunDir::at(&self.run_dir);
+        eventually("the learner wrote endpoints.json", PATIENCE, || dir.read_endpoints().ok())
     }
 
     /// Sum of the samples of `quad_learner_<name>` whose labels contain `label`; nothing if it does not answer.
@@ -57,18 +57,14 @@ impl Learner {
     }
 
     /// The lines of scores.jsonl so far.
-    pub fn scores(&self) -> Vec<Score> {
-        let text = fs::read_to_string(self.run_dir.join("scores.jsonl")).unwrap_or_default();
-        let complete = text.rfind('\n').map_or("", |end| &text[..end]);
-        complete.lines().map(|line| Score(serde_json::from_str(line).expect("a line is a JSON object"))).collect()
+    pub fn scores(&self) -> Vec<ScoreLine> {
+        RunDir::at(&self.run_dir).read_scores().expect("the lines are a learner's")
     }
 
     /// Reads all scores, and asserts that no episode is scored twice.
-    pub fn assert_scores_are_distinct(&self) -> Vec<Score> {
+    pub fn assert_scores_are_distinct(&self) -> Vec<ScoreLine> {
         let scores = self.scores();
-        let mut keys: Vec<_> = scores.iter().map(Score::key).collect();
-        keys.sort_unstable();
-        keys.dedup();
+        let keys: BTreeSet<_> = scores.iter().map(|score| (score.step, score.seed)).collect();
         assert_eq!(keys.len(), scores.len(), "a (step, seed) has two scores");
         scores
     }
@@ -104,35 +100,10 @@ impl Learner {
 
     /// The snapshot that the learner saved after a gradient step.
     pub fn snapshot(&self, step: u64) -> PathBuf {
-        self.run_dir.join(format!("snapshots/step_{step:09}.safetensors"))
+        RunDir::at(&self.run_dir).snapshot_path(step)
     }
 }
 
 fn name_of(path: &Path) -> Option<String> {
     Some(path.file_name()?.to_str()?.to_owned())
-}
-
-/// A line of scores.jsonl.
-pub struct Score(Value);
-
-impl Score {
-    /// Gradient step and episode seed: what has to be scored exactly once.
-    pub fn key(&self) -> (u64, u64) {
-        (self.integer("step"), self.integer("seed"))
-    }
-
-    /// A field that is a whole number.
-    pub fn integer(&self, field: &str) -> u64 {
-        self.0[field].as_u64().unwrap_or_else(|| panic!("{field} is no whole number in {}", self.0))
-    }
-
-    /// A field that is a number.
-    pub fn number(&self, field: &str) -> f64 {
-        self.0[field].as_f64().unwrap_or_else(|| panic!("{field} is no number in {}", self.0))
-    }
-
-    /// A field that is text.
-    pub fn text(&self, field: &str) -> &str {
-        self.0[field].as_str().unwrap_or_else(|| panic!("{field} is no text in {}", self.0))
-    }
 }

@@ -13,7 +13,7 @@
 //! - [`link`]: a connection on which things go wrong.
 //! - [`power`]: what a disk holds after a power cut; [`small_disk`]: one that is soon full.
 //! - [`peers`]: programs that are not ours; where one is missing, a test is skipped or fails.
-//! - [`prometheus`]: one to start, and what to ask any; [`dashboard`]: what Grafana's panels ask it.
+//! - [`prometheus`]: one to start and ask; [`dashboard`]: what Grafana's panels ask it.
 //!
 //! A helper that cannot do its work panics, and so fails its test.
 #![allow(clippy::unwrap_used, clippy::expect_used, clippy::print_stderr)]

@@ -1,4 +1,4 @@
-//! Prometheus: one to start, and what to ask any.
+//! Debian's Prometheus.
 
 use std::fs;
 use std::path::Path;
@@ -10,14 +10,15 @@ use crate::http;
 use crate::process::Process;
 use crate::system::{Scratch, free_port};
 
-/// A Prometheus somewhere.
+/// A Prometheus at work.
 pub struct Prometheus {
     /// Where it answers, e.g. `127.0.0.1:9090`.
-    pub address: String,
+    address: String,
+    _process: Process,
 }
 
 /// Starts Debian's Prometheus with our alert rules, which scrapes the pages of each job twice a second.
-pub fn start(scratch: &Scratch, jobs: &[(&str, &[String])]) -> (Process, Prometheus) {
+pub fn start(scratch: &Scratch, jobs: &[(&str, &[String])]) -> Prometheus {
     let configuration = scratch.path().join("prometheus.yml");
     let rules = Path::new(env!("CARGO_MANIFEST_DIR")).join("../deploy/prometheus/alerts.yml");
     let mut text = format!("global:\n  evaluation_interval: 500ms\nrule_files: [{rules:?}]\nscrape_configs:\n");
@@ -31,7 +32,7 @@ pub fn start(scratch: &Scratch, jobs: &[(&str, &[String])]) -> (Process, Prometh
     command.arg(format!("--config.file={}", configuration.display()));
     command.arg(format!("--storage.tsdb.path={}", scratch.path().join("tsdb").display()));
     command.arg(format!("--web.listen-address={address}"));
-    (Process::start("prometheus", scratch.path(), command), Prometheus { address })
+    Prometheus { address, _process: Process::start("prometheus", scratch.path(), command) }
 }
 
 impl Prometheus {
@@ -43,11 +44,6 @@ impl Prometheus {
         let series = answer["data"]["result"].as_array()?;
         let values = series.iter().filter_map(|one| one["value"][1].as_str()?.parse().ok());
         Some(values.filter(|value: &f64| value.is_finite()).collect())
-    }
-
-    /// The value of an expression now, if it has one.
-    pub fn value(&self, expression: &str) -> Option<f64> {
-        self.query(expression)?.first().copied()
     }
 }
 

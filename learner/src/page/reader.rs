@@ -46,40 +46,33 @@ pub(super) struct Reader {
 }
 
 /// The newest answer to a question, and when it was made.
-#[derive(Default)]
-struct Kept(Option<(Instant, Bytes)>);
+type Kept = Option<(Instant, Bytes)>;
 
-impl Kept {
-    fn get(&self, every: Duration) -> Option<Bytes> {
-        self.0.as_ref().filter(|(made, _)| made.elapsed() < every).map(|(_, answer)| answer.clone())
-    }
-
-    fn set(&mut self, answer: &Value) -> Bytes {
-        let answer = Bytes::from(answer.to_string());
-        self.0 = Some((Instant::now(), answer.clone()));
-        answer
-    }
+/// The answer that is kept, unless it is as old as that: then it is made anew.
+fn answer(kept: &mut Kept, every: Duration, make: impl FnOnce() -> Value) -> Bytes {
+    let young = kept.take().filter(|(made, _)| made.elapsed() < every);
+    kept.insert(young.unwrap_or_else(|| (Instant::now(), make().to_string().into()))).1.clone()
 }
 
 impl Reader {
     pub fn new(root: PathBuf) -> Self {
-        Self { root, list: Kept::default(), dirs: HashMap::new(), runs: HashMap::new() }
+        Self { root, list: None, dirs: HashMap::new(), runs: HashMap::new() }
     }
 
     /// Answers until the web server is gone.
     pub fn run(mut self, questions: &Receiver<Asked>) {
         stay_in_background();
-        while let Ok((question, answer)) = questions.recv() {
+        while let Ok((question, tell)) = questions.recv() {
             let found = match question {
                 Question::Runs => Some(self.list()),
                 Question::Run(name) => self.of_run(name),
             };
-            answer.send(found).ok();
+            tell.send(found).ok();
         }
     }
 
     fn list(&mut self) -> Bytes {
-        self.list.get(LIST_EVERY).unwrap_or_else(|| {
+        answer(&mut self.list, LIST_EVERY, || {
             let entries = list::list(std::slice::from_ref(&self.root));
             self.dirs = entries.iter().map(|entry| (entry.name.clone(), entry.dir.clone())).collect();
             let shown = entries.iter().map(|entry| {
@@ -89,7 +82,7 @@ impl Reader {
                 }
                 shown
             });
-            self.list.set(&shown.collect())
+            shown.collect()
         })
     }
 
@@ -101,12 +94,9 @@ impl Reader {
         if self.runs.len() >= MOST_KEPT && !self.runs.contains_key(&name) {
             self.runs.clear();
         }
-        let (run, kept) = self.runs.entry(name).or_insert_with(|| (RunPage::of(dir), Kept::default()));
-        let answer = kept.get(RUN_EVERY);
-        Some(answer.unwrap_or_else(|| {
-            let answer = run.read().unwrap_or_else(|error| json!({ "error": format!("{error:#}") }));
-            kept.set(&answer)
-        }))
+        let (run, kept) = self.runs.entry(name).or_insert_with(|| (RunPage::of(dir), None));
+        let read = || run.read().unwrap_or_else(|error| json!({ "error": format!("{error:#}") }));
+        Some(answer(kept, RUN_EVERY, read))
     }
 }
 

@@ -8,7 +8,6 @@ mod foreign;
 #[path = "../../../tests/fixtures/hopper.rs"]
 mod hopper;
 mod list;
-mod online;
 mod presets;
 mod published;
 mod report;

@@ -117,7 +117,7 @@ impl System {
 
 fn keys_of(learner: &Learner) -> BTreeSet<Key> {
     let scores = learner.scores();
-    scores.iter().map(|score| (score.key().0, score.key().1, score.text("weights").to_owned())).collect()
+    scores.iter().map(|score| (score.step, score.seed, score.weights.clone())).collect()
 }
 
 /// Cuts the power of a learner at work, again and again. Before some cuts the learner is killed, and another one builds on what it

@@ -86,13 +86,13 @@ fn weights_that_come_out_otherwise_for_a_scored_step_end_the_run() {
     learner.process.kill();
     fs::remove_dir_all(learner.run_dir.join("checkpoints")).ok();
     let first = learner.scores().remove(0);
-    let snapshot = learner.snapshot(first.key().0);
+    let snapshot = learner.snapshot(first.step);
     let mut bytes = fs::read(&snapshot).unwrap();
     *bytes.last_mut().unwrap() ^= 1;
     fs::write(&snapshot, &bytes).unwrap();
     let log = learner.run_dir.join("scores.jsonl");
     let weights = Hash::of(&bytes).to_string();
-    fs::write(&log, fs::read_to_string(&log).unwrap().replace(first.text("weights"), &weights)).unwrap();
+    fs::write(&log, fs::read_to_string(&log).unwrap().replace(&first.weights, &weights)).unwrap();
     let mut learner = scratch.learner("run", LONG);
     assert_eq!(learner.process.wait(PATIENCE).code(), Some(1));
     let said = learner.process.log();

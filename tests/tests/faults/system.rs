@@ -5,7 +5,8 @@ use std::fs;
 use std::thread::sleep;
 use std::time::Duration;
 
-use quad_protocol::{EpisodeScore, Hash, ScoreReply, ScoreReport, decode, encode, keys};
+use quad_protocol::{Hash, ScoreReply, ScoreReport, decode, encode, keys};
+use quad_run::run::ScoreLine;
 use quad_tests::PATIENCE;
 use quad_tests::learner::Learner;
 use quad_tests::link::{Link, Trouble};
@@ -175,13 +176,8 @@ impl System {
     fn deliver_again(&self) {
         let scores = self.learner.scores();
         let Some(last) = scores.last() else { return };
-        let step = last.integer("step");
-        let episodes = scores.iter().filter(|score| score.integer("step") == step).map(|score| EpisodeScore {
-            seed: score.integer("seed"),
-            episode_return: score.number("return"),
-            length: score.integer("length") as u32,
-            score: score.number("score"),
-        });
+        let step = last.step;
+        let episodes = scores.iter().filter(|score| score.step == step).map(ScoreLine::episode);
         let report = ScoreReport {
             evaluator: name("echo"),
             run: name("run"),
@@ -189,7 +185,7 @@ impl System {
             job: 1,
             step,
             weights: Hash::of(&fs::read(self.learner.snapshot(step)).unwrap()),
-            precision: name(last.text("precision")),
+            precision: name(&last.precision),
             episodes: episodes.collect(),
         };
         let query = self.router.as_ref().expect("it is there").get(keys::scores(&report.run));

@@ -48,7 +48,7 @@ async fn nonsense_on_every_key_is_counted_and_survived() {
     let session = router(&endpoint).await;
     let mut learner = scratch.learner_with("run", ENDLESS, &["--connect", &endpoint]);
     let mut evaluator = scratch.evaluator("brave", &endpoint);
-    let first = eventually("there are scores", PATIENCE, || Some(learner.scores().first()?.key().0));
+    let first = eventually("there are scores", PATIENCE, || Some(learner.scores().first()?.step));
 
     let run = name("run");
     let replies = session.get(keys::weights_at(&run, first)).await.unwrap();

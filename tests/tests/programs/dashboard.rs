@@ -24,6 +24,6 @@ fn every_panel_shows_data() {
     let evaluators = ["first", "second"].map(|name| scratch.evaluator(name, &learner.endpoint()));
     let pages = evaluators.each_ref().map(|evaluator| evaluator.metrics());
     let jobs: [(&str, &[String]); 2] = [("learner", &[learner.metrics()]), ("evaluator", &pages)];
-    let (_process, prometheus) = prometheus::start(&scratch, &jobs);
+    let prometheus = prometheus::start(&scratch, &jobs);
     dashboard::assert_every_panel_shows_data(&prometheus, Duration::from_secs(60));
 }

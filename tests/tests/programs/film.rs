@@ -55,11 +55,11 @@ fn a_film_shows_the_episode_that_is_scored() {
     let folder = scratch.path();
     let (first, last) = (learner.snapshot(20), learner.snapshot(40));
     let [first, last] = [&first, &last].map(|path| path.to_str().unwrap());
-    let score = learner.scores().into_iter().find(|score| score.key().0 == 40).unwrap();
-    let seed = score.key().1.to_string();
+    let score = learner.scores().into_iter().find(|score| score.step == 40).unwrap();
+    let seed = score.seed.to_string();
 
     let told = said(&film(folder, &[last, "--seed", &seed]).output().unwrap());
-    let (length, episode_return) = (score.integer("length"), score.number("return"));
+    let (length, episode_return) = (u64::from(score.length), score.episode_return);
     let words = format!("seed {seed}, {length} steps, return {episode_return:.2}, {} candidates", SETTING.candidates);
     assert!(told.contains(&words), "{words:?} is not in {told:?}");
     let (size, frames) = frames(&folder.join("film.gif"));

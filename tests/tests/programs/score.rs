@@ -5,7 +5,7 @@ use std::path::Path;
 use std::process::{Command, Output};
 
 use quad_tests::PATIENCE;
-use quad_tests::learner::{Learner, Score};
+use quad_tests::learner::Learner;
 use quad_tests::process::binary;
 use quad_tests::setting::Setting;
 use quad_tests::system::Scratch;
@@ -55,17 +55,16 @@ fn a_snapshot_gets_the_scores_that_its_run_has() {
         let scored = read(&score("2", &snapshots, &["--precision", precision, "--json"]));
         assert_eq!(scored.len(), steps.len());
         for ((scored, &step), snapshot) in scored.iter().zip(&steps).zip(snapshots) {
-            let of_run: Vec<_> = learner.scores().into_iter().filter(|score| score.key().0 == step).collect();
+            let of_run: Vec<_> = learner.scores().into_iter().filter(|score| score.step == step).collect();
             let same = |field: &str, value: &str| assert_eq!(scored[field], value, "{field}");
             same("snapshot", snapshot.to_str().unwrap());
-            same("weights", of_run[0].text("weights"));
-            same("precision", of_run[0].text("precision"));
+            same("weights", &of_run[0].weights);
+            same("precision", &of_run[0].precision);
             assert_eq!(scored["step"], step);
             assert_eq!(scored["choice"], json!({ "candidates": SETTING.candidates, "value": "mean", "rule": "best" }));
-            let bits = |score: &Score, field| score.number(field).to_bits();
             let mut of_run: Vec<_> = of_run
                 .iter()
-                .map(|score| (score.key().1, score.integer("length"), bits(score, "return"), bits(score, "score")))
+                .map(|s| (s.seed, s.length.into(), s.episode_return.to_bits(), s.score.to_bits()))
                 .collect();
             let mut again = episodes(scored);
             of_run.sort_unstable();

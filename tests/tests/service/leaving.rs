@@ -55,13 +55,20 @@ fn a_stderr_that_is_never_read_holds_up_neither_the_work_nor_the_end() {
     assert!(checkpoints > 0, "it has left without a checkpoint");
 }
 
+/// After a crash, the token of the dead learner is still there for some seconds.
 #[tokio::test(flavor = "multi_thread")]
-async fn a_learner_that_waits_for_another_to_be_gone_leaves_in_order() {
+async fn a_learner_that_waits_for_another_to_be_gone_hears_of_a_failure_and_leaves_in_order() {
     let scratch = Scratch::new();
     let endpoint = free_endpoint();
     let session = router(&endpoint).await;
     let _other = session.liveliness().declare_token(keys::live_learner(&name("run"), 1)).await.unwrap();
-    let mut learner = scratch.learner_with("run", ENDLESS, &["--connect", &endpoint]);
+    let diverges = ["--connect", &endpoint, "--agent", "critic_learning_rate=1e30"];
+    let mut learner = scratch.learner_with("run", ENDLESS, &diverges);
+    assert_eq!(learner.process.wait(PATIENCE).code(), Some(1));
+    // One that heard nothing would say after eight seconds that there is another learner.
+    assert!(learner.process.log().contains("training diverged"), "{}", learner.process.log());
+
+    let mut learner = scratch.learner_with("run", ENDLESS, &["--connect", &endpoint, "--fresh"]);
     learner.process.wait_for_log("waiting to see if it is gone", PATIENCE);
     assert_eq!(learner.process.terminate(PATIENCE).code(), Some(75), "{}", learner.process.log());
     assert!(learner.process.log().contains("the same command continues from there"), "{}", learner.process.log());
