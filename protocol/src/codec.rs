@@ -47,51 +47,24 @@ pub trait Message: Encode + Decode<()> {
 
 /// Why bytes are not the expected message, or a message cannot be sent.
 #[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
+#[allow(missing_docs)] // The sentences say what each is.
 pub enum CodecError {
-    /// The bytes do not start like a frame.
     #[error("this is no QUAD message")]
     NotQuad,
-    /// The sender speaks another version.
     #[error("the message has protocol version {theirs}, this program speaks {ours}: update the older of the two")]
-    Version {
-        /// Version of the message.
-        theirs: u16,
-        /// Version of this program.
-        ours: u16,
-    },
-    /// It is another message.
+    Version { theirs: u16, ours: u16 },
     #[error("the message is of kind {found}, kind {expected} belongs here")]
-    Kind {
-        /// Kind of the message.
-        found: u8,
-        /// Kind that was expected.
-        expected: u8,
-    },
-    /// The end is missing.
+    Kind { found: u8, expected: u8 },
     #[error("the message is cut off")]
     Truncated,
-    /// It is larger than any honest message of its kind.
     #[error("the message has {length} bytes, at most {limit} are allowed")]
-    Oversized {
-        /// Length of the frame, bytes.
-        length: usize,
-        /// Largest frame of this kind, bytes.
-        limit: usize,
-    },
-    /// Something follows the message.
+    Oversized { length: usize, limit: usize },
     #[error("{0} bytes follow the message")]
     Trailing(usize),
-    /// A field has a value that it cannot have.
     #[error("the message is malformed: {0}")]
     Malformed(String),
-    /// The file is not the one that the hash was made of.
     #[error("the file has the hash {found}, not {claimed} as the message says")]
-    Hash {
-        /// The hash in the message.
-        claimed: Hash,
-        /// The hash of the file.
-        found: Hash,
-    },
+    Hash { claimed: Hash, found: Hash },
 }
 
 impl CodecError {

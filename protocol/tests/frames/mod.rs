@@ -24,6 +24,21 @@ pub fn frames() -> Vec<Vec<u8>> {
     frames
 }
 
+/// Decodes bytes as a message of each kind. What can be read is what is sent on.
+pub fn decode_as_each(bytes: &[u8]) {
+    fn read<M: Message>(bytes: &[u8]) {
+        if let Ok(message) = decode::<M>(bytes) {
+            assert_eq!(encode(&message).unwrap(), bytes);
+        }
+    }
+    read::<Snapshot>(bytes);
+    read::<JobRequest>(bytes);
+    read::<JobReply>(bytes);
+    read::<ScoreReport>(bytes);
+    read::<ScoreReply>(bytes);
+    read::<Progress>(bytes);
+}
+
 fn name() -> Name {
     Name::new("some-name").unwrap()
 }
