@@ -91,16 +91,4 @@ mod tests {
             assert!(sha256.is_none() || dataset.bytes.is_some(), "{name}");
         }
     }
-
-    #[test]
-    fn every_row_of_the_papers_first_table_can_be_verified() {
-        for environment in ["hopper", "halfcheetah", "walker2d"] {
-            for kind in ["medium", "medium-replay", "medium-expert"] {
-                assert!(find(&format!("{environment}-{kind}-v2")).unwrap().bytes.is_some());
-            }
-        }
-        for kind in ["umaze", "umaze-diverse", "medium-play", "medium-diverse", "large-play", "large-diverse"] {
-            assert!(find(&format!("antmaze-{kind}-v0")).unwrap().bytes.is_some());
-        }
-    }
 }

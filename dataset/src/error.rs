@@ -30,131 +30,81 @@ impl DatasetError {
 
 /// What can be wrong with a dataset. Arrays are called by their path in the file; rows count from 0.
 #[derive(Debug, thiserror::Error)]
-#[allow(missing_docs)] // The fields are what the sentences name.
+#[allow(missing_docs)] // The sentences say what each is.
 pub enum Problem {
-    /// The operating system refused.
     #[error("cannot be opened or written")]
     Io(#[source] io::Error),
-    /// A file of some other kind.
     #[error("neither an HDF5 file nor an npz archive")]
     UnknownFormat,
-    /// A folder that is no Minari dataset.
     #[error("a folder without main_data.hdf5, so no Minari dataset that is stored as HDF5")]
     UnknownFolder,
-    /// A file or folder of a format that is known, but not read.
     #[error("{what}, which is none of the formats that are read")]
     Foreign { what: String, load: &'static str },
-    /// Another program writes the HDF5 file, or the file system has no locks to tell.
     #[error("locked: another program has it open for writing, or its file system has no locks")]
     Locked(#[source] hdf5::Error),
-    /// The program that wrote the HDF5 file ended without closing it.
     #[error("not closed by the program that wrote it")]
     NotClosed(#[source] hdf5::Error),
-    /// An HDF5 file says that it is longer than it is.
     #[error("cut short: {bytes} bytes are there of {expected}")]
     Truncated { bytes: u64, expected: u64 },
-    /// HDF5 does not recognise the file as a whole one of its own.
     #[error("not an HDF5 file, or a damaged or incomplete one")]
     DamagedHdf5(#[source] hdf5::Error),
-    /// The npz archive is not whole.
     #[error("a damaged or incomplete npz archive")]
     DamagedNpz(#[source] zip::result::ZipError),
-    /// Minari's metadata is not what Minari writes.
     #[error("cannot be understood")]
     Metadata(#[source] serde_json::Error),
-    /// A value of the root attribute `layout` that means nothing.
     #[error("the attribute `layout` is {found:?}, but the only value with a meaning is \"transitions\"")]
     UnknownLayout { found: String },
-    /// An array that the layout asks for is absent.
     #[error("array `{array}` is missing")]
     Missing { array: String },
-    /// An array holds another kind of elements.
     #[error("array `{array}` holds {found}, but must hold {expected}")]
     Type { array: String, found: String, expected: &'static str },
-    /// Neither a list of numbers nor a list of rows of them.
     #[error("array `{array}` has shape {found:?}, but must have one or two axes: rows, and the numbers in each")]
     Axes { array: String, found: Vec<usize> },
-    /// An array has another shape than the environment and the other arrays ask for.
     #[error("array `{array}` has shape {found:?}, but must have {expected:?}")]
     Shape { array: String, found: Vec<usize>, expected: Vec<usize> },
-    /// An array in memory has another length than the sizes ask for.
     #[error("array `{array}` has {found} numbers, but {rows} rows of {width} are {}", .rows * .width)]
     Numbers { array: String, found: usize, rows: usize, width: usize },
-    /// An array claims more elements than a file of that size can hold.
     #[error("array `{array}` claims the shape {found:?}, more than a file of {bytes} bytes can hold")]
     Oversized { array: String, found: Vec<usize>, bytes: u64 },
-    /// An array is compressed by a filter that this program's HDF5 library does not have.
     #[error("array `{array}` is compressed by HDF5's filter {filter}, which this program cannot read")]
     Filter { array: String, filter: String },
-    /// A virtual or external array, or a link that leads nowhere.
     #[error("array `{array}` is not in this file: it leads to numbers that lie elsewhere")]
     Elsewhere { array: String },
-    /// HDF5 or the archive fails in the middle of an array.
     #[error("array `{array}` cannot be read")]
     Unreadable {
         array: String,
         #[source]
         source: Box<dyn Error + Send + Sync>,
     },
-    /// Fewer episodes than Minari's metadata promises.
     #[error("{found} episodes, but metadata.json says {expected}")]
     Episodes { found: usize, expected: usize },
-    /// Minari's Dicts within Dicts, or a file of another layout.
     #[error("`{array}` is a group of arrays, but must be an array")]
     Group { array: String },
-    /// Recorded in another environment than the one that is asked for.
     #[error("recorded in `{claimed}`, which is not `{expected}`")]
     OtherEnvironment { claimed: String, expected: String },
-    /// Numbers in a row that are not the environment's.
     #[error("`{array}` has {found} numbers a row, but `{environment}` has {expected}")]
     Width { array: &'static str, found: usize, expected: usize, environment: String },
-    /// NaN or an infinity.
     #[error("array `{array}`, row {row}: {value} is not a finite float32{}", such_rows(*.rows))]
-    NotFinite {
-        array: String,
-        row: usize,
-        value: f32,
-        /// Rows with such a number.
-        rows: usize,
-    },
-    /// A flag that is neither 0 nor 1.
+    NotFinite { array: String, row: usize, value: f32, rows: usize },
     #[error("array `{array}`, row {row}: {value} is neither 0 nor 1")]
     NotBoolean { array: String, row: usize, value: f32 },
-    /// An action that no policy here can take unless it is scaled.
     #[error("array `{array}`, row {row}: the action {value} is outside [-1, 1]{}", such_rows(*.rows))]
-    ActionOutside {
-        array: String,
-        row: usize,
-        value: f32,
-        /// Rows with such a number.
-        rows: usize,
-    },
-    /// Actions of which each is one of a few, which no policy here can take.
+    ActionOutside { array: String, row: usize, value: f32, rows: usize },
     #[error("array `{array}` holds whole numbers, as if actions were discrete; only continuous ones can be learnt")]
     DiscreteActions { array: String },
-    /// A D4RL file whose rows do not follow one another.
     #[error(
         "array `next_observations`, row {row}: not the observation of the row that follows, though the episode continues there{}",
         such_rows(*.rows)
     )]
-    Stray {
-        row: usize,
-        /// Rows with such a next observation.
-        rows: usize,
-    },
-    /// All rows make one episode, so that resets would be taken for steps.
+    Stray { row: usize, rows: usize },
     #[error("{rows} rows without any terminal or timeout, as if they were one endless episode")]
     Endless { rows: usize },
-    /// The rules leave no transition.
     #[error("{rows} rows, of which none makes a transition")]
     NoTransitions { rows: usize },
-    /// The locomotion rule divides by the spread of the trajectories' returns, and there is none.
     #[error("all trajectories have the same return, so the reward rule `locomotion` cannot scale them")]
     SameReturns,
-    /// HDF5 fails while writing.
     #[error("cannot be written")]
     Write(#[source] hdf5::Error),
-    /// A row that would make the file unreadable.
     #[error("row {row} cannot be written: `{array}` {problem}")]
     BadRow { row: usize, array: &'static str, problem: String },
 }

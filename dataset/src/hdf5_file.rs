@@ -87,35 +87,35 @@ impl Hdf5File {
     }
 
     /// Rows of an array, and numbers in each.
-    pub(crate) fn size(&self, array: &str) -> Result<(usize, usize), DatasetError> {
-        let empty = Array::<f32>::new(array, &self.dataset(array)?.shape(), Vec::new());
-        empty.map(|array| (array.rows(), array.width)).map_err(|problem| self.error(problem))
+    pub(crate) fn size(&self, array: &str) -> Result<(usize, usize), Problem> {
+        let empty = Array::<f32>::new(array, &self.dataset(array)?.shape(), Vec::new())?;
+        Ok((empty.rows(), empty.width))
     }
 
     /// An array of numbers, converted to `T`, that may be NaN.
-    pub(crate) fn numbers<T: H5Type>(&self, array: &str) -> Result<Array<T>, DatasetError> {
+    pub(crate) fn numbers<T: H5Type>(&self, array: &str) -> Result<Array<T>, Problem> {
         let dataset = self.dataset(array)?;
         self.descriptor(&dataset, array, NUMBERS)?;
         let shape = self.check_size(&dataset, array)?;
-        let values = dataset.read_raw::<T>().map_err(|source| self.unreadable(array, source))?;
-        Array::new(array, &shape, values).map_err(|problem| self.error(problem))
+        let values = dataset.read_raw::<T>().map_err(|source| unreadable(array, source))?;
+        Array::new(array, &shape, values)
     }
 
     /// An array of actions: numbers whose type says that they are continuous.
-    pub(crate) fn actions(&self, array: &str) -> Result<Array<f32>, DatasetError> {
+    pub(crate) fn actions(&self, array: &str) -> Result<Array<f32>, Problem> {
         match self.descriptor(&self.dataset(array)?, array, NUMBERS)? {
             TypeDescriptor::Float(_) => self.numbers(array),
-            _ => Err(self.error(Problem::DiscreteActions { array: array.to_owned() })),
+            _ => Err(Problem::DiscreteActions { array: array.to_owned() }),
         }
     }
 
     /// An array of `rows × width` numbers.
-    pub(crate) fn table<T: H5Type>(&self, array: &str, rows: usize, width: usize) -> Result<Vec<T>, DatasetError> {
-        self.numbers(array)?.sized(rows, width).map_err(|problem| self.error(problem))
+    pub(crate) fn table<T: H5Type>(&self, array: &str, rows: usize, width: usize) -> Result<Vec<T>, Problem> {
+        self.numbers(array)?.sized(rows, width)
     }
 
     /// An array of one flag a row.
-    pub(crate) fn flags(&self, array: &str, rows: usize) -> Result<Vec<bool>, DatasetError> {
+    pub(crate) fn flags(&self, array: &str, rows: usize) -> Result<Vec<bool>, Problem> {
         let dataset = self.dataset(array)?;
         let descriptor = self.descriptor(&dataset, array, FLAGS)?;
         let shape = self.check_size(&dataset, array)?;
@@ -124,32 +124,26 @@ impl Hdf5File {
             // Not read as `bool`: a damaged file may hold any byte. HDF5 saturates, so nothing else becomes 0 or 1.
             _ => dataset.read_raw::<i8>().map(|values| values.into_iter().map(f32::from).collect()),
         };
-        let values = values.map_err(|source| self.unreadable(array, source))?;
-        Array::new(array, &shape, values)
-            .and_then(|array| array.into_flags(rows))
-            .map_err(|problem| self.error(problem))
+        let values = values.map_err(|source| unreadable(array, source))?;
+        Array::new(array, &shape, values).and_then(|array| array.into_flags(rows))
     }
 
-    pub(crate) fn error(&self, problem: Problem) -> DatasetError {
-        DatasetError::new(&self.path, problem)
-    }
-
-    fn dataset(&self, array: &str) -> Result<hdf5::Dataset, DatasetError> {
+    fn dataset(&self, array: &str) -> Result<hdf5::Dataset, Problem> {
         if !self.has(array) {
-            return Err(self.error(Problem::Missing { array: array.to_owned() }));
+            return Err(Problem::Missing { array: array.to_owned() });
         }
         let name = || array.to_owned();
         let dataset = self.file.dataset(array).map_err(|source| match self.file.group(array) {
-            Ok(_) => self.error(Problem::Group { array: name() }),
-            Err(_) if self.is_link(array) => self.error(Problem::Elsewhere { array: name() }),
-            Err(_) => self.unreadable(array, source),
+            Ok(_) => Problem::Group { array: name() },
+            Err(_) if self.is_link(array) => Problem::Elsewhere { array: name() },
+            Err(_) => unreadable(array, source),
         })?;
-        let creation = dataset.dcpl().map_err(|source| self.unreadable(array, source))?;
+        let creation = dataset.dcpl().map_err(|source| unreadable(array, source))?;
         if creation.layout() == Layout::Virtual || !creation.external().is_empty() {
-            return Err(self.error(Problem::Elsewhere { array: name() }));
+            return Err(Problem::Elsewhere { array: name() });
         }
         match creation.filters().iter().find(|filter| !filter.is_available()) {
-            Some(filter) => Err(self.error(Problem::Filter { array: name(), filter: filter_name(filter.id()) })),
+            Some(filter) => Err(Problem::Filter { array: name(), filter: filter_name(filter.id()) }),
             None => Ok(dataset),
         }
     }
@@ -166,9 +160,9 @@ impl Hdf5File {
         dataset: &hdf5::Dataset,
         array: &str,
         expected: &'static str,
-    ) -> Result<TypeDescriptor, DatasetError> {
-        let wrong = |found: String| self.error(Problem::Type { array: array.to_owned(), found, expected });
-        let datatype = dataset.dtype().map_err(|source| self.unreadable(array, source))?;
+    ) -> Result<TypeDescriptor, Problem> {
+        let wrong = |found: String| Problem::Type { array: array.to_owned(), found, expected };
+        let datatype = dataset.dtype().map_err(|source| unreadable(array, source))?;
         // `to_descriptor` reads an enum's member into 8 bytes, whatever size the file gives it.
         if datatype.size() > MAX_ELEMENT_BYTES {
             return Err(wrong(format!("elements of {} bytes", datatype.size())));
@@ -181,20 +175,20 @@ impl Hdf5File {
         }
     }
 
-    fn check_size(&self, dataset: &hdf5::Dataset, array: &str) -> Result<Vec<usize>, DatasetError> {
+    fn check_size(&self, dataset: &hdf5::Dataset, array: &str) -> Result<Vec<usize>, Problem> {
         let shape = dataset.shape();
         let claimed = shape.iter().fold(1u64, |product, &axis| product.saturating_mul(axis as u64));
         let rows = shape.first().copied().unwrap_or(0);
         if claimed > self.bytes.saturating_mul(MAX_COMPRESSION) || rows > u32::MAX as usize {
             let array = array.to_owned();
-            return Err(self.error(Problem::Oversized { array, found: shape, bytes: self.bytes }));
+            return Err(Problem::Oversized { array, found: shape, bytes: self.bytes });
         }
         Ok(shape)
     }
+}
 
-    fn unreadable(&self, array: &str, source: hdf5::Error) -> DatasetError {
-        self.error(Problem::Unreadable { array: array.to_owned(), source: source.into() })
-    }
+fn unreadable(array: &str, source: hdf5::Error) -> Problem {
+    Problem::Unreadable { array: array.to_owned(), source: source.into() }
 }
 
 /// Why HDF5 refuses a file of `bytes` bytes that begins like this.

@@ -37,30 +37,28 @@ impl NpzFile {
         self.archive.index_for_name(&entry(array)).is_some()
     }
 
+    pub(crate) fn path(&self) -> &Path {
+        &self.path
+    }
+
     /// An array of numbers, converted to float32, that may be NaN.
-    pub(crate) fn numbers(&mut self, array: &str) -> Result<Array<f32>, DatasetError> {
-        self.read(array, false).map_err(|problem| self.error(problem))
+    pub(crate) fn numbers(&mut self, array: &str) -> Result<Array<f32>, Problem> {
+        self.read(array, false)
     }
 
     /// An array of actions: numbers whose type says that they are continuous.
-    pub(crate) fn actions(&mut self, array: &str) -> Result<Array<f32>, DatasetError> {
-        self.read(array, true).map_err(|problem| self.error(problem))
+    pub(crate) fn actions(&mut self, array: &str) -> Result<Array<f32>, Problem> {
+        self.read(array, true)
     }
 
     /// An array of `rows × width` numbers.
-    pub(crate) fn table(&mut self, array: &str, rows: usize, width: usize) -> Result<Vec<f32>, DatasetError> {
-        let table = self.numbers(array)?.sized(rows, width);
-        table.map_err(|problem| self.error(problem))
+    pub(crate) fn table(&mut self, array: &str, rows: usize, width: usize) -> Result<Vec<f32>, Problem> {
+        self.numbers(array)?.sized(rows, width)
     }
 
     /// An array of one flag a row, which may be stored as numbers.
-    pub(crate) fn flags(&mut self, array: &str, rows: usize) -> Result<Vec<bool>, DatasetError> {
-        let flags = self.numbers(array)?.into_flags(rows);
-        flags.map_err(|problem| self.error(problem))
-    }
-
-    pub(crate) fn error(&self, problem: Problem) -> DatasetError {
-        DatasetError::new(&self.path, problem)
+    pub(crate) fn flags(&mut self, array: &str, rows: usize) -> Result<Vec<bool>, Problem> {
+        self.numbers(array)?.into_flags(rows)
     }
 
     fn read(&mut self, array: &str, continuous: bool) -> Result<Array<f32>, Problem> {

@@ -46,7 +46,8 @@ pub struct RecordedRows {
 /// The environments of the table whose sizes a file has.
 pub fn environments_of_its_sizes(path: impl AsRef<Path>) -> Result<Vec<&'static EnvironmentSpec>, DatasetError> {
     let file = Hdf5File::open(path.as_ref())?;
-    let sizes = (file.size("observations")?.1, file.size("actions")?.1);
+    let size = |array| file.size(array).map_err(|problem| DatasetError::new(file.path(), problem));
+    let sizes = (size("observations")?.1, size("actions")?.1);
     Ok(environment::all().iter().filter(|spec| (spec.observation_dim, spec.action_dim) == sizes).collect())
 }
 
@@ -57,8 +58,12 @@ impl RecordedRows {
     /// Reads a file recorded in `environment`.
     pub fn read(path: impl AsRef<Path>, environment: &'static EnvironmentSpec) -> Result<Self, DatasetError> {
         let file = Hdf5File::open(path.as_ref())?;
+        Self::of(&file, environment).map_err(|problem| DatasetError::new(file.path(), problem))
+    }
+
+    fn of(file: &Hdf5File, environment: &'static EnvironmentSpec) -> Result<Self, Problem> {
         let (rows, _) = file.size("actions")?;
-        let table = |array, width| finite(&file, array, rows, width);
+        let table = |array, width| finite(file, array, rows, width);
         Ok(Self {
             environment,
             observations: table("observations", environment.observation_dim)?,
@@ -124,11 +129,11 @@ impl RecordedRows {
 }
 
 /// An array of numbers, none of which may be NaN or infinite.
-fn finite(file: &Hdf5File, array: &str, rows: usize, width: usize) -> Result<Vec<f64>, DatasetError> {
+fn finite(file: &Hdf5File, array: &str, rows: usize, width: usize) -> Result<Vec<f64>, Problem> {
     let values: Vec<f64> = file.table(array, rows, width)?;
     if let Some(i) = values.iter().position(|value| !value.is_finite()) {
         let (row, value) = (i / width, values[i] as f32);
-        return Err(file.error(Problem::NotFinite { array: array.to_owned(), row, value, rows: 1 }));
+        return Err(Problem::NotFinite { array: array.to_owned(), row, value, rows: 1 });
     }
     Ok(values)
 }

@@ -59,16 +59,12 @@ mod tests {
 
     #[test]
     fn each_name_says_what_its_rule_does_to_rewards_of_0_and_1() {
-        #[derive(Deserialize)]
-        struct Keys {
-            reward: RewardRule,
-        }
         // The returns are from -1 to 3.
         for (name, of_0, of_1) in
             [("locomotion", 0.0, 250.0), ("as-is", 0.0, 1.0), ("subtract-1", -1.0, 0.0), ("centre-times-4", -2.0, 2.0)]
         {
-            let keys: Keys = toml::from_str(&format!("reward = '{name}'")).unwrap();
-            let scaling = keys.reward.scaling(&[3.0, -1.0, 0.5]).unwrap();
+            let rule: RewardRule = serde_json::from_value(name.into()).unwrap();
+            let scaling = rule.scaling(&[3.0, -1.0, 0.5]).unwrap();
             assert_eq!((scaling.apply(0.0), scaling.apply(1.0)), (of_0, of_1), "{name}");
         }
     }

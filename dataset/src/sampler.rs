@@ -93,14 +93,9 @@ mod tests {
     }
 
     #[test]
-    fn the_seed_alone_decides_the_order() {
-        assert_eq!(passes(50, 7, 120), passes(50, 7, 120));
-        assert_ne!(passes(50, 7, 120), passes(50, 8, 120));
-    }
-
-    #[test]
     fn a_sampler_goes_on_where_another_one_was() {
         let all = passes(50, 7, 240);
+        assert_ne!(all, passes(50, 8, 240));
         for batches in [0, 1, 7, 10, 16, 20, 33] {
             let mut sampler = BatchSampler::new(50, 5, 7, batches);
             let rest: Vec<u32> = (0..25).map(|_| sampler.draw()).collect();

@@ -90,18 +90,3 @@ pub(crate) fn returns(rewards: impl Iterator<Item = (f32, bool)>) -> Vec<f64> {
     finished.extend(open);
     finished
 }
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn what_is_gained_after_the_goal_does_not_count() {
-        let sum = |goal| {
-            let mut episode = Episode::default();
-            [0.0, 1.0, 1.0, 0.0, 1.0].into_iter().for_each(|reward| episode.push(reward, goal));
-            (episode.length, episode.sum)
-        };
-        assert_eq!((sum(true), sum(false)), ((5, 1.0), (5, 3.0)));
-    }
-}

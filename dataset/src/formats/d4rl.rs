@@ -1,7 +1,7 @@
 //! D4RL's HDF5 files, of all its versions, and AntMaze's.
 
 use crate::environment::EnvironmentSpec;
-use crate::error::DatasetError;
+use crate::error::Problem;
 use crate::hdf5_file::Hdf5File;
 use crate::recording::{Recording, RowKind};
 
@@ -11,10 +11,10 @@ use crate::recording::{Recording, RowKind};
 ///
 /// Without timeouts, a row at which an episode reaches the environment's time limit counts as one. Where the file stores
 /// `next_observations`, they are kept aside, to see whether the rows follow one another at all.
-pub(super) fn read(file: &Hdf5File, environment: Option<&EnvironmentSpec>) -> Result<Recording, DatasetError> {
+pub(super) fn read(file: &Hdf5File, environment: Option<&EnvironmentSpec>) -> Result<Recording, Problem> {
     let observations = file.numbers("observations")?;
     let rows = observations.rows();
-    let actions = file.actions("actions")?.of_rows(rows).map_err(|problem| file.error(problem))?;
+    let actions = file.actions("actions")?.of_rows(rows)?;
     let terminals = file.flags("terminals", rows)?;
     let timeouts = match (file.has("timeouts"), environment) {
         (true, _) => file.flags("timeouts", rows)?,
@@ -62,26 +62,4 @@ fn derive_timeouts(terminals: &[bool], limit: usize) -> Vec<bool> {
         timeout
     };
     terminals.iter().map(timeout).collect()
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn the_time_limit_makes_timeouts_and_restarts_with_each_episode() {
-        let (f, t) = (false, true);
-        // Rows 0 to 2 reach the limit. Row 3 is terminal, so the count is 1 at row 4 and the limit at row 5; row 8 is at
-        // the limit and terminal, so the count starts at 0 again.
-        let terminals = [f, f, f, t, f, f, f, f, t, f, f, f];
-        assert_eq!(derive_timeouts(&terminals, 3), [f, f, t, f, f, t, f, f, t, f, f, t]);
-    }
-
-    #[test]
-    fn after_a_terminal_the_count_starts_at_1_as_in_d4rl() {
-        let terminals: Vec<bool> = (0..3000).map(|row| row == 500).collect();
-        let timeouts = derive_timeouts(&terminals, 1000);
-        let rows: Vec<usize> = (0..3000).filter(|&row| timeouts[row]).collect();
-        assert_eq!(rows, [1499, 2499]);
-    }
 }

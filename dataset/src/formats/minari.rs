@@ -68,11 +68,11 @@ impl Metadata {
 
 /// Reads all episodes. Every step is a transition, to the observation that its episode has for the following one; a mask
 /// is 0 where `terminations` is 1. An observation that is a Dict or a Tuple becomes a row by [`parts`].
-pub(super) fn read(file: &Hdf5File, metadata: &Metadata) -> Result<Recording, DatasetError> {
+pub(super) fn read(file: &Hdf5File, metadata: &Metadata) -> Result<Recording, Problem> {
     let mut recording = Recording::default();
     let episodes = episodes(file);
     if let Some(expected) = metadata.total_episodes.filter(|&expected| expected != episodes) {
-        return Err(file.error(Problem::Episodes { found: episodes, expected }));
+        return Err(Problem::Episodes { found: episodes, expected });
     }
     for episode in 0..episodes {
         append(file, &format!("{EPISODE}{episode}"), &mut recording)?;
@@ -86,7 +86,7 @@ fn episodes(file: &Hdf5File) -> usize {
 }
 
 /// Appends an episode of T steps as T + 1 rows, the last of which is its last state.
-fn append(file: &Hdf5File, episode: &str, recording: &mut Recording) -> Result<(), DatasetError> {
+fn append(file: &Hdf5File, episode: &str, recording: &mut Recording) -> Result<(), Problem> {
     let array = |name: &str| format!("{episode}/{name}");
     let actions = file.actions(&array("actions"))?;
     let steps = actions.rows();
@@ -97,8 +97,8 @@ fn append(file: &Hdf5File, episode: &str, recording: &mut Recording) -> Result<(
     let (o, a) = (recording.observation_dim, recording.action_dim);
     let rows = recording.rows() + steps + 1;
     recording.parts.push((recording.rows(), episode.to_owned()));
-    recording.observations.extend(observations.sized(steps + 1, o).map_err(|problem| file.error(problem))?);
-    recording.actions.extend(actions.sized(steps, a).map_err(|problem| file.error(problem))?);
+    recording.observations.extend(observations.sized(steps + 1, o)?);
+    recording.actions.extend(actions.sized(steps, a)?);
     recording.rewards.extend(file.table::<f32>(&array("rewards"), steps, 1)?);
     recording.terminals.extend(file.flags(&array("terminations"), steps)?);
     recording.timeouts.extend(file.flags(&array("truncations"), steps)?);
@@ -115,18 +115,14 @@ fn append(file: &Hdf5File, episode: &str, recording: &mut Recording) -> Result<(
 }
 
 /// An array, or the arrays of a Dict or a Tuple side by side.
-fn observations(file: &Hdf5File, name: &str, rows: usize) -> Result<Array<f32>, DatasetError> {
+fn observations(file: &Hdf5File, name: &str, rows: usize) -> Result<Array<f32>, Problem> {
     let Some(members) = file.members(name) else { return file.numbers(name) };
-    let error = |problem| file.error(problem);
-    let columns = parts(members).into_iter().map(|part| {
-        let column = file.numbers(&format!("{name}/{part}"))?;
-        column.of_rows(rows).map_err(error)
-    });
+    let columns = parts(members).into_iter().map(|part| file.numbers(&format!("{name}/{part}"))?.of_rows(rows));
     let columns: Vec<Array<f32>> = columns.collect::<Result<_, _>>()?;
     let row = |row: usize| columns.iter().flat_map(move |column| column.row(row));
     let values = (0..rows).flat_map(row).copied().collect();
     let width = columns.iter().map(|column| column.width).sum();
-    Array::new(name, &[rows, width], values).map_err(error)
+    Array::new(name, &[rows, width], values)
 }
 
 /// The arrays of a row in their order: those of a Dict by name, those of a Tuple by number, which Minari calls `_index_0`,

@@ -57,11 +57,11 @@ impl Source {
     fn hdf5(file: Hdf5File) -> Result<Self, DatasetError> {
         match file.attribute("layout") {
             Some(layout) if layout == own::LAYOUT => return Ok(Self::Own(file)),
-            Some(found) => return Err(file.error(Problem::UnknownLayout { found })),
+            Some(found) => return Err(DatasetError::new(file.path(), Problem::UnknownLayout { found })),
             None => {}
         }
         if let Some(problem) = file.members("data").and_then(|members| foreign::of_group(&members)) {
-            return Err(file.error(problem));
+            return Err(DatasetError::new(file.path(), problem));
         }
         let is_minari = file.path().ends_with(minari::DATA_FILE) || file.has("episode_0");
         match is_minari {
@@ -112,12 +112,16 @@ impl Source {
 
     /// Reads all of it. The environment says what a D4RL file may leave open: a time limit, and whether there is a goal.
     pub(crate) fn read(&mut self, environment: Option<&EnvironmentSpec>) -> Result<Recording, DatasetError> {
-        match self {
-            Self::D4rl(file) => d4rl::read(file, environment),
-            Self::Own(file) => own::read(file),
-            Self::Minari(file, metadata) => minari::read(file, metadata),
-            Self::OgBench(file) => ogbench::read(file),
-        }
+        let (path, recording) = match self {
+            Self::D4rl(file) => (file.path(), d4rl::read(file, environment)),
+            Self::Own(file) => (file.path(), own::read(file)),
+            Self::Minari(file, metadata) => (file.path(), minari::read(file, metadata)),
+            Self::OgBench(file) => {
+                let recording = ogbench::read(file);
+                (file.path(), recording)
+            }
+        };
+        recording.map_err(|problem| DatasetError::new(path, problem))
     }
 }
 

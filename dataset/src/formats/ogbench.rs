@@ -1,6 +1,6 @@
 //! OGBench's npz files.
 
-use crate::error::DatasetError;
+use crate::error::Problem;
 use crate::npz_file::NpzFile;
 use crate::recording::{Recording, RowKind};
 
@@ -10,10 +10,10 @@ use crate::recording::{Recording, RowKind};
 /// without masks. As OGBench stores its data, the last state of a trajectory is a row of its own, so that a row at a
 /// terminal starts no transition. As its loader returns the data, either each row is a transition with its own
 /// `next_observations`, or `valids` say which rows start one.
-pub(super) fn read(file: &mut NpzFile) -> Result<Recording, DatasetError> {
+pub(super) fn read(file: &mut NpzFile) -> Result<Recording, Problem> {
     let observations = file.numbers("observations")?;
     let (rows, observation_dim) = (observations.rows(), observations.width);
-    let actions = file.actions("actions")?.of_rows(rows).map_err(|problem| file.error(problem))?;
+    let actions = file.actions("actions")?.of_rows(rows)?;
     let terminals = file.flags("terminals", rows)?;
     let masks = match file.has("masks") {
         true => file.flags("masks", rows)?,

@@ -1,6 +1,6 @@
 //! The custom layout: HDF5, one row a transition.
 
-use crate::error::DatasetError;
+use crate::error::Problem;
 use crate::hdf5_file::Hdf5File;
 use crate::recording::{Recording, RowKind};
 
@@ -10,10 +10,10 @@ pub(crate) const LAYOUT: &str = "transitions";
 /// Reads `observations`, `actions`, `rewards`, `next_observations`, `terminals` and, if there, `timeouts`. Every row is a
 /// transition, with the next observation that the file stores. Terminals and timeouts end an episode; without timeouts,
 /// so does a row whose next observation is not the following row's observation.
-pub(super) fn read(file: &Hdf5File) -> Result<Recording, DatasetError> {
+pub(super) fn read(file: &Hdf5File) -> Result<Recording, Problem> {
     let observations = file.numbers("observations")?;
     let (rows, observation_dim) = (observations.rows(), observations.width);
-    let actions = file.actions("actions")?.of_rows(rows).map_err(|problem| file.error(problem))?;
+    let actions = file.actions("actions")?.of_rows(rows)?;
     let next_observations = file.table("next_observations", rows, observation_dim)?;
     let mut recording = Recording {
         observation_dim,

@@ -1,11 +1,11 @@
 //! The rules that turn rows of D4RL's layout into transitions, against NumPy.
 
-use std::path::{Path, PathBuf};
+use std::path::Path;
 
 use quad_dataset::{EnvironmentSpec, RewardRule, environment, recorded_environment};
-use tempfile::{TempDir, tempdir};
+use tempfile::tempdir;
 
-use crate::{all, compare, hopper, peers, read, shared, try_read};
+use crate::{all, compare, generated, hopper, peers, read, shared, try_read};
 
 /// Compares a file with what `peers.py reference` finds in it.
 fn compare_with_rules(path: &Path, environment: Option<&'static EnvironmentSpec>) {
@@ -16,13 +16,6 @@ fn compare_with_rules(path: &Path, environment: Option<&'static EnvironmentSpec>
     if peers(&["reference", path.to_str().unwrap(), &limit, goal, out.to_str().unwrap()]) {
         compare(path, environment, &out);
     }
-}
-
-/// A file that `peers.py generate` makes; `None` where there is no Python.
-fn generated(variant: &str) -> Option<(TempDir, PathBuf)> {
-    let folder = tempdir().unwrap();
-    let path = folder.path().join("generated.hdf5");
-    peers(&["generate", variant, path.to_str().unwrap()]).then_some((folder, path))
 }
 
 /// Terminals, timeouts and both; double precision, as in replay files; rewards and flags of shape N × 1; flags as integers;

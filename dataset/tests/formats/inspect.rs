@@ -1,18 +1,12 @@
 //! What `inspect` says of good files and of bad ones.
 
-use std::path::{Path, PathBuf};
+use std::path::Path;
 
 use ndarray::{Array1, Array2};
 use quad_dataset::{RewardRule, environment, inspect};
-use tempfile::{TempDir, tempdir};
+use tempfile::tempdir;
 
-use crate::{hopper, peers, read, shared};
-
-fn generated(variant: &str) -> Option<(TempDir, PathBuf)> {
-    let folder = tempdir().unwrap();
-    let path = folder.path().join("generated.hdf5");
-    peers(&["generate", variant, path.to_str().unwrap()]).then_some((folder, path))
-}
+use crate::{generated, hopper, peers, read, shared};
 
 /// Three episodes of a robot, of 4, 4 and 2 rows, whose numbers can be followed by eye.
 fn write_robot(path: &Path, spoil: impl Fn(&mut Array2<f32>, &mut Array2<f32>, &mut Array1<f32>)) {

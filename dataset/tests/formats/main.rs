@@ -7,6 +7,7 @@ use std::process::Command;
 use hdf5::H5Type;
 use ndarray::ArrayViewD;
 use quad_dataset::{Batch, DatasetError, EnvironmentSpec, ReadOptions, RewardRule, Scale, Transitions, environment};
+use tempfile::{TempDir, tempdir};
 
 mod broken;
 mod d4rl;
@@ -84,6 +85,13 @@ fn assert_close(name: &str, ours: &[f32], theirs: &[f32]) {
     for (i, (ours, theirs)) in ours.iter().zip(theirs).enumerate() {
         assert!((ours - theirs).abs() <= 1e-6 * theirs.abs().max(1e-3), "{name} {i}: {ours} against {theirs}");
     }
+}
+
+/// A file that `peers.py generate` makes; `None` where there is no Python.
+fn generated(variant: &str) -> Option<(TempDir, PathBuf)> {
+    let folder = tempdir().unwrap();
+    let path = folder.path().join("generated.hdf5");
+    peers(&["generate", variant, path.to_str().unwrap()]).then_some((folder, path))
 }
 
 /// Runs `peers.py`; false where there is no Python to run it, unless QUAD_REQUIRE_PEERS=1 asks for one.
