@@ -26,17 +26,3 @@ pub(crate) fn sizes() -> zenoh::Result<Value> {
 fn of_router(key: &str) -> zenoh::Result<Value> {
     Ok(serde_json::from_str(&Config::from_json5(ROUTER)?.get_json(key)?)?)
 }
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn no_client_of_a_learner_may_be_a_learner() {
-        let rules = rules().unwrap();
-        assert_eq!((&rules["enabled"], &rules["default_permission"]), (&json!(true), &json!("deny")));
-        let subjects: Vec<_> = rules["policies"].as_array().unwrap().iter().map(|policy| &policy["subjects"]).collect();
-        assert_eq!(subjects, [&json!(["evaluator"]), &json!(["monitor"])]);
-        assert!(!sizes().unwrap().as_array().unwrap().is_empty());
-    }
-}

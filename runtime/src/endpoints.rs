@@ -31,23 +31,14 @@ pub enum SessionError {
     #[error("no endpoint to listen at or to connect to")]
     NoEndpoint,
     /// This program cannot use the endpoint. (Zenoh would try for ever to connect by an unknown protocol.)
-    #[error("{endpoint:?} is not an endpoint; write it like {OPEN}127.0.0.1:7447 or {PROTECTED}127.0.0.1:7447")]
-    NotAnEndpoint {
-        /// The endpoint as the user wrote it.
-        endpoint: String,
-    },
+    #[error("{0:?} is not an endpoint; write it like {OPEN}127.0.0.1:7447 or {PROTECTED}127.0.0.1:7447")]
+    NotAnEndpoint(String),
     /// There are certificates, but the endpoint would not use them.
-    #[error("certificates are given, but the connection at {endpoint} would not be encrypted")]
-    Open {
-        /// The endpoint.
-        endpoint: String,
-    },
+    #[error("certificates are given, but the connection at {0} would not be encrypted")]
+    Open(String),
     /// The endpoint needs certificates, but there are none.
-    #[error("{endpoint} needs certificates")]
-    NoCertificates {
-        /// The endpoint.
-        endpoint: String,
-    },
+    #[error("{0} needs certificates")]
+    NoCertificates(String),
     /// The session cannot listen at the endpoints, or their options are wrong.
     #[error("cannot use the Zenoh endpoint {endpoints}: {reason}")]
     Endpoint {
@@ -65,8 +56,8 @@ impl SessionError {
     /// What to do about it.
     pub fn hint(&self) -> &'static str {
         match self {
-            SessionError::Open { .. } => "write the endpoint like tls/HOST:PORT, or leave --certificates away",
-            SessionError::NoCertificates { .. } => {
+            SessionError::Open(_) => "write the endpoint like tls/HOST:PORT, or leave --certificates away",
+            SessionError::NoCertificates(_) => {
                 "name their folder by --certificates DIR or QUAD_CERTIFICATES; deploy/zenoh/certificates.sh makes one"
             }
             _ => {
@@ -90,8 +81,8 @@ impl Endpoints {
         for endpoint in self.listen.iter().chain(&self.connect) {
             let endpoint = parse_endpoint(endpoint)?;
             match (endpoint.starts_with(PROTECTED), &self.certificates) {
-                (false, Some(_)) => return Err(SessionError::Open { endpoint }),
-                (true, None) => return Err(SessionError::NoCertificates { endpoint }),
+                (false, Some(_)) => return Err(SessionError::Open(endpoint)),
+                (true, None) => return Err(SessionError::NoCertificates(endpoint)),
                 _ => {}
             }
         }
@@ -137,7 +128,7 @@ pub fn parse_endpoint(text: &str) -> Result<String, SessionError> {
     if [OPEN, PROTECTED].iter().any(|protocol| text.starts_with(protocol)) && text.parse::<EndPoint>().is_ok() {
         return Ok(text.to_owned());
     }
-    Err(SessionError::NotAnEndpoint { endpoint: text.to_owned() })
+    Err(SessionError::NotAnEndpoint(text.to_owned()))
 }
 
 /// HOST:PORT of an endpoint, between its protocol and its options: `tcp/127.0.0.1:0#iface=lo`.

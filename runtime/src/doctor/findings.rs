@@ -21,19 +21,21 @@ struct Finding {
 impl Findings {
     /// Adds that `check` found what it should.
     pub fn ok(&mut self, check: &str, what: impl Into<String>) {
-        self.0.push(Finding { verdict: "ok", check: check.to_owned(), what: what.into(), hint: None });
+        self.add("ok", check, what.into(), None);
     }
 
     /// Adds that `check` found something that works, but may fail later or be slow.
     pub fn warn(&mut self, check: &str, what: impl Into<String>, hint: impl Into<String>) {
-        let hint = Some(hint.into());
-        self.0.push(Finding { verdict: "warn", check: check.to_owned(), what: what.into(), hint });
+        self.add("warn", check, what.into(), Some(hint.into()));
     }
 
     /// Adds that `check` found something that does not work.
     pub fn fail(&mut self, check: &str, what: impl Into<String>, hint: impl Into<String>) {
-        let hint = Some(hint.into());
-        self.0.push(Finding { verdict: "fail", check: check.to_owned(), what: what.into(), hint });
+        self.add("fail", check, what.into(), Some(hint.into()));
+    }
+
+    fn add(&mut self, verdict: &'static str, check: &str, what: String, hint: Option<String>) {
+        self.0.push(Finding { verdict, check: check.to_owned(), what, hint });
     }
 
     /// # Errors

@@ -2,8 +2,10 @@
 
 use std::path::PathBuf;
 
+use quad_protocol::keys;
 use quad_tests::PATIENCE;
 use quad_tests::certificates::{Certificates, connect};
+use quad_tests::made_up::name;
 use quad_tests::router::protected_router;
 use quad_tests::setting::{ENDLESS, IDLE, SHORT};
 use quad_tests::system::Scratch;
@@ -56,6 +58,15 @@ async fn a_learner_that_listens_itself_asks_who_comes() {
     let folder = certificates.argument("evaluator");
     let _evaluator = scratch.evaluator_with("trusted", &["--connect", &endpoint, "--certificates", &folder]);
     learner.wait_for_scores(0);
+
+    // One that would stay connected by itself, although its certificate has expired. The other one stays.
+    certificates.short("brief", 10);
+    let brief = connect(&endpoint, &authority, Some(&certificates.of("brief"))).await.unwrap();
+    let key = keys::live_evaluator(&name("run"), &name("brief"));
+    let _token = brief.liveliness().declare_token(key).await.unwrap();
+    for count in [2.0, 1.0] {
+        learner.wait_for_metric("evaluators", "", |there| there == count);
+    }
 }
 
 #[tokio::test(flavor = "multi_thread")]
@@ -85,7 +96,6 @@ async fn the_router_refuses_those_without_a_valid_certificate() {
     assert!(!stray.process.log().contains("connected"));
 }
 
-/// At a learner that listens itself, the same is tested beside the session.
 #[tokio::test(flavor = "multi_thread")]
 async fn an_expired_certificate_ends_a_connection_and_a_renewed_one_brings_it_back() {
     let Some(certificates) = Certificates::make() else { return };
