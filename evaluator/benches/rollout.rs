@@ -5,10 +5,11 @@
 
 use candle_core::Device;
 use criterion::{BatchSize, Criterion, criterion_group, criterion_main};
-use quad_evaluator::sim::{EnvironmentError, Environments, Rollout, Simulations, make, simulated};
+use quad_dataset::environment;
+use quad_evaluator::sim::{EnvironmentError, Environments, Rollout, Simulations, make};
 use quad_policy::{
-    Choice, DiffusionPolicy, DiffusionShape, Ensemble, EpisodeState, Header, Layout, MlpConfig, NoisePredictor, Policy,
-    PolicyConfig, Precision, Weights, load_policy,
+    Choice, DiffusionShape, EpisodeState, Header, Layout, MlpConfig, Policy, PolicyConfig, Precision, Weights,
+    load_policy,
 };
 use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
@@ -28,14 +29,9 @@ fn precisions() -> impl Iterator<Item = Precision> {
 fn policy(precision: Precision) -> Box<dyn Policy> {
     let shape = DiffusionShape::quad((11, 3), &MlpConfig::mish(&[256; 3]), 10, 5);
     let mut generator = ChaCha8Rng::seed_from_u64(0);
-    let mut weights = |layout: Layout| {
-        let values = Weights::initial(&layout, &mut generator, &Device::Cpu).expect("weights");
-        Weights::constant(layout, values)
-    };
-    let actor = NoisePredictor::new(shape.actor(), weights(shape.actor().layout()), Precision::F32);
-    let critics = Ensemble::new(shape.critics(), weights(shape.critics().layout()), Precision::F32);
-    let tensors = DiffusionPolicy::tensors(&actor, &critics, None).expect("tensors");
     let policy = PolicyConfig::Diffusion { shape, choice: Choice::best_of(CANDIDATES) };
+    let initial = |layout: &Layout| Weights::initial(layout, &mut generator, &Device::Cpu);
+    let tensors = policy.tensors(initial).expect("weights");
     let file = Header { policy, scaling: None, origin: () }.to_safetensors(&tensors).expect("finite weights");
     load_policy(&file, precision).expect("what was just written")
 }
@@ -92,7 +88,7 @@ fn select(criterion: &mut Criterion) {
 fn environments(criterion: &mut Criterion) {
     let mut group = criterion.benchmark_group("environment");
     // Those of one simulation differ in the goal alone.
-    for spec in simulated().filter(|spec| spec.name == spec.simulation()) {
+    for spec in environment::all().iter().filter(|spec| spec.name == spec.simulation()) {
         let mut environment = make(spec, 0).expect("MuJoCo compiles the embedded model");
         let mut random = ChaCha8Rng::seed_from_u64(0);
         let mut action = vec![0.0; spec.action_dim];

@@ -14,10 +14,10 @@ use quad_runtime::{Hint, certificates_folder, json, print};
 use crate::doctor::{self, DoctorArgs};
 use crate::serve::{self, ServeArgs};
 use crate::sim::Simulations;
-use crate::tools::collect::{self, CollectError, Summary};
+use crate::tools::collect::{self, Summary};
 use crate::tools::film::{self, FilmArgs};
 use crate::tools::score::{self, ScoreArgs};
-use crate::tools::verify::{self, Report, VerifyError};
+use crate::tools::verify::{self, Report};
 
 /// Runs policies in MuJoCo, and records datasets there.
 #[derive(Debug, Parser)]
@@ -96,13 +96,12 @@ impl Cli {
             Command::Score(args) => print(&score::score(&args)?),
             Command::Film(args) => print(&film::film(&args)?),
             Command::Collect(args) => {
-                let summary = collect::collect(args.env, &args.out, args.transitions.get(), args.seed)
-                    .hint_of(CollectError::hint)?;
+                let summary = collect::collect(args.env, &args.out, args.transitions.get(), args.seed)?;
                 print(&collected(&args, &summary))
             }
             Command::VerifyDataset(args) => {
                 let spec = args.env.map_or_else(|| verify::environment_of(&args.file), Ok);
-                let report = spec.and_then(|spec| verify::verify(&args.file, spec)).hint_of(VerifyError::hint)?;
+                let report = spec.and_then(|spec| verify::verify(&args.file, spec))?;
                 print(&if args.json { json(&report)? } else { verified(&report) })?;
                 let differ = report.rewards_differ + report.terminals_differ;
                 anyhow::ensure!(differ == 0, "the simulation differs from the file");

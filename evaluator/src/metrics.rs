@@ -27,26 +27,18 @@ impl JobOutcome {
     }
 }
 
-/// The metrics of one evaluator process, in a registry of their own.
+/// The metrics of one evaluator process, in a registry of their own; their help says what each counts.
 #[derive(Clone)]
 pub struct Metrics {
     /// The registry that `/metrics` serves.
     pub registry: Registry,
-    /// Episodes finished, in any job.
     pub episodes: IntCounter,
-    /// Environment steps taken.
     pub environment_steps: IntCounter,
-    /// Snapshots received whole and verified.
     pub snapshots_received: IntCounter,
-    /// Normalised score of each scored episode.
     pub episode_score: Histogram,
-    /// Seconds from a job's hand-out to the end of its last episode.
     pub job_duration: Histogram,
-    /// Seconds spent choosing actions.
     pub select_seconds: Counter,
-    /// Seconds spent in the physics.
     pub physics_seconds: Counter,
-    /// Runs that the evaluator serves.
     pub runs: IntGauge,
     jobs: IntCounterVec,
     rejected_messages: IntCounterVec,

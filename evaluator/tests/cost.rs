@@ -1,14 +1,13 @@
 //! The memory that a policy says its actions take is what they take: an evaluator refuses jobs by it.
 #![allow(clippy::unwrap_used, clippy::expect_used)]
 
-use std::alloc::{GlobalAlloc, Layout as Block, System};
+use std::alloc::{GlobalAlloc, Layout, System};
 use std::sync::atomic::{AtomicUsize, Ordering::Relaxed};
 
-use candle_core::{Device, Tensor};
+use candle_core::{DType, Device, Tensor};
 use quad_policy::{
-    Choice, DiffusionPolicy, DiffusionShape, Ensemble, GaussianPolicy, GaussianShape, Header, Layout, MlpConfig,
-    NoisePredictor, Policy, PolicyConfig, Precision, Rule, ScoreNetwork, ScorePolicy, ScorePolicyShape, ScoreShape,
-    SquashedPolicy, SquashedShape, Tensors, Weights, load_policy,
+    Choice, DiffusionShape, GaussianShape, Header, MlpConfig, Policy, PolicyConfig, Precision, Rule, ScorePolicyShape,
+    SquashedShape, load_policy,
 };
 
 /// What is not counted, such as the embedding of each denoising step: little of what an evaluator gives, bytes.
@@ -22,67 +21,50 @@ static PEAK: AtomicUsize = AtomicUsize::new(0);
 
 // SAFETY: everything is handed on to the system's allocator as it came.
 unsafe impl GlobalAlloc for Counting {
-    unsafe fn alloc(&self, block: Block) -> *mut u8 {
-        PEAK.fetch_max(NOW.fetch_add(block.size(), Relaxed) + block.size(), Relaxed);
-        unsafe { System.alloc(block) }
+    unsafe fn alloc(&self, layout: Layout) -> *mut u8 {
+        PEAK.fetch_max(NOW.fetch_add(layout.size(), Relaxed) + layout.size(), Relaxed);
+        unsafe { System.alloc(layout) }
     }
 
-    unsafe fn dealloc(&self, pointer: *mut u8, block: Block) {
-        NOW.fetch_sub(block.size(), Relaxed);
-        unsafe { System.dealloc(pointer, block) }
+    unsafe fn dealloc(&self, pointer: *mut u8, layout: Layout) {
+        NOW.fetch_sub(layout.size(), Relaxed);
+        unsafe { System.dealloc(pointer, layout) }
     }
 }
 
 #[global_allocator]
 static ALLOCATOR: Counting = Counting;
 
-fn zeros(layout: Layout) -> Weights {
-    let values = Tensor::zeros(layout.count(), candle_core::DType::F32, &Device::Cpu).unwrap();
-    Weights::constant(layout, values)
-}
-
-fn loaded(policy: PolicyConfig, tensors: &Tensors) -> Box<dyn Policy> {
-    load_policy(&Header { policy, scaling: None, origin: () }.to_safetensors(tensors).unwrap(), Precision::F32).unwrap()
+fn loaded(policy: PolicyConfig) -> Box<dyn Policy> {
+    let tensors = policy.tensors(|layout| Tensor::zeros(layout.count(), DType::F32, &Device::Cpu)).unwrap();
+    load_policy(&Header { policy, scaling: None, origin: () }.to_safetensors(&tensors).unwrap(), Precision::F32)
+        .unwrap()
 }
 
 fn diffusion(hidden: usize, critics: usize, diffusion_steps: usize, choice: Choice) -> Box<dyn Policy> {
     let layers = MlpConfig::mish(&[hidden; 3]);
     let value = (choice.rule == Rule::Nearest).then(|| layers.clone());
     let shape = DiffusionShape { value, ..DiffusionShape::quad((11, 3), &layers, critics, diffusion_steps) };
-    let actor = NoisePredictor::new(shape.actor(), zeros(shape.actor().layout()), Precision::F32);
-    let critics = Ensemble::new(shape.critics(), zeros(shape.critics().layout()), Precision::F32);
-    let value = shape.value().map(|of| Ensemble::new(of.clone(), zeros(of.layout()), Precision::F32));
-    let tensors = DiffusionPolicy::tensors(&actor, &critics, value.as_ref()).unwrap();
-    loaded(PolicyConfig::Diffusion { shape, choice }, &tensors)
+    loaded(PolicyConfig::Diffusion { shape, choice })
 }
 
 fn gaussian(hidden: usize) -> Box<dyn Policy> {
     let shape = GaussianShape { observation_dim: 11, action_dim: 3, actor: MlpConfig::mish(&[hidden; 3]) };
-    let actor = Ensemble::new(shape.actor(), zeros(shape.actor().layout()), Precision::F32);
-    loaded(PolicyConfig::Gaussian { shape }, &GaussianPolicy::tensors(&actor).unwrap())
+    loaded(PolicyConfig::Gaussian { shape })
 }
 
 fn squashed(hidden: usize, norm: bool) -> Box<dyn Policy> {
     let actor = MlpConfig::mish(&[hidden; 3]);
     let critic = MlpConfig { norm, ..actor.clone() };
     let shape = SquashedShape { observation_dim: 11, action_dim: 3, actor, critic, critics: 2 };
-    let [actor, critics] = [shape.actor(), shape.critics()].map(|of| {
-        let weights = zeros(of.layout());
-        Ensemble::new(of, weights, Precision::F32)
-    });
-    let choice = Choice::best_of(1024);
-    loaded(PolicyConfig::Squashed { shape, choice }, &SquashedPolicy::tensors(&actor, &critics).unwrap())
+    loaded(PolicyConfig::Squashed { shape, choice: Choice::best_of(1024) })
 }
 
 fn score(widths: &[usize], candidates: u32) -> Box<dyn Policy> {
     let actor = MlpConfig::mish(widths);
     let critic = MlpConfig::mish(&[8]);
     let shape = ScorePolicyShape { observation_dim: 11, action_dim: 3, actor, critic, evaluations: 4 };
-    let frequencies = Tensor::zeros(ScoreShape::FREQUENCIES, candle_core::DType::F32, &Device::Cpu).unwrap();
-    let actor = ScoreNetwork::new(shape.actor(), zeros(shape.actor().layout()), frequencies);
-    let critic = Ensemble::new(shape.critic(), zeros(shape.critic().layout()), Precision::F32);
-    let tensors = ScorePolicy::tensors(&actor, &critic).unwrap();
-    loaded(PolicyConfig::Score { shape, choice: Choice::best_of(candidates) }, &tensors)
+    loaded(PolicyConfig::Score { shape, choice: Choice::best_of(candidates) })
 }
 
 #[test]

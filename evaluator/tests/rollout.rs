@@ -1,13 +1,10 @@
 //! Episodes do not depend on the batch they run in, and are what stepping an environment by hand gives.
 #![allow(clippy::unwrap_used)]
 
-use std::collections::BTreeMap;
-
-use quad_dataset::environment::{EnvironmentSpec, find};
+use quad_dataset::environment::find;
 use quad_evaluator::sim::{
-    Environment, EnvironmentError, Environments, EpisodeOutcome, Rollout, Simulations, Step, make, simulated,
+    Environment, EnvironmentError, Environments, EpisodeOutcome, Rollout, Simulations, Step, make,
 };
-use quad_policy::{EpisodeState, Policy, PolicyError, Precision};
 use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 
@@ -81,104 +78,6 @@ fn an_outcome_is_what_stepping_by_hand_gives() {
         assert_eq!((outcome.episode_return, outcome.length), (episode_return, length));
         assert_eq!(outcome.score, 100.0 * (episode_return + 20.272305) / (3234.3 + 20.272305));
     }
-}
-
-/// What the policy saw of each seed's episode in the first steps of a batch.
-fn trajectories(spec: &'static EnvironmentSpec, seeds: &[u64]) -> BTreeMap<u64, Vec<f32>> {
-    let mut seen = BTreeMap::<u64, Vec<f32>>::new();
-    let make = || Simulations.make(&spec.name, 0);
-    let sizes = (spec.observation_dim, spec.action_dim);
-    let mut rollout = Rollout::new(make, sizes, seeds, |seed| (seed, ChaCha8Rng::seed_from_u64(seed))).unwrap();
-    for _ in 0..40 {
-        let select = |observations: &[f32], noise: &mut [(u64, ChaCha8Rng)], actions: &mut [f32]| {
-            let observations = observations.chunks(spec.observation_dim);
-            for ((observation, (seed, noise)), action) in
-                observations.zip(noise).zip(actions.chunks_mut(spec.action_dim))
-            {
-                seen.entry(*seed).or_default().extend(observation);
-                action.fill_with(|| noise.random_range(-1.0..1.0));
-            }
-            Ok::<_, EnvironmentError>(())
-        };
-        rollout.step(select).unwrap();
-    }
-    seen
-}
-
-#[test]
-fn in_every_environment_an_episode_depends_on_its_seed_alone() {
-    for spec in simulated() {
-        let together = trajectories(spec, &[3, 14, 15, 92]);
-        assert_eq!(together.len(), 4, "{}", spec.name);
-        assert_ne!(together[&3], together[&14], "{}", spec.name);
-        for (&seed, trajectory) in &together {
-            assert!(trajectory.len() > 5 * spec.observation_dim, "{}", spec.name);
-            assert_eq!(trajectories(spec, &[seed])[&seed], *trajectory, "{}, seed {seed}", spec.name);
-        }
-    }
-}
-
-/// Remembers how often it acted in an episode, and acts by that: after some steps it lets the hopper fall.
-struct Counter;
-
-impl Policy for Counter {
-    fn observation_dim(&self) -> usize {
-        11
-    }
-
-    fn action_dim(&self) -> usize {
-        3
-    }
-
-    fn precision(&self) -> Precision {
-        Precision::F32
-    }
-
-    fn memory(&self, _: usize) -> u64 {
-        0
-    }
-
-    fn begin(&self, seed: u64) -> EpisodeState {
-        let mut state = EpisodeState::new(seed);
-        state.memory = vec![0.0, seed as f32];
-        state
-    }
-
-    fn act(&self, _: &[f32], states: &mut [EpisodeState], actions: &mut [f32]) -> Result<(), PolicyError> {
-        for (state, action) in states.iter_mut().zip(actions.chunks_exact_mut(3)) {
-            let [count, seed] = state.memory[..] else { panic!("its own two numbers") };
-            state.memory[0] = count + 1.0;
-            action.fill((seed + count / 5.0).sin());
-        }
-        Ok(())
-    }
-}
-
-#[test]
-fn what_a_policy_remembers_is_its_episode_s_own_and_begins_anew() {
-    let run = |seeds: &[u64]| {
-        let mut rollout = hopper(seeds, |seed| Counter.begin(seed));
-        while !rollout.is_done() {
-            rollout
-                .step(|observations, states, actions| {
-                    Counter.act(observations, states, actions).unwrap();
-                    Ok::<_, EnvironmentError>(())
-                })
-                .unwrap();
-        }
-        rollout.into_outcomes()
-    };
-    let together = run(&[1, 2, 3, 4, 5, 6]);
-    let lengths: std::collections::HashSet<u32> = together.iter().map(|outcome| outcome.length).collect();
-    assert!(lengths.len() > 1, "episodes of one length only prove nothing about leaving the batch");
-    for outcome in together {
-        assert_eq!(run(&[outcome.seed])[0], EpisodeOutcome { index: 0, ..outcome });
-    }
-}
-
-#[test]
-fn no_seeds_are_done_at_once() {
-    assert!(run(&[]).is_empty());
 }
 
 #[test]

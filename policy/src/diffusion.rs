@@ -18,9 +18,9 @@ use serde::{Deserialize, Serialize};
 /// Most denoising steps that are believed; the tensors' shapes do not bound them.
 const MOST_STEPS: usize = 1000;
 /// Before the names of the networks' tensors.
-const ACTOR: &str = "actor.";
-const CRITIC: &str = "critic.";
-const VALUE: &str = "value.";
+pub(crate) const ACTOR: &str = "actor.";
+pub(crate) const CRITIC: &str = "critic.";
+pub(crate) const VALUE: &str = "value.";
 
 /// The shapes of a diffusion policy's networks.
 #[derive(Clone, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]

@@ -1,17 +1,18 @@
 //! Kinds of policy, and how one is read from a file that says which it is.
 
 use crate::choice::Choice;
-use crate::diffusion::{DiffusionPolicy, DiffusionShape};
+use crate::diffusion::{ACTOR, CRITIC, DiffusionPolicy, DiffusionShape, VALUE};
 use crate::error::PolicyError;
 use crate::gaussian::{GaussianPolicy, GaussianShape};
 use crate::policy::Policy;
 use crate::precision::Precision;
 use crate::scaled::scaled;
-use crate::score::{ScorePolicy, ScorePolicyShape};
+use crate::score::{FREQUENCIES, ScorePolicy, ScorePolicyShape};
+use crate::score_network::ScoreShape;
 use crate::squashed::{SquashedPolicy, SquashedShape};
-use crate::weights::{Tensors, check_finite};
-use candle_core::Device;
+use crate::weights::{Layout, Tensors, Weights, check_finite};
 use candle_core::safetensors::Load;
+use candle_core::{DType, Device, Tensor};
 use quad_kernels::scaling::Scaling;
 use safetensors::{SafeTensorError, SafeTensors};
 use serde::de::{DeserializeOwned, IgnoredAny};
@@ -54,6 +55,41 @@ pub enum PolicyConfig {
         /// Which samples they are.
         choice: Choice,
     },
+}
+
+impl PolicyConfig {
+    /// The tensors of such a policy whose networks have the numbers that `values` gives for their layouts, as
+    /// [`Weights::initial`] does. Tests and benchmarks act with it.
+    pub fn tensors(
+        &self,
+        mut values: impl FnMut(&Layout) -> candle_core::Result<Tensor>,
+    ) -> candle_core::Result<Tensors> {
+        let mut tensors = Tensors::new();
+        let mut add = |prefix, layout: Layout| {
+            let values = values(&layout)?;
+            tensors.extend(Weights::constant(layout, values).tensors(prefix)?);
+            candle_core::Result::Ok(())
+        };
+        match self {
+            Self::Diffusion { shape, .. } => {
+                add(ACTOR, shape.actor().layout())?;
+                add(CRITIC, shape.critics().layout())?;
+                shape.value().map(|value| add(VALUE, value.layout())).transpose()?;
+            }
+            Self::Squashed { shape, .. } => {
+                add(ACTOR, shape.actor().layout())?;
+                add(CRITIC, shape.critics().layout())?;
+            }
+            Self::Gaussian { shape } => add(ACTOR, shape.actor().layout())?,
+            Self::Score { shape, .. } => {
+                add(ACTOR, shape.actor().layout())?;
+                add(CRITIC, shape.critic().layout())?;
+                let frequencies = Tensor::ones(ScoreShape::FREQUENCIES, DType::F32, &Device::Cpu)?;
+                tensors.insert(FREQUENCIES.to_owned(), frequencies);
+            }
+        }
+        Ok(tensors)
+    }
 }
 
 /// What a policy's file says beside its tensors: JSON under one key of its metadata, written once, with the tensors. `O` says
@@ -161,10 +197,7 @@ fn check_header(file: &[u8]) -> Result<(), PolicyError> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::ensemble::Ensemble;
     use crate::mlp_config::MlpConfig;
-    use crate::weights::Weights;
-    use candle_core::{DType, Tensor};
     use std::fmt::Write;
 
     /// A file of so many tensors without numbers.
@@ -200,11 +233,9 @@ mod tests {
     fn gaussian(origin: &str) -> Vec<u8> {
         let actor = MlpConfig::mish(&[4]);
         let shape = GaussianShape { observation_dim: 3, action_dim: 1, actor };
-        let layout = shape.actor().layout();
-        let values = Tensor::zeros(layout.count(), DType::F32, &Device::Cpu).unwrap();
-        let actor = Ensemble::new(shape.actor(), Weights::constant(layout, values), Precision::F32);
-        let header = Header { policy: PolicyConfig::Gaussian { shape }, scaling: None, origin };
-        header.to_safetensors(&GaussianPolicy::tensors(&actor).unwrap()).unwrap()
+        let policy = PolicyConfig::Gaussian { shape };
+        let tensors = policy.tensors(|layout| Tensor::zeros(layout.count(), DType::F32, &Device::Cpu)).unwrap();
+        Header { policy, scaling: None, origin }.to_safetensors(&tensors).unwrap()
     }
 
     #[test]

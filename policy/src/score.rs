@@ -20,7 +20,7 @@ const MOST_EVALUATIONS: usize = 1000;
 /// Before the names of the networks' tensors, and the name of the score network's frequencies.
 const ACTOR: &str = "actor.";
 const CRITIC: &str = "critic.";
-const FREQUENCIES: &str = "frequencies";
+pub(crate) const FREQUENCIES: &str = "frequencies";
 
 /// The shapes of such a policy's networks.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]

@@ -6,10 +6,7 @@ use std::thread;
 use std::time::Duration;
 
 use candle_core::{DType, Device, Tensor};
-use quad_policy::{
-    Choice, DiffusionPolicy, DiffusionShape, Ensemble, Header, Layout, MlpConfig, NoisePredictor, PolicyConfig,
-    Precision, Weights, load_policy,
-};
+use quad_policy::{Choice, DiffusionShape, Header, MlpConfig, PolicyConfig, Precision, load_policy};
 use rayon::prelude::*;
 
 /// Policies, each asked by all threads at once.
@@ -18,14 +15,8 @@ const POLICIES: usize = 100;
 /// The file of a policy whose kernels take a while to lay out.
 fn file() -> Vec<u8> {
     let shape = DiffusionShape::quad((3, 1), &MlpConfig::mish(&[256, 256]), 64, 1);
-    let zeros = |layout: Layout| {
-        let values = Tensor::zeros(layout.count(), DType::F32, &Device::Cpu).unwrap();
-        Weights::constant(layout, values)
-    };
-    let actor = NoisePredictor::new(shape.actor(), zeros(shape.actor().layout()), Precision::F32);
-    let critics = Ensemble::new(shape.critics(), zeros(shape.critics().layout()), Precision::F32);
-    let tensors = DiffusionPolicy::tensors(&actor, &critics, None).unwrap();
     let policy = PolicyConfig::Diffusion { shape, choice: Choice::best_of(2) };
+    let tensors = policy.tensors(|layout| Tensor::zeros(layout.count(), DType::F32, &Device::Cpu)).unwrap();
     Header { policy, scaling: None, origin: () }.to_safetensors(&tensors).unwrap()
 }
 

@@ -1,10 +1,7 @@
 //! Data for the tests of this module.
 
 use candle_core::{DType, Device, Tensor};
-use quad_policy::{
-    Choice, DiffusionPolicy, DiffusionShape, Ensemble, Header, Layout, MlpConfig, NoisePredictor, PolicyConfig,
-    Precision, Weights,
-};
+use quad_policy::{Choice, DiffusionShape, Header, MlpConfig, PolicyConfig};
 use quad_protocol::{Hash, Job, Name, Origin, Snapshot};
 
 /// Two episodes of Hopper.
@@ -34,14 +31,8 @@ pub fn smallest() -> DiffusionShape {
 
 /// The file of a diffusion policy for an environment, all zero, that takes the best of `candidates`.
 pub fn file(environment: &str, shape: DiffusionShape, candidates: u32) -> Vec<u8> {
-    let zeros = |layout: Layout| {
-        let values = Tensor::zeros(layout.count(), DType::F32, &Device::Cpu).unwrap();
-        Weights::constant(layout, values)
-    };
-    let actor = NoisePredictor::new(shape.actor(), zeros(shape.actor().layout()), Precision::F32);
-    let critics = Ensemble::new(shape.critics(), zeros(shape.critics().layout()), Precision::F32);
-    let tensors = DiffusionPolicy::tensors(&actor, &critics, None).unwrap();
     let policy = PolicyConfig::Diffusion { shape, choice: Choice::best_of(candidates) };
+    let tensors = policy.tensors(|layout| Tensor::zeros(layout.count(), DType::F32, &Device::Cpu)).unwrap();
     let origin = Origin { environment: environment.to_owned(), seed: 1, step: 1, episodes: 2 };
     Header { policy, scaling: None, origin }.to_safetensors(&tensors).unwrap()
 }

@@ -5,7 +5,7 @@ use std::sync::atomic::{AtomicBool, AtomicU32, AtomicU64, Ordering::Relaxed};
 use std::time::{Duration, Instant};
 
 use anyhow::Context;
-use quad_policy::{EpisodeState, Policy};
+use quad_policy::{EpisodeState, Policy, PolicyError};
 use quad_protocol::{EpisodeScore, Job};
 
 use crate::metrics::{JobOutcome, Metrics};
@@ -20,18 +20,19 @@ const MAX_BYTES: u64 = 256 << 20;
 /// Why the evaluator does not run a job.
 #[derive(Debug, thiserror::Error)]
 pub enum JobError {
-    /// The job is empty, or too large.
     #[error("it has {0} episodes, but must have from 1 to {MAX_EPISODES}")]
     Size(usize),
-    /// Its policy would take too much memory.
     #[error("each of its steps takes {0} bytes of memory, more than {MAX_BYTES}")]
     Memory(u64),
-    /// The job took too long.
     #[error("its episodes did not end within {} s", Job::LONGEST.as_secs())]
     TooLong,
-    /// The evaluator does not know its environment.
     #[error("this evaluator has no environment \"{0}\"")]
     Environment(String),
+    /// The snapshot is for another environment, or has other sizes.
+    #[error("the snapshot is for {found}, the job's environment is {wanted}")]
+    OtherEnvironment { found: String, wanted: String },
+    #[error(transparent)]
+    Policy(#[from] PolicyError),
 }
 
 impl JobError {
@@ -40,7 +41,8 @@ impl JobError {
         match self {
             JobError::Size(_) | JobError::Memory(_) => "job_size",
             JobError::TooLong => "too_long",
-            JobError::Environment(_) => "environment",
+            JobError::Environment(_) | JobError::OtherEnvironment { .. } => "environment",
+            JobError::Policy(_) => "tensors",
         }
     }
 }

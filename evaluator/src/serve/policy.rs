@@ -1,43 +1,19 @@
 //! Makes a policy from a snapshot.
 
-use quad_policy::{Header, Policy, PolicyError, Precision, load_policy};
+use quad_policy::{Header, Policy, Precision, load_policy};
 use quad_protocol::{Origin, Snapshot};
+
+use super::job::JobError;
 
 /// Most characters of an environment's name from a file that messages show.
 const LONGEST_NAME: usize = 64;
-
-/// Why a snapshot is no policy for an environment.
-#[derive(Debug, thiserror::Error)]
-pub enum LoadError {
-    /// The snapshot is for another environment, or has other sizes.
-    #[error("the snapshot is for {found}, the job's environment is {wanted}")]
-    Environment {
-        /// The environment of the snapshot.
-        found: String,
-        /// The environment of the job.
-        wanted: String,
-    },
-    /// The file is no policy.
-    #[error(transparent)]
-    Policy(#[from] PolicyError),
-}
-
-impl LoadError {
-    /// The reason as a metric's label.
-    pub fn label(&self) -> &'static str {
-        match self {
-            LoadError::Environment { .. } => "environment",
-            LoadError::Policy(_) => "tensors",
-        }
-    }
-}
 
 /// Loads the policy of `snapshot` for the environment `wanted`, whose sizes may be known.
 pub fn load(
     snapshot: &Snapshot,
     (wanted, wanted_sizes): (&str, Option<(usize, usize)>),
     precision: Precision,
-) -> Result<Box<dyn Policy>, LoadError> {
+) -> Result<Box<dyn Policy>, JobError> {
     let Header { origin: Origin { environment, .. }, .. } = Header::read(&snapshot.file)?;
     let policy = load_policy(&snapshot.file, precision)?;
     let sizes = (policy.observation_dim(), policy.action_dim());
@@ -45,7 +21,7 @@ pub fn load(
     if (environment.as_str(), sizes) == (wanted, wanted_sizes) {
         return Ok(policy);
     }
-    Err(LoadError::Environment { found: described(&environment, sizes), wanted: described(wanted, wanted_sizes) })
+    Err(JobError::OtherEnvironment { found: described(&environment, sizes), wanted: described(wanted, wanted_sizes) })
 }
 
 /// An environment with its sizes.

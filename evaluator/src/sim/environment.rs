@@ -22,18 +22,12 @@ pub trait Environment: Send {
     fn reset(&mut self, seed: u64) -> Result<(), EnvironmentError>;
 
     /// Applies an action for one control period.
-    ///
-    /// # Errors
-    /// As [`Self::reset`].
     fn step(&mut self, action: &[f32]) -> Result<Step, EnvironmentError>;
 
     /// The current observation.
     fn observation(&self) -> &[f64];
 
     /// The score of the ended episode, given the undiscounted sum of its rewards.
-    ///
-    /// # Errors
-    /// As [`Self::reset`].
     fn score(&mut self, episode_return: f64) -> Result<f64, EnvironmentError>;
 }
 
@@ -55,35 +49,18 @@ pub trait Environments: Send + Sync {
 
 /// Why an environment is missing or failed.
 #[derive(Debug, Error)]
+#[allow(missing_docs)] // The sentences say what each is.
 pub enum EnvironmentError {
-    /// The name is known to the dataset crate, but this evaluator has no simulation of it.
     #[error("this evaluator cannot simulate the environment \"{0}\"")]
     NotSimulated(String),
-    /// The environment gave an observation of another size than the policy takes.
     #[error("an observation has {found} numbers, but the policy takes {wanted}")]
-    Observation {
-        /// Size of the observation.
-        found: usize,
-        /// Size that the policy takes.
-        wanted: usize,
-    },
-    /// The environment failed, with its own message.
+    Observation { found: usize, wanted: usize },
+    /// With the environment's own message.
     #[error("the environment \"{name}\" failed: {reason}")]
-    Failed {
-        /// The environment.
-        name: String,
-        /// The message.
-        reason: String,
-    },
-    /// MuJoCo refused the embedded model: the library is not the version that this program was built for.
+    Failed { name: String, reason: String },
+    /// The library is not the version that this program was built for.
     #[error("MuJoCo could not compile the model of \"{simulation}\": {reason}")]
-    Model {
-        /// Name of the simulation whose model it is.
-        simulation: &'static str,
-        /// MuJoCo's error message.
-        reason: String,
-    },
-    /// MuJoCo could not allocate the state of a simulation.
+    Model { simulation: &'static str, reason: String },
     #[error("MuJoCo could not allocate the state of a simulation: {0}")]
     Allocation(String),
 }

@@ -24,4 +24,4 @@ mod simulations;
 pub use environment::{Environment, EnvironmentError, Environments, Step};
 pub use rollout::{EpisodeOutcome, Rollout};
 pub use simulation::Simulation;
-pub use simulations::{Simulations, make, mjcf, simulated};
+pub use simulations::{Simulations, make, mjcf};

@@ -18,10 +18,7 @@ use super::environment::EnvironmentError;
 const RESET_STREAM: u64 = 1;
 
 /// The compiled model of a simulation. If the process does not have it yet, it is compiled from the text that `mjcf` gives.
-pub(super) fn model(
-    simulation: &'static str,
-    mjcf: impl FnOnce() -> Result<String, EnvironmentError>,
-) -> Result<Arc<MjModel>, EnvironmentError> {
+pub(super) fn model(simulation: &'static str, mjcf: impl FnOnce() -> String) -> Result<Arc<MjModel>, EnvironmentError> {
     static MODELS: Mutex<BTreeMap<&str, Arc<MjModel>>> = Mutex::new(BTreeMap::new());
     static LOGGING: Once = Once::new();
     let mut models = MODELS.lock().unwrap_or_else(PoisonError::into_inner);
@@ -30,7 +27,7 @@ pub(super) fn model(
     }
     // SAFETY: every use of MuJoCo in this program starts with a compiled model, so none runs before this.
     LOGGING.call_once(|| unsafe { set_log_handler(log) });
-    let model = MjModel::from_xml_string(&mjcf()?)
+    let model = MjModel::from_xml_string(&mjcf())
         .map_err(|error| EnvironmentError::Model { simulation, reason: error.to_string() })?;
     Ok(Arc::clone(models.entry(simulation).or_insert(Arc::new(model))))
 }

@@ -3,6 +3,7 @@
 use std::time::{Duration, Instant};
 
 use rayon::prelude::*;
+use serde::Serialize;
 
 use super::environment::{Environment, EnvironmentError};
 
@@ -37,13 +38,15 @@ struct Episode {
 }
 
 /// The result of one episode.
-#[derive(Clone, Copy, Debug, PartialEq)]
+#[derive(Clone, Copy, Debug, PartialEq, Serialize)]
 pub struct EpisodeOutcome {
     /// The index of the episode's seed among the rollout's seeds.
+    #[serde(skip)]
     pub index: usize,
     /// The seed of its initial state and of the policy's noise.
     pub seed: u64,
     /// Sum of its rewards, undiscounted.
+    #[serde(rename = "return")]
     pub episode_return: f64,
     /// Its number of steps.
     pub length: u32,

@@ -24,31 +24,25 @@ enum Rules {
 }
 
 impl Kind {
-    fn of(spec: &EnvironmentSpec) -> Result<Self, EnvironmentError> {
-        let row = environment::find(spec.simulation()).ok();
-        let planar = row.and_then(|row| row.planar.as_ref()).map(Rules::Planar);
-        let rules = planar.or_else(|| row?.maze.as_deref().map(|map| Rules::Maze(Maze(map))));
-        let not_simulated = || EnvironmentError::NotSimulated(spec.simulation().to_owned());
-        let (row, rules) = row.zip(rules).ok_or_else(not_simulated)?;
-        Ok(Self { name: &row.name, rules })
+    #[allow(clippy::expect_used)] // The table is part of the program, and the test here makes each of its environments.
+    fn of(spec: &EnvironmentSpec) -> Self {
+        let row = environment::find(spec.simulation()).expect("a simulation is a row of the table");
+        let planar = row.planar.as_ref().map(Rules::Planar);
+        let rules = planar.or_else(|| row.maze.as_deref().map(|map| Rules::Maze(Maze(map))));
+        Self { name: &row.name, rules: rules.expect("its row is a planar robot or a maze") }
     }
 
-    fn mjcf(&self) -> Result<String, EnvironmentError> {
+    #[allow(clippy::expect_used)] // As above.
+    fn mjcf(&self) -> String {
         let file = |name: &str| {
-            let found = MODELS.iter().find(|(model, _)| *model == name).map(|(_, mjcf)| *mjcf);
-            let reason = || format!("evaluator/assets/{name}.xml is missing");
-            found.ok_or_else(|| EnvironmentError::Model { simulation: self.name, reason: reason() })
+            let found = MODELS.iter().find(|(model, _)| *model == name);
+            found.expect("evaluator/assets has the model").1
         };
         match self.rules {
-            Rules::Planar(_) => file(self.name).map(str::to_owned),
-            Rules::Maze(maze) => file("ant").map(|ant| maze.mjcf(ant)),
+            Rules::Planar(_) => file(self.name).to_owned(),
+            Rules::Maze(maze) => maze.mjcf(file("ant")),
         }
     }
-}
-
-/// The environments of the table that [`make`] can make.
-pub fn simulated() -> impl Iterator<Item = &'static EnvironmentSpec> {
-    environment::all().iter().filter(|spec| Kind::of(spec).is_ok())
 }
 
 /// Makes the simulation of an environment. Simulations of one model share the compiled model, so a second one costs little.
@@ -57,9 +51,9 @@ pub fn simulated() -> impl Iterator<Item = &'static EnvironmentSpec> {
 ///
 /// # Errors
 ///
-/// This program does not simulate the environment, or MuJoCo fails.
+/// MuJoCo fails.
 pub fn make(spec: &'static EnvironmentSpec, environment_seed: u64) -> Result<Simulation, EnvironmentError> {
-    let kind = Kind::of(spec)?;
+    let kind = Kind::of(spec);
     let model = physics::model(kind.name, || kind.mjcf())?;
     Ok(match kind.rules {
         Rules::Planar(robot) => {
@@ -77,7 +71,7 @@ pub struct Simulations;
 
 impl Environments for Simulations {
     fn names(&self) -> Vec<String> {
-        simulated().map(|spec| spec.name.clone()).collect()
+        environment::names().into_iter().map(str::to_owned).collect()
     }
 
     fn sizes(&self, name: &str) -> Option<(usize, usize)> {
@@ -91,11 +85,8 @@ impl Environments for Simulations {
 }
 
 /// The MJCF text that an environment's model is compiled from.
-///
-/// # Errors
-/// This program does not simulate the environment.
-pub fn mjcf(spec: &EnvironmentSpec) -> Result<String, EnvironmentError> {
-    Kind::of(spec)?.mjcf()
+pub fn mjcf(spec: &EnvironmentSpec) -> String {
+    Kind::of(spec).mjcf()
 }
 
 #[cfg(test)]
@@ -104,23 +95,10 @@ mod tests {
 
     #[test]
     fn every_environment_of_the_table_is_simulated() {
-        let names: Vec<&str> = simulated().map(|spec| spec.name.as_str()).collect();
-        assert_eq!(names, environment::names());
-        for spec in simulated() {
+        for spec in environment::all() {
             let environment = make(spec, 0).unwrap();
             let sizes = (environment.observation().len(), environment.qpos().len(), environment.qvel().len());
             assert_eq!(sizes, (spec.observation_dim, spec.qpos_dim, spec.qvel_dim), "{}", spec.name);
         }
-    }
-
-    #[test]
-    fn an_environment_without_simulation_is_refused() {
-        let spec: EnvironmentSpec = serde_json::from_value(serde_json::json!({
-            "name": "cartpole", "observation_dim": 4, "action_dim": 1, "qpos_dim": 2, "qvel_dim": 2,
-            "max_episode_steps": 200, "reference_returns": [0.0, 1.0], "reward": "locomotion", "collect": {"none": "a test"},
-        }))
-        .unwrap();
-        let error = make(Box::leak(Box::new(spec)), 0).err().unwrap();
-        assert!(matches!(&error, EnvironmentError::NotSimulated(name) if name == "cartpole"), "{error}");
     }
 }

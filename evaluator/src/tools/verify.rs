@@ -1,14 +1,15 @@
 //! Replays a recorded file one step at a time from its own states, and measures how far the simulation is from it.
 
-use std::path::{Path, PathBuf};
+use std::path::Path;
 
-use quad_dataset::environment::{UnknownEnvironment, find};
+use anyhow::{Context, anyhow};
+use quad_dataset::environment::find;
 use quad_dataset::{
     DatasetError, EnvironmentSpec, Problem, RecordedRows, Row, environments_of_its_sizes, recorded_environment,
 };
+use quad_runtime::Hint;
 use rayon::prelude::*;
 use serde::Serialize;
-use thiserror::Error;
 
 use crate::sim::{self, EnvironmentError, Simulation};
 
@@ -59,68 +60,40 @@ pub struct RewardError {
     pub max: f64,
 }
 
-/// Why a file could not be compared.
-#[derive(Debug, Error)]
-pub enum VerifyError {
-    /// The file could not be read, or lacks what a replay needs.
-    #[error(transparent)]
-    Dataset(#[from] DatasetError),
-    /// The environment could not be made.
-    #[error(transparent)]
-    Environment(#[from] EnvironmentError),
-    /// The file has no row to replay.
-    #[error("{0}: no rows with a next observation")]
-    Empty(PathBuf),
-    /// The file names an unknown environment.
-    #[error("{path}: recorded in another environment")]
-    Unknown {
-        /// The file.
-        path: PathBuf,
-        /// The environment's name.
-        source: UnknownEnvironment,
-    },
-    /// The file names no environment, and its sizes fit several or none.
-    #[error("{path}: does not say which environment it was recorded in, and its sizes fit {}", sizes(fitting))]
-    Unnamed {
-        /// The file.
-        path: PathBuf,
-        /// Names of the environments of these sizes.
-        fitting: Vec<&'static str>,
-    },
-}
+const OTHER_FILE: &str = "a file that can be replayed is what `evaluator collect --env hopper --out FILE` writes";
+const ENVIRONMENT: &str = "--env NAME says where it was recorded";
 
-impl VerifyError {
-    /// What to do about it.
-    pub fn hint(&self) -> String {
-        match self {
-            Self::Dataset(error) if !matches!(error.problem, Problem::Missing { .. }) => error.hint(),
-            Self::Unknown { .. } | Self::Unnamed { .. } => "--env NAME says where it was recorded".to_owned(),
-            _ => "a file that can be replayed is what `evaluator collect --env hopper --out FILE` writes".to_owned(),
-        }
-    }
-}
-
-fn sizes(fitting: &[&str]) -> String {
-    if fitting.is_empty() { "none".to_owned() } else { fitting.join(", ") }
+/// What to do about a file that cannot be read, or lacks what a replay needs.
+fn hint(error: &DatasetError) -> String {
+    if let Problem::Missing { .. } = error.problem { OTHER_FILE.to_owned() } else { error.hint() }
 }
 
 /// The environment of a file: the one that it names or, if it names none, the only one of its sizes.
-pub fn environment_of(path: &Path) -> Result<&'static EnvironmentSpec, VerifyError> {
-    if let Some(name) = recorded_environment(path)? {
-        return find(&name).map_err(|source| VerifyError::Unknown { path: path.into(), source });
+///
+/// # Errors
+/// The file cannot be read, names an unknown environment, or its sizes fit several or none.
+pub fn environment_of(path: &Path) -> anyhow::Result<&'static EnvironmentSpec> {
+    if let Some(name) = recorded_environment(path).hint_of(hint)? {
+        let other = || format!("{}: recorded in another environment", path.display());
+        return find(&name).with_context(other).hint(ENVIRONMENT);
     }
-    match environments_of_its_sizes(path)?[..] {
-        [only] => Ok(only),
-        ref fitting => {
-            let fitting = fitting.iter().map(|spec| spec.name.as_str()).collect();
-            Err(VerifyError::Unnamed { path: path.into(), fitting })
-        }
+    let fitting = environments_of_its_sizes(path).hint_of(hint)?;
+    if let [only] = fitting[..] {
+        return Ok(only);
     }
+    let names = fitting.iter().map(|spec| spec.name.as_str()).collect::<Vec<_>>().join(", ");
+    let names = if names.is_empty() { "none" } else { &names };
+    let path = path.display();
+    let text = "does not say which environment it was recorded in, and its sizes fit";
+    Err(anyhow!("{path}: {text} {names}")).hint(ENVIRONMENT)
 }
 
 /// Replays every row of the file at `path`: sets its qpos and qvel, and takes one step with its action.
-pub fn verify(path: &Path, spec: &'static EnvironmentSpec) -> Result<Report, VerifyError> {
-    let rows = RecordedRows::read(path, spec)?;
+///
+/// # Errors
+/// The file lacks what a replay needs, or MuJoCo fails.
+pub fn verify(path: &Path, spec: &'static EnvironmentSpec) -> anyhow::Result<Report> {
+    let rows = RecordedRows::read(path, spec).hint_of(hint)?;
     let threads = rayon::current_num_threads();
     let share = rows.len().div_ceil(threads);
     let mut environments = (0..threads).map(|_| sim::make(spec, 0)).collect::<Result<Vec<_>, EnvironmentError>>()?;
@@ -133,7 +106,8 @@ pub fn verify(path: &Path, spec: &'static EnvironmentSpec) -> Result<Report, Ver
             own.map(move |i| replay(environment, &rows.row(i), rows.goal(i)))
         })
         .collect();
-    summarise(spec, &errors).ok_or_else(|| VerifyError::Empty(path.into()))
+    let report = summarise(spec, &errors);
+    report.with_context(|| format!("{}: no rows with a next observation", path.display())).hint(OTHER_FILE)
 }
 
 struct RowError {

@@ -5,10 +5,7 @@ use std::sync::{Arc, Mutex};
 use std::time::{Duration, Instant};
 
 use candle_core::Device;
-use quad_policy::{
-    Choice, DiffusionPolicy, DiffusionShape, Ensemble, Header, Layout, MlpConfig, NoisePredictor, PolicyConfig,
-    Precision, Weights,
-};
+use quad_policy::{Choice, DiffusionShape, Header, MlpConfig, PolicyConfig, Weights};
 use quad_protocol::{
     Hash, Job, JobReply, JobRequest, Message, Name, Origin, ScoreReply, ScoreReport, Snapshot, decode, encode, keys,
 };
@@ -60,14 +57,8 @@ pub struct Learner {
 pub fn file(candidates: u32) -> Vec<u8> {
     let shape = DiffusionShape::quad((11, 3), &MlpConfig::mish(&[8; 3]), 2, 5);
     let mut generator = ChaCha8Rng::seed_from_u64(0);
-    let mut weights = |layout: Layout| {
-        let values = Weights::initial(&layout, &mut generator, &Device::Cpu).unwrap();
-        Weights::constant(layout, values)
-    };
-    let actor = NoisePredictor::new(shape.actor(), weights(shape.actor().layout()), Precision::F32);
-    let critics = Ensemble::new(shape.critics(), weights(shape.critics().layout()), Precision::F32);
-    let tensors = DiffusionPolicy::tensors(&actor, &critics, None).unwrap();
     let policy = PolicyConfig::Diffusion { shape, choice: Choice::best_of(candidates) };
+    let tensors = policy.tensors(|layout| Weights::initial(layout, &mut generator, &Device::Cpu)).unwrap();
     let origin = Origin { environment: "hopper".to_owned(), seed: 1, step: 10, episodes: 3 };
     Header { policy, scaling: None, origin }.to_safetensors(&tensors).unwrap()
 }

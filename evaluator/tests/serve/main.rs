@@ -114,17 +114,6 @@ async fn an_evaluator_leaves_in_time_though_its_learner_hangs() {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn a_job_that_is_not_done_is_handed_back() {
-    let learner = Learner::start(snapshot(file(200))).await;
-    let seeds = (0..256).collect();
-    learner.give(Job { seeds, ..job(&learner.snapshot) });
-    let (evaluator, _tokens) = learner.evaluator().await;
-    learner.wait_for(|heard| heard.contains(&Heard::Progress).then_some(())).await;
-    assert!(evaluator.leave().success());
-    assert_eq!(learner.heard.lock().unwrap().last(), Some(&Heard::HandedBack(None)));
-}
-
-#[tokio::test(flavor = "multi_thread")]
 async fn a_job_that_fails_is_handed_back_with_the_reason() {
     let learner = Learner::start(snapshot(b"no tensors".to_vec())).await;
     let (_evaluator, _tokens) = learner.evaluator().await;

@@ -113,14 +113,4 @@ mod tests {
             assert_eq!(inverse_deviation[1], 1.0);
         }
     }
-
-    #[test]
-    fn actions_are_linear_in_the_normalised_observation() {
-        let mut policy = LinearPolicy::zero(2, 2);
-        policy.weights = vec![1.0, 2.0, 0.0, -1.0];
-        policy.normaliser = Normaliser { mean: vec![1.0, 1.0], inverse_deviation: vec![1.0, 0.5] };
-        let mut action = [0.0; 2];
-        policy.act(&[4.0, 5.0], &mut action);
-        assert_eq!(action, [3.0 + 4.0, -2.0]);
-    }
 }

@@ -5,7 +5,6 @@
 //! learning policy. The file is a function of the number of transitions and the seed; the number of threads does not change
 //! it.
 
-mod error;
 mod linear;
 mod record;
 mod search;
@@ -13,12 +12,15 @@ mod search;
 use std::path::Path;
 use std::time::Instant;
 
+use anyhow::anyhow;
 use quad_dataset::environment::{all, find};
 use quad_dataset::{Collect, D4rlWriter, EnvironmentSpec, Metadata, Recipe};
+use quad_runtime::Hint;
 use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;
 
-pub use error::CollectError;
+const OUT: &str = "--out names a file in a folder that you may write in";
+const MUJOCO: &str = "deploy/setup.sh installs the version of MuJoCo that this program was built for";
 
 /// The streams of the file's seed: one for recording, the next ones for the searches.
 const RECORD_STREAM: u64 = 0;
@@ -51,33 +53,29 @@ pub fn environment(name: &str) -> Result<&'static EnvironmentSpec, String> {
     found.map_err(|error| format!("{error}; what can be recorded is {}", possible.collect::<Vec<_>>().join(", ")))
 }
 
-fn recipe(spec: &'static EnvironmentSpec) -> Result<&'static Recipe, CollectError> {
+fn recipe(spec: &'static EnvironmentSpec) -> anyhow::Result<&'static Recipe> {
     match &spec.collect {
         Collect::Recipe(recipe) => Ok(recipe),
-        Collect::None(reason) => Err(CollectError::NoRecipe { environment: &spec.name, reason }),
+        Collect::None(reason) => Err(anyhow!("nothing can be recorded in {}: {reason}", spec.name)),
     }
 }
 
 /// Trains, then records at least `transitions` transitions, in whole episodes, to `path`.
-pub fn collect(
-    spec: &'static EnvironmentSpec,
-    path: &Path,
-    transitions: usize,
-    seed: u64,
-) -> Result<Summary, CollectError> {
+///
+/// # Errors
+/// The environment has no recipe, MuJoCo fails, or the file cannot be written.
+pub fn collect(spec: &'static EnvironmentSpec, path: &Path, transitions: usize, seed: u64) -> anyhow::Result<Summary> {
     let start = Instant::now();
     let recipe = recipe(spec)?;
-    let mut writer = D4rlWriter::create(path, spec)?;
+    let mut writer = D4rlWriter::create(path, spec).hint(OUT)?;
 
-    let policies = search::train(spec, recipe, transitions, |index| stream(seed, RECORD_STREAM + 1 + index))?;
+    let random = |index| stream(seed, RECORD_STREAM + 1 + index);
+    let policies = search::train(spec, recipe, transitions, random).hint(MUJOCO)?;
     let mut scores = record::record(spec, recipe, &policies, transitions, stream(seed, RECORD_STREAM), &mut writer)?;
     let rows = writer.rows();
-    let iteration = policies.len() as i64 - 1;
-    writer.finish(&Metadata {
-        algorithm: "augmented random search, all iterations, with action noise",
-        iteration,
-        seed,
-    })?;
+    let (algorithm, iteration) =
+        ("augmented random search, all iterations, with action noise", policies.len() as i64 - 1);
+    writer.finish(&Metadata { algorithm, iteration, seed }).hint(OUT)?;
 
     scores.sort_by(f64::total_cmp);
     let percentile = |percent: usize| scores[(scores.len() - 1) * percent / 100];

@@ -1,14 +1,14 @@
 //! Mixes episodes of a search's policies, from the first to the last, into one dataset.
 
-use quad_dataset::{D4rlWriter, EnvironmentSpec, Recipe, Row};
-use quad_runtime::ProgressBar;
+use quad_dataset::{D4rlWriter, DatasetError, EnvironmentSpec, Recipe, Row};
+use quad_runtime::{Hint, ProgressBar};
 use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 use rand_distr::{Distribution, StandardNormal};
 use rayon::prelude::*;
 
-use super::error::CollectError;
 use super::linear::LinearPolicy;
+use super::{MUJOCO, OUT};
 use crate::sim::{self, EnvironmentError, Simulation, Step};
 
 /// Each episode adds Gaussian noise to its actions (which span ±1). Its standard deviation is drawn uniformly from this range:
@@ -34,8 +34,9 @@ pub fn record(
     transitions: usize,
     mut random: ChaCha8Rng,
     writer: &mut D4rlWriter,
-) -> Result<Vec<f64>, CollectError> {
-    let mut recorders = (0..ROUND).map(|_| Recorder::new(spec)).collect::<Result<Vec<_>, EnvironmentError>>()?;
+) -> anyhow::Result<Vec<f64>> {
+    let recorders = (0..ROUND).map(|_| Recorder::new(spec)).collect::<Result<Vec<_>, EnvironmentError>>();
+    let mut recorders = recorders.hint(MUJOCO)?;
     let mixture = &recipe.mixture;
     let mut room: Vec<f64> = mixture.iter().map(|(_, share)| share * transitions as f64).collect();
     let mut scores = Vec::new();
@@ -60,7 +61,7 @@ pub fn record(
             let band = mixture.iter().rposition(|&(from, _)| score >= from).unwrap_or(0);
             if recorder.ended() && (room[band] > 0.0 || !patient) {
                 room[band] -= recorder.steps.len() as f64;
-                recorder.write(writer)?;
+                recorder.write(writer).hint(OUT)?;
                 scores.push(score);
             }
             if writer.rows() >= transitions {
@@ -139,7 +140,7 @@ impl Recorder {
         self.qvel.extend_from_slice(self.environment.qvel());
     }
 
-    fn write(&self, writer: &mut D4rlWriter) -> Result<(), CollectError> {
+    fn write(&self, writer: &mut D4rlWriter) -> Result<(), DatasetError> {
         let EnvironmentSpec { observation_dim, action_dim, qpos_dim, qvel_dim, .. } = *self.spec;
         for (i, step) in self.steps.iter().enumerate() {
             writer.push(&Row {

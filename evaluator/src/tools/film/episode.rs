@@ -105,18 +105,3 @@ impl Environment for Watched {
         self.simulation.score(episode_return)
     }
 }
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn a_caption_says_the_steps_the_return_and_the_candidates_and_stays_at_the_end() {
-        let pose = |episode_return| Pose { qpos: Vec::new(), goal: None, episode_return };
-        let poses = vec![pose(0.0), pose(1.25), pose(3.0)];
-        let episode = Episode { seed: 1, poses, gradient_step: 200, choice: "10 candidates".to_owned() };
-        assert_eq!(episode.caption(1), ["trained 200\nstep 1", "return 1.2\n10 candidates"]);
-        assert_eq!(episode.caption(2), ["trained 200\nstep 2, end", "return 3.0\n10 candidates"]);
-        assert_eq!(episode.caption(9), episode.caption(2));
-    }
-}

@@ -98,12 +98,6 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_name_says_what_a_film_is_written_as() {
-        assert_eq!(output("a/film.mp4").unwrap(), Output { path: "a/film.mp4".into(), format: Format::Mp4 });
-        assert!(output("film.avi").is_err() && output("gif").is_err());
-    }
-
-    #[test]
     fn films_lie_side_by_side_and_strips_one_below_the_other() {
         let (film, strip) = (Layout::of(Format::Gif), Layout::of(Format::Png));
         assert_eq!(film.size(2), (640, 240));

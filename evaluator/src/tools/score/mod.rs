@@ -14,7 +14,7 @@ use tracing::{info, warn};
 
 use crate::sim::{Environments, Simulations};
 pub(crate) use args::ScoreArgs;
-use results::{Episode, Scored, table};
+use results::{Scored, table};
 pub(crate) use subject::Subject;
 
 /// Episodes in a batch. The limit bounds memory; a larger batch is hardly faster.
@@ -50,7 +50,7 @@ fn measure(subject: &Subject) -> anyhow::Result<Scored> {
         seed: *seed,
         choice: policy.choice(),
         precision: policy.precision().arithmetic(),
-        episodes: batches.iter().flatten().map(Episode::from).collect(),
+        episodes: batches.into_iter().flatten().collect(),
     };
     let spread = scored.spread().map(Spread::text).unwrap_or_default();
     info!("{}, {}: {spread}", path.display(), scored.title());

@@ -29,21 +29,7 @@ pub struct Scored {
     /// Arithmetic of its actions, as in `scores.jsonl`.
     pub precision: String,
     /// Episodes in the order of their seeds.
-    pub episodes: Vec<Episode>,
-}
-
-/// The result of one episode.
-#[derive(Clone, Copy, Debug, PartialEq, Serialize)]
-pub struct Episode {
-    /// Seed of its initial state and of the policy's noise.
-    pub seed: u64,
-    /// Sum of its rewards, undiscounted.
-    #[serde(rename = "return")]
-    pub episode_return: f64,
-    /// Its environment steps.
-    pub length: u32,
-    /// D4RL's normalised score.
-    pub score: f64,
+    pub episodes: Vec<EpisodeOutcome>,
 }
 
 impl Scored {
@@ -55,13 +41,6 @@ impl Scored {
     /// The normalised scores of the episodes, of which there is at least one.
     pub fn spread(&self) -> Option<Spread> {
         Spread::of(&Vec::from_iter(self.episodes.iter().map(|episode| episode.score)))
-    }
-}
-
-impl From<&EpisodeOutcome> for Episode {
-    fn from(outcome: &EpisodeOutcome) -> Self {
-        let EpisodeOutcome { seed, episode_return, length, score, .. } = *outcome;
-        Self { seed, episode_return, length, score }
     }
 }
 
@@ -112,7 +91,7 @@ mod tests {
     use super::*;
 
     fn scored(snapshot: &str, candidates: u32, scores: &[f64]) -> Scored {
-        let episode = |&score| Episode { seed: 1, episode_return: 0.0, length: 7, score };
+        let episode = |&score| EpisodeOutcome { index: 0, seed: 1, episode_return: 0.0, length: 7, score };
         Scored {
             snapshot: Path::new(snapshot).to_owned(),
             weights: String::new(),
@@ -140,18 +119,12 @@ mod tests {
     }
 
     #[test]
-    fn unlike_environments_have_no_mean() {
-        let other = Scored { environment: "walker2d".to_owned(), ..scored("b", 1, &[1.0]) };
-        let table = table(&[scored("a", 1, &[1.0]), other]);
-        assert!(!table.contains("mean of"), "{table}");
-        assert!(table.contains(" 1.00\n"), "a single episode has no spread: {table}");
-    }
-
-    #[test]
-    fn every_arithmetic_is_named() {
-        let gaussian = Scored { choice: None, precision: "f32-avx2".to_owned(), ..scored("a", 1, &[1.0]) };
+    fn unlike_environments_have_no_mean_and_every_arithmetic_is_named() {
+        let gaussian = Scored { choice: None, environment: "walker2d".to_owned(), ..scored("a", 1, &[1.0]) };
         let diffusion = Scored { precision: "bf16-amx".to_owned(), ..scored("b", 10, &[1.0]) };
         let table = table(&[gaussian, diffusion]);
+        assert!(!table.contains("mean of"), "{table}");
         assert!(table.contains("no candidates  10 candidates") && table.contains("bf16-amx and f32-avx2"), "{table}");
+        assert!(table.contains(" 1.00\n"), "a single episode has no spread: {table}");
     }
 }

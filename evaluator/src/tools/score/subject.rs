@@ -11,7 +11,7 @@ use quad_protocol::{Hash, Origin};
 use quad_runtime::Hint;
 
 use super::args::{MOST_EPISODES, ScoreArgs};
-use crate::sim::{self, Environment, EnvironmentError, EpisodeOutcome, Rollout};
+use crate::sim::{Environment, EnvironmentError, EpisodeOutcome, Rollout};
 
 const ONE: &str = "what can be scored is a file like RUN/snapshots/step_000020000.safetensors, as `learner train` of this \
                    version writes them";
@@ -106,8 +106,6 @@ impl Subject {
             );
             return Err(error).hint("--env NAME says where it is to act");
         }
-        let simulated = sim::make(self.spec, self.seed).with_context(|| format!("{name} cannot be scored here"));
-        simulated.hint(OTHER_ENVIRONMENT)?;
         if !(1..=MOST_EPISODES).contains(&episodes.into()) {
             return Err(anyhow!("{name} asks for {episodes} episodes")).hint(RANGE);
         }

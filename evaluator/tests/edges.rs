@@ -1,0 +1,162 @@
+//! What simulations do where the comparison with Gymnasium does not come: initial states, bounds that are rarely met, time
+//! limits, numbers that are none.
+#![allow(clippy::unwrap_used)]
+
+use quad_dataset::EnvironmentSpec;
+use quad_dataset::environment::{all, find};
+use quad_evaluator::sim::{Simulation, Step, make};
+
+const MAZES: [&str; 3] = ["antmaze-umaze", "antmaze-medium", "antmaze-large"];
+
+fn simulation(name: &str) -> Simulation {
+    make(find(name).unwrap(), 0).unwrap()
+}
+
+#[test]
+fn an_episode_is_a_function_of_its_seed() {
+    for spec in all() {
+        let (mut one, mut other) = (make(spec, 0).unwrap(), make(spec, 0).unwrap());
+        let action = vec![0.3; spec.action_dim];
+        one.reset(7);
+        one.step(&action);
+        one.reset(8);
+        other.reset(8);
+        for _ in 0..10 {
+            assert_eq!(one.observation(), other.observation(), "{}", spec.name);
+            assert_eq!(one.step(&action), other.step(&action), "{}", spec.name);
+        }
+        one.reset(9);
+        other.reset(8);
+        assert_ne!(one.observation(), other.observation(), "{}", spec.name);
+    }
+}
+
+/// The noise on the positions and velocities of 2,000 initial states, of which `rest` are the positions without it.
+fn initial_noise(name: &str, rest: &[f64]) -> (Vec<f64>, Vec<f64>) {
+    let mut simulation = simulation(name);
+    let (mut positions, mut velocities) = (Vec::new(), Vec::new());
+    for seed in 0..2000 {
+        simulation.reset(seed);
+        positions.extend(simulation.qpos().iter().zip(rest).map(|(value, rest)| value - rest));
+        velocities.extend_from_slice(simulation.qvel());
+    }
+    (positions, velocities)
+}
+
+fn assert_fills(values: &[f64], bound: f64) {
+    let (least, most) = values.iter().fold((f64::INFINITY, f64::NEG_INFINITY), |(a, b), &v| (a.min(v), b.max(v)));
+    // Sums with the position at rest are rounded.
+    assert!(least >= -bound - 1e-12 && least < -0.99 * bound, "{least}");
+    assert!(most <= bound + 1e-12 && most > 0.99 * bound, "{most}");
+}
+
+#[test]
+fn initial_states_lie_within_the_noise() {
+    let mut standing = [0.0; 15];
+    standing[1] = 1.25;
+    for name in ["hopper", "walker2d"] {
+        let (positions, velocities) = initial_noise(name, &standing);
+        assert_fills(&positions, 0.005);
+        assert_fills(&velocities, 0.005);
+    }
+    let mut ant = [0.0; 15];
+    (ant[2], ant[3]) = (0.75, 1.0);
+    for (name, rest) in [("halfcheetah", [0.0; 15])].into_iter().chain(MAZES.map(|name| (name, ant))) {
+        let (positions, velocities) = initial_noise(name, &rest);
+        assert_fills(&positions, 0.1);
+        let n = velocities.len() as f64;
+        let mean = velocities.iter().sum::<f64>() / n;
+        let deviation = (velocities.iter().map(|v| v * v).sum::<f64>() / n).sqrt();
+        let within_one = velocities.iter().filter(|v| v.abs() < 0.1).count() as f64 / n;
+        assert!(mean.abs() < 0.003 && (deviation - 0.1).abs() < 0.003, "{name}: mean {mean}, deviation {deviation}");
+        assert!((within_one - 0.6827).abs() < 0.01, "{name}: {within_one}; a normal distribution has 0.6827");
+    }
+}
+
+#[test]
+fn a_hopper_is_healthy_only_below_a_hundred_metres_a_second() {
+    let mut hopper = simulation("hopper");
+    for (velocity, terminated) in [(90.0, false), (110.0, true)] {
+        // In the air, with level legs.
+        hopper.set_state(&[0.0, 1.5, 0.0, -1.57, 0.0, 0.0], &[velocity, 0.0, 0.0, 0.0, 0.0, 0.0]);
+        assert_eq!(hopper.step(&[0.0; 3]).terminated, terminated, "{velocity} m/s");
+    }
+}
+
+#[test]
+fn infinite_actions_are_clipped() {
+    let (mut one, mut other) = (simulation("hopper"), simulation("hopper"));
+    one.reset(0);
+    other.reset(0);
+    assert_eq!(one.step(&[5.0, f32::NEG_INFINITY, f32::INFINITY]), other.step(&[1.0, -1.0, 1.0]));
+    assert_eq!(one.observation(), other.observation());
+}
+
+#[test]
+fn a_goal_is_reached_at_half_a_metre() {
+    let mut ant = simulation("antmaze-umaze");
+    let standing = [1.2, 0.0, 0.55, 1.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0, -1.0, 0.0, -1.0, 0.0, 1.0];
+    let mut step_with_goal = |goal: [f64; 2]| {
+        ant.set_goal(&goal);
+        ant.set_state(&standing, &[0.0; 14]);
+        let step = ant.step(&[0.0; 8]);
+        (step, [ant.qpos()[0], ant.qpos()[1]])
+    };
+    let (_, [x, y]) = step_with_goal([8.0, 8.0]);
+    let edge = x + 0.5; // Exact: both lie between 1 and 2.
+    assert_eq!(edge - x, 0.5);
+    assert_eq!(step_with_goal([edge, y]).0, Step { reward: 1.0, terminated: true, truncated: false });
+    assert_eq!(step_with_goal([edge.next_up(), y]).0, Step { reward: 0.0, terminated: false, truncated: false });
+}
+
+/// Where nothing but the time limit ends an episode: in the air, or on the back. A walker has no such place.
+fn endless(spec: &EnvironmentSpec) -> Option<Vec<f64>> {
+    let mut qpos = vec![0.0; spec.qpos_dim];
+    match spec.simulation() {
+        "walker2d" => return None,
+        "hopper" => qpos[1] = 400.0, // Falls for 8 s, 314 m, at less than 100 m/s.
+        "halfcheetah" => qpos[2] = std::f64::consts::PI,
+        _ => qpos[2..5].copy_from_slice(&[0.55, 0.0, 1.0]),
+    }
+    Some(qpos)
+}
+
+#[test]
+fn the_time_limit_truncates_and_does_not_terminate() {
+    for spec in all() {
+        let Some(qpos) = endless(spec) else { continue };
+        let mut simulation = make(spec, 0).unwrap();
+        simulation.reset(0);
+        simulation.set_state(&qpos, &vec![0.0; spec.qvel_dim]);
+        for step in 1..=spec.max_episode_steps {
+            let Step { terminated, truncated, .. } = simulation.step(&vec![0.0; spec.action_dim]);
+            assert_eq!((terminated, truncated), (false, step == spec.max_episode_steps), "{}, {step}", spec.name);
+        }
+        simulation.reset(0);
+        assert!(!simulation.step(&vec![0.0; spec.action_dim]).truncated, "a reset starts the time anew");
+    }
+}
+
+#[test]
+fn what_is_not_a_number_ends_the_episode_without_reward() {
+    let end = Step { reward: 0.0, terminated: true, truncated: false };
+    for spec in all() {
+        let mut simulation = make(spec, 0).unwrap();
+        simulation.reset(0);
+        // Even at the goal.
+        let here = [simulation.qpos()[0], simulation.qpos()[1]];
+        simulation.set_goal(&here);
+        let still = vec![0.0; spec.action_dim];
+        let mut action = still.clone();
+        action[1] = f32::NAN;
+        assert_eq!(simulation.step(&action), end, "{}", spec.name);
+        let (qpos, mut qvel) = (simulation.qpos().to_vec(), simulation.qvel().to_vec());
+        qvel[3] = 1e12;
+        simulation.set_state(&qpos, &qvel);
+        assert_eq!(simulation.step(&still), end, "{}", spec.name);
+        assert!(simulation.observation().iter().all(|value| value.is_finite()));
+        simulation.set_goal(&[50.0; 2]);
+        simulation.reset(0);
+        assert!(!simulation.step(&still).terminated, "a reset recovers");
+    }
+}
