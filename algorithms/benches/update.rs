@@ -1,4 +1,5 @@
-//! Gradient steps at Hopper's shapes, whole and in parts, and the machine's peaks at these shapes, which bound them.
+//! Gradient steps of every algorithm at Hopper's shapes, QUAD's also in parts, and the machine's peaks at these shapes, which
+//! bound them.
 //! `deploy/bench.sh` makes a table of the results.
 
 #![allow(clippy::expect_used)] // what cannot be had ends the run
@@ -23,8 +24,11 @@ use toml::Table;
 /// Hopper's observation and action.
 const DIMS: (usize, usize) = (11, 3);
 
-/// The configurations that are measured: task, algorithm, and next actions sampled per state. deploy/bench/bench.py knows
-/// their shapes.
+/// The task whose values all algorithms but QUAD are measured with.
+const TASK: &str = "hopper-medium-v2";
+
+/// Other configurations that are measured: task, algorithm, and next actions sampled per state. deploy/bench/bench.py knows
+/// QUAD's shapes; algorithms/benches/jax_step.py names all as they are named here.
 const CONFIGURATIONS: [(&str, [&str; 2], Option<u32>); 4] = [
     ("paper, 10 samples", ["hopper-medium-replay-v2", "quad"], Some(10)),
     ("paper, 1 sample", ["hopper-medium-replay-v2", "quad"], Some(1)),
@@ -37,6 +41,7 @@ struct Experiment {
     definition: Definition,
     agent: Table,
     batch_size: usize,
+    total_steps: u64,
 }
 
 fn experiment([task, algorithm]: [&str; 2], samples: Option<u32>) -> Experiment {
@@ -44,15 +49,16 @@ fn experiment([task, algorithm]: [&str; 2], samples: Option<u32>) -> Experiment 
     let mut values = Values::of(&definition).expect("its values").for_task(Some(task));
     let Some(toml::Value::Table(mut agent)) = values.remove("agent") else { panic!("no values for {task}") };
     agent.extend(samples.map(|samples| ("samples".to_owned(), samples.into())));
-    let batch_size = values["batch_size"].as_integer().expect("a whole number") as usize;
-    Experiment { definition, agent, batch_size }
+    let number = |name: &str| values[name].as_integer().expect("a whole number");
+    let (batch_size, total_steps) = (number("batch_size") as usize, number("steps") as u64);
+    Experiment { definition, agent, batch_size, total_steps }
 }
 
 fn context(experiment: &Experiment, precision: Precision, device: &Device) -> Context {
     Context {
-        transitions: Arc::new(transitions(experiment.batch_size)),
+        transitions: Arc::new(transitions(2 * experiment.batch_size)),
         batch_size: experiment.batch_size,
-        total_steps: 1_000_000,
+        total_steps: experiment.total_steps,
         seed: 0,
         precision,
         device: device.clone(),
@@ -78,7 +84,7 @@ fn transitions(count: usize) -> Transitions {
         rewards: numbers(count),
         next_observations: numbers(count * DIMS.0),
         terminals: vec![false; count],
-        timeouts: vec![true; count],
+        timeouts: (1..=count).map(|row| row == count).collect(),
     };
     Transitions::of(arrays).expect("numbers that can be learnt from")
 }
@@ -95,12 +101,19 @@ fn updates(criterion: &mut Criterion) {
     for (group, device, precision) in groups {
         let mut group = criterion.benchmark_group(group);
         group.sample_size(20);
-        for (name, which, samples) in CONFIGURATIONS {
+        let others =
+            ALGORITHMS.iter().filter(|known| known.name != "quad").map(|known| (known.name, [TASK, known.name], None));
+        for (name, which, samples) in CONFIGURATIONS.into_iter().chain(others) {
             let experiment = experiment(which, samples);
             let context = context(&experiment, precision, &device);
-            let items: Vec<u32> = (0..experiment.batch_size as u32).collect();
             let mut agent = Agent::new(experiment.definition, &experiment.agent, context).expect("usable values");
-            group.bench_function(name, |bencher| bencher.iter(|| agent.update(&items).expect("a step")));
+            let items: Vec<u32> = (0..experiment.batch_size).map(|i| (i % agent.items()) as u32).collect();
+            let phases = agent.phases();
+            for (i, start) in phases.iter().enumerate() {
+                agent.skip_to(*start);
+                let name = if phases.len() == 1 { name.to_owned() } else { format!("{name}, phase {}", i + 1) };
+                group.bench_function(name, |bencher| bencher.iter(|| agent.update(&items).expect("a step")));
+            }
         }
         group.finish();
     }

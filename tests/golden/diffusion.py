@@ -30,7 +30,7 @@ def random_predictor(rng, observation_dim, action_dim, trunk):
 
 def schedule(steps):
     t = np.arange(1, steps + 1)
-    beta = np.concatenate([[0.0], 1 - np.exp(-0.1 / steps - 0.5 * (10 - 0.1) * (2 * t - 1) / steps**2)])
+    beta = np.concatenate([np.zeros(1), 1 - np.exp(-0.1 / steps - 0.5 * (10 - 0.1) * (2 * t - 1) / steps**2)])
     return beta, np.cumprod(1 - beta)
 
 
@@ -40,9 +40,9 @@ def denoise(actor, states, noisy_actions, t, steps, activation):
     epsilon = fast_noise(actor, states, noisy_actions, np.full(states.shape[:-1], t), activation)
     x0 = (noisy_actions - math.sqrt(1 - alpha_bar[t]) * epsilon) / math.sqrt(alpha_bar[t])
     x0 = np.clip(x0, -1, 1)
-    of_x0 = math.sqrt(alpha_bar[t - 1]) * float(beta[t])
-    of_noisy = math.sqrt(1 - beta[t]) * float(1 - alpha_bar[t - 1])
-    return x0, (of_x0 * x0 + of_noisy * noisy_actions) / float(1 - alpha_bar[t])
+    of_x0 = math.sqrt(alpha_bar[t - 1]) * beta[t]
+    of_noisy = math.sqrt(1 - beta[t]) * (1 - alpha_bar[t - 1])
+    return x0, (of_x0 * x0 + of_noisy * noisy_actions) / (1 - alpha_bar[t])
 
 
 def repeated(states, noise):

@@ -41,11 +41,16 @@ def weigh(agent, state, inputs, nu_squared, sigma_squared):
         return weights[inputs["permutation"]], share_of_delta, {}
     if guidance == "quad":
         return weights, share_of_delta, {}
-    means, rate = state["lambda_means"].copy(), agent["nu_ema_rate"]
-    for step in np.unique(t):
-        now, before = weights[t == step].mean(), means[step - 1]
-        means[step - 1] = now if before < 0 else (1 - rate) * before + rate * now
+    before, rate = state["lambda_means"], agent["nu_ema_rate"]
+    now, exist = group_means(weights, t - 1, agent["diffusion_steps"])
+    means = np.where(exist, np.where(before < 0, now, (1 - rate) * before + rate * now), before)
     return means[t - 1], share_of_delta, {"lambda_means": means}
+
+
+def group_means(weights, groups, count):
+    """The mean weight of each group, 0 of an empty one; and which groups are not empty."""
+    rows = groups == np.arange(count)[:, None]
+    return (rows * weights).sum(1) / np.maximum(rows.sum(1), 1), rows.any(1)
 
 
 def measure(agent, t, weights, nu_squared, sigma_squared, gradient, error):
@@ -53,9 +58,8 @@ def measure(agent, t, weights, nu_squared, sigma_squared, gradient, error):
     fifths = FIFTHS * (t - 1) // agent["diffusion_steps"]
     cosine = (gradient * error).sum(-1) / np.linalg.norm(gradient, axis=-1) / np.linalg.norm(error, axis=-1)
     out = {f"lambda_quantile_{q}": np.quantile(weights, q / 100) for q in QUANTILES}
-    for fifth in range(FIFTHS):
-        of_fifth = weights[fifths == fifth]
-        out[f"lambda_fifth_{fifth + 1}"] = of_fifth.mean() if len(of_fifth) else weights.mean()
+    means = np.where(*group_means(weights, fifths, FIFTHS)[::-1], weights.mean())
+    out |= {f"lambda_fifth_{fifth + 1}": means[fifth] for fifth in range(FIFTHS)}
     return out | {
         "lambda_mean": weights.mean(),
         "lambda_above_99_share": np.mean(weights > 0.99),

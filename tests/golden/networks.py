@@ -73,7 +73,7 @@ fast_values = compiled(values)
 def clip_by_norm(gradients, limit):
     """Clipping by the global norm; also the norm before it."""
     norm = math.sqrt(sum(np.sum(g**2) for g in gradients.values()))
-    return {name: g * min(1.0, limit / norm) for name, g in gradients.items()}, norm
+    return {name: g * np.minimum(1.0, limit / norm) for name, g in gradients.items()}, norm
 
 
 def decayed(rate, config):

@@ -152,7 +152,7 @@ def guide(config, state, inputs, noisy, target_critic):
     alignment = (u * g).sum(-1)  # [K, B]
     sigma_squared = alignment.var(0)
     nu_squared, batch_nu, rate = state["nu_squared"][0], alignment.mean(0).var(), agent["nu_ema_rate"]
-    nu_squared = batch_nu if nu_squared < 0 else (1 - rate) * nu_squared + rate * batch_nu
+    nu_squared = np.where(nu_squared < 0, batch_nu, (1 - rate) * nu_squared + rate * batch_nu)
     weights, share_of_delta, means = guidance.weigh(agent, state, inputs, nu_squared, sigma_squared)
     out = {"critic_action_gradients": gradients, "q_scale": q_scale, "u": u, "sigma_squared": sigma_squared}
     out |= {"nu_squared": nu_squared, "lambda": weights, "delta_share": np.mean(share_of_delta > 0.01)} | means
