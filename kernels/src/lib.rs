@@ -6,6 +6,7 @@
 //! - `packed`: a product's right-hand side, laid out once for many products.
 //! - `avx512`, `avx2`: the products that the libraries at hand do more slowly (kernels/benches/README.md says by how much).
 //! - [`activation`]: Mish and its derivative; [`narrow`]: the first and last layer of a network, fused with it.
+//! - [`norm`]: layer norm, forward and backward.
 //! - [`optimiser`]: Adam and EMA over whole parameter vectors.
 //! - `cuda`: what of this a GPU does in one launch, with the feature `cuda`.
 //! - [`scaling`]: between a user's units and those of networks.
@@ -26,6 +27,7 @@ mod buffer;
 pub mod cuda;
 mod level;
 pub mod narrow;
+pub mod norm;
 pub mod optimiser;
 #[cfg(target_arch = "x86_64")]
 mod packed;

@@ -90,13 +90,14 @@ fn first_rows(layer: &FirstLayer<'_>, out: &mut [f32], f: impl Fn(f32) -> f32) {
 }
 
 vectorised! {
-    /// `out = f(base + shift + actions · kernel)`, `rows × width`.
-    pub fn first_layer(f: Activation, layer: &FirstLayer<'_>, out: &mut [f32]) {
+    /// `out = f(base + shift + actions · kernel)`, `rows × width`; without f the sum itself.
+    pub fn first_layer(f: Option<Activation>, layer: &FirstLayer<'_>, out: &mut [f32]) {
         match f {
-            Activation::Mish => first_rows(layer, out, mish),
-            Activation::Relu => first_rows(layer, out, relu),
-            Activation::Silu => first_rows(layer, out, |x| silu_and_slope(x).0),
-            Activation::Tanh => first_rows(layer, out, |x| tanh_and_slope(x).0),
+            None => first_rows(layer, out, |x| x),
+            Some(Activation::Mish) => first_rows(layer, out, mish),
+            Some(Activation::Relu) => first_rows(layer, out, relu),
+            Some(Activation::Silu) => first_rows(layer, out, |x| silu_and_slope(x).0),
+            Some(Activation::Tanh) => first_rows(layer, out, |x| tanh_and_slope(x).0),
         }
     }
 }
@@ -169,7 +170,7 @@ mod tests {
             let layer =
                 FirstLayer { base: &x, repeat: 1, shift: &v[..width], actions: &[0.3, -0.2, 0.9], kernel: &v[width..] };
             let mut y = vec![0.0; 3 * width];
-            first_layer(Activation::Mish, &layer, &mut y);
+            first_layer(Some(Activation::Mish), &layer, &mut y);
             for (i, y) in y.iter().enumerate() {
                 let pre = x[i] + v[i % width] + [0.3, -0.2, 0.9][i / width] * v[width + i % width];
                 assert!((f64::from(*y) - mish_f64(f64::from(pre)).0).abs() < 1e-5);

@@ -31,11 +31,11 @@ impl Operation for ActionGradients {
                     x.extend_from_slice(&actions[row * a..][..a]);
                 }
                 with_workspace(|work| {
-                    work.with_activations(count, layers.hidden(), |left, work| {
+                    work.with_activations(count, layers, |left, work| {
                         let mut values = vec![0.0; count];
                         network.forward_saving(&x, left, work, &mut values);
                         values.fill(1.0);
-                        network.backward(&values, &mut left.slope, work);
+                        network.backward(&values, left, work);
                         network.input_gradient(left.slope[0], (o, a), out);
                     });
                 });

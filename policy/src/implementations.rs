@@ -55,8 +55,8 @@ fn layers(generator: &mut ChaCha8Rng) -> MlpConfig {
     MlpConfig {
         hidden: (0..generator.random_range(1..5)).map(|_| widths[generator.random_range(0..4)]).collect(),
         activation: ACTIVATIONS[generator.random_range(0..4)],
-        norm: false,
-        norm_epsilon: Epsilon::Flax,
+        norm: generator.random(),
+        norm_epsilon: [Epsilon::Flax, Epsilon::Torch][generator.random_range(0..2)],
         initial: [Initial::Xavier, Initial::Orthogonal, Initial::Torch][generator.random_range(0..3)],
     }
 }

@@ -28,12 +28,14 @@ pub(crate) struct Layers {
     offsets: Vec<usize>,
 }
 
-/// Kernel and bias of one layer of one member, to be written.
+/// Parameters of one layer of one member, to be written.
 pub(crate) struct LayerMut<'a> {
     pub layer: usize,
     pub member: usize,
     pub kernel: &'a mut [f32],
     pub bias: &'a mut [f32],
+    /// Scale and shift of the norm, if the layer has one.
+    pub norm: Option<[&'a mut [f32]; 2]>,
 }
 
 impl Layers {
@@ -56,6 +58,11 @@ impl Layers {
 
     fn is_normed(&self, layer: usize) -> bool {
         self.norm && layer + 1 < self.count()
+    }
+
+    /// What a norm adds to the variance.
+    pub fn epsilon(&self) -> f32 {
+        self.norm_epsilon.value() as f32
     }
 
     /// Numbers that go in.
@@ -101,17 +108,31 @@ impl Layers {
         &weights[self.offsets[layer] + (self.members * inputs + member) * outputs..][..outputs]
     }
 
-    /// All kernels and biases in the part of a vector that is these layers', which have no norm. They share nothing, so that
-    /// each may be written by another thread.
+    /// Scale and shift of a layer's norm, if it has one.
+    pub fn norm<'a>(&self, weights: &'a [f32], layer: usize, member: usize) -> Option<[&'a [f32]; 2]> {
+        let (inputs, outputs) = self.shape(layer);
+        let of = |kind| &weights[self.offsets[layer] + (self.members * (inputs + kind) + member) * outputs..][..outputs];
+        self.is_normed(layer).then(|| [of(1), of(2)])
+    }
+
+    /// All parameters in the part of a vector that is these layers'. They share nothing, so that each may be written by another
+    /// thread.
     pub fn split_mut<'a>(&self, mut rest: &'a mut [f32]) -> Vec<LayerMut<'a>> {
         let mut all = Vec::with_capacity(self.count() * self.members);
         for layer in 0..self.count() {
             let (inputs, outputs) = self.shape(layer);
             let (kernels, behind) = rest.split_at_mut(self.members * inputs * outputs);
             let (biases, behind) = behind.split_at_mut(self.members * outputs);
+            let norms = if self.is_normed(layer) { self.members * outputs } else { 0 };
+            let (scales, behind) = behind.split_at_mut(norms);
+            let (shifts, behind) = behind.split_at_mut(norms);
             rest = behind;
+            let mut norms = scales.chunks_exact_mut(outputs).zip(shifts.chunks_exact_mut(outputs));
             let members = kernels.chunks_exact_mut(inputs * outputs).zip(biases.chunks_exact_mut(outputs));
-            all.extend(members.enumerate().map(|(member, (kernel, bias))| LayerMut { layer, member, kernel, bias }));
+            all.extend(members.enumerate().map(|(member, (kernel, bias))| {
+                let norm = norms.next().map(|(scale, shift)| [scale, shift]);
+                LayerMut { layer, member, kernel, bias, norm }
+            }));
         }
         all
     }

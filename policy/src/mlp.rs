@@ -62,7 +62,7 @@ impl Mlp {
 
     /// Whether the fast implementation serves them.
     pub fn is_fast(&self, weights: &Weights) -> bool {
-        has_fast_implementation(weights.values().device()) && !self.layers.norm
+        has_fast_implementation(weights.values().device())
     }
 
     fn composed_forward(&self, weights: &Weights, x: &Tensor) -> Result<Tensor> {
@@ -142,7 +142,7 @@ impl Operation {
         // The copy is cut up; the other is read as a whole.
         saved.tiles(&mut gradient.to_vec()).into_par_iter().for_each(|mut tile| {
             let network = self.mlp.network(weights, tile.member);
-            with_workspace(|work| network.backward(tile.out, &mut tile.activations.slope, work));
+            with_workspace(|work| network.backward(tile.out, &mut tile.activations, work));
         });
         if let Some(kept) = &self.kept {
             kept.write(layers.range(), |out| saved.weight_gradients(layers.split_mut(out), x, gradient))?;

@@ -1,4 +1,5 @@
-//! One network on one tile of rows: hidden layers with an activation each, and a linear output; forward and backward.
+//! One network on one tile of rows: hidden layers with a norm, if they have one, and an activation each, and a linear output;
+//! forward and backward.
 //!
 //! Forward passes that nothing is kept of take the first layer apart: the state's part is computed once per state, whatever
 //! number of actions is tried in it, and the action's few columns are fused with the activation.
@@ -8,6 +9,7 @@ use crate::precision::Precision;
 use quad_kernels::Buffer;
 use quad_kernels::activation::{activate, activate_with_slope, multiply};
 use quad_kernels::narrow::{FirstLayer, dots, first_layer, scale_by_combination};
+use quad_kernels::norm::{kept, normalise, normalise_backward};
 use quad_kernels::product::{Packed, product, product_transposed};
 use std::cell::RefCell;
 
@@ -44,6 +46,8 @@ pub(crate) struct Input<'a> {
 pub(crate) struct Activations<'a> {
     pub x: Vec<&'a mut [f32]>,
     pub slope: Vec<&'a mut [f32]>,
+    /// What norms keep ([`quad_kernels::norm`]); empty without a norm.
+    pub norm: Vec<&'a mut [f32]>,
 }
 
 /// Buffers of one thread, grown to the largest tile it met.
@@ -58,6 +62,9 @@ pub(crate) struct Workspace {
     out: Buffer,
     x: Vec<Buffer>,
     slope: Vec<Buffer>,
+    norm: Vec<Buffer>,
+    /// What a norm keeps when no gradient is taken.
+    not_kept: Buffer,
 }
 
 thread_local! {
@@ -87,18 +94,19 @@ impl Workspace {
     pub fn with_activations<R>(
         &mut self,
         rows: usize,
-        widths: &[usize],
+        layers: &Layers,
         work: impl FnOnce(&mut Activations<'_>, &mut Self) -> R,
     ) -> R {
-        let (mut x, mut slope) = (std::mem::take(&mut self.x), std::mem::take(&mut self.slope));
-        x.resize_with(widths.len().max(x.len()), Buffer::default);
-        slope.resize_with(widths.len().max(slope.len()), Buffer::default);
-        let result = {
-            let x = x.iter_mut().zip(widths).map(|(buffer, width)| buffer.sized(rows * width)).collect();
-            let slope = slope.iter_mut().zip(widths).map(|(buffer, width)| buffer.sized(rows * width)).collect();
-            work(&mut Activations { x, slope }, self)
-        };
-        (self.x, self.slope) = (x, slope);
+        let mut all = [&mut self.x, &mut self.slope, &mut self.norm].map(std::mem::take);
+        let widths = layers.hidden();
+        all.iter_mut().for_each(|buffers| buffers.resize_with(widths.len().max(buffers.len()), Buffer::default));
+        let [x, slope, norm] = &mut all;
+        let normed = if layers.norm { widths } else { &[] };
+        let x = x.iter_mut().zip(widths).map(|(buffer, width)| buffer.sized(rows * width)).collect();
+        let slope = slope.iter_mut().zip(widths).map(|(buffer, width)| buffer.sized(rows * width)).collect();
+        let norm = norm.iter_mut().zip(normed).map(|(buffer, width)| buffer.sized(kept(rows, *width))).collect();
+        let result = work(&mut Activations { x, slope, norm }, self);
+        [self.x, self.slope, self.norm] = all;
         result
     }
 }
@@ -110,6 +118,11 @@ impl<'a> Network<'a> {
 
     pub fn bias(&self, layer: usize) -> &'a [f32] {
         self.layers.bias(self.weights, layer, self.member)
+    }
+
+    /// Scale and shift of a layer's norm, if it has one.
+    fn norm(&self, layer: usize) -> Option<[&'a [f32]; 2]> {
+        self.layers.norm(self.weights, layer, self.member)
     }
 
     /// The last layer's number.
@@ -178,11 +191,17 @@ impl<'a> Network<'a> {
             let count = out.len() / outputs;
             let actions = &input.actions[i * rows * action_dim..][..count * action_dim];
             let Input { repeat, shift, kernel, .. } = input;
-            first_layer(
-                self.layers.activation,
-                &FirstLayer { base, repeat, shift, actions, kernel },
-                x.sized(count * width),
-            );
+            let first = FirstLayer { base, repeat, shift, actions, kernel };
+            let out_of_first = x.sized(count * width);
+            match self.norm(0) {
+                None => first_layer(Some(self.layers.activation), &first, out_of_first),
+                Some([scale, shift]) => {
+                    first_layer(None, &first, out_of_first);
+                    let room = work.not_kept.sized(kept(count, width));
+                    normalise(out_of_first, None, scale, self.layers.epsilon(), room);
+                    activate(self.layers.activation, out_of_first, shift);
+                }
+            }
             for layer in 1..last {
                 let (inputs, width) = self.layers.shape(layer);
                 let (x, y) = if layer % 2 == 1 { (&mut *x, &mut *y) } else { (&mut *y, &mut *x) };
@@ -191,7 +210,8 @@ impl<'a> Network<'a> {
                     Some(kernels) => kernels[layer - 1].product(x, y),
                     None => product(x, self.kernel(layer), y, inputs, width),
                 }
-                activate(self.layers.activation, y, self.bias(layer));
+                let bias = self.normalise(layer, y, || work.not_kept.sized(kept(count, width)));
+                activate(self.layers.activation, y, bias);
             }
             let width = self.layers.shape(last).0;
             let x = if last % 2 == 1 { &mut *x } else { &mut *y };
@@ -207,16 +227,32 @@ impl<'a> Network<'a> {
             let (before, here) = left.x.split_at_mut(layer);
             let x = before.last().map_or(input, |x| &**x);
             product(x, self.kernel(layer), here[0], inputs, width);
-            activate_with_slope(self.layers.activation, here[0], self.bias(layer), left.slope[layer]);
+            let bias = self.normalise(layer, here[0], || left.norm[layer]);
+            activate_with_slope(self.layers.activation, here[0], bias, left.slope[layer]);
         }
         dots(left.x[last - 1], self.output_rows(&mut work.output), self.bias(last), out, self.layers.shape(last).0);
     }
 
-    /// Turns the slopes of a tile into the gradients δ before each activation, given that of the output.
-    pub fn backward(&self, output_gradient: &[f32], slope: &mut [&mut [f32]], work: &mut Workspace) {
+    /// Adds the bias of a layer that has a norm, and normalises. Gives what is to be added before the activation.
+    fn normalise<'b>(&self, layer: usize, x: &mut [f32], keep: impl FnOnce() -> &'b mut [f32]) -> &'a [f32] {
+        let bias = self.bias(layer);
+        let Some([scale, shift]) = self.norm(layer) else { return bias };
+        normalise(x, Some(bias), scale, self.layers.epsilon(), keep());
+        shift
+    }
+
+    /// Turns the slopes of a tile into the gradients δ before each activation and norm, given that of the output.
+    pub fn backward(&self, output_gradient: &[f32], left: &mut Activations<'_>, work: &mut Workspace) {
         let last = self.last();
+        let Activations { slope, norm, .. } = left;
+        let mut through_norm = |layer: usize, delta: &mut [f32]| {
+            if let Some([scale, _]) = self.norm(layer) {
+                normalise_backward(delta, scale, norm[layer]);
+            }
+        };
         let output = self.output_rows(&mut work.output);
         scale_by_combination(slope[last - 1], output_gradient, output, self.layers.shape(last).0);
+        through_norm(last - 1, slope[last - 1]);
         for layer in (1..last).rev() {
             let (inputs, width) = self.layers.shape(layer);
             let (below, above) = slope.split_at_mut(layer);
@@ -224,6 +260,7 @@ impl<'a> Network<'a> {
             let temporary = work.pair[0].sized(below.len());
             product_transposed(above, self.kernel(layer), temporary, inputs, width);
             multiply(below, temporary);
+            through_norm(layer - 1, below);
         }
     }
 

@@ -1,5 +1,5 @@
-//! The networks in plain candle operations, which candle differentiates: those with a norm, and what the others are tested
-//! against.
+//! The networks in plain candle operations, which candle differentiates: on a GPU those with a norm, and what the others are
+//! tested against.
 
 use crate::layers::Layers;
 use crate::weights::Tensors;

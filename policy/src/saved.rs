@@ -4,6 +4,7 @@ use crate::layers::{LayerMut, Layers, TILE};
 use crate::network::Activations;
 use quad_kernels::Buffer;
 use quad_kernels::activation::column_sums;
+use quad_kernels::norm::kept;
 use quad_kernels::product::outer;
 use rayon::prelude::*;
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
@@ -14,6 +15,8 @@ use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 pub(crate) struct SavedActivations {
     x: Vec<Buffer>,
     slope: Vec<Buffer>,
+    /// What norms keep, tile after tile as if each were full; none without a norm.
+    norm: Vec<Buffer>,
     widths: Vec<usize>,
     members: usize,
     rows: usize,
@@ -35,6 +38,7 @@ impl SavedActivations {
         (self.widths, self.members, self.rows) = (layers.hidden().to_vec(), layers.members, rows);
         self.x.resize_with(self.widths.len(), Buffer::default);
         self.slope.resize_with(self.widths.len(), Buffer::default);
+        self.norm.resize_with(if layers.norm { self.widths.len() } else { 0 }, Buffer::default);
     }
 
     /// Cuts everything into tiles, beside `out`, which is `members × rows × outputs`.
@@ -46,7 +50,7 @@ impl SavedActivations {
         };
         let each_member = rows.div_ceil(TILE);
         let tile = |(i, out)| {
-            let activations = Activations { x: Vec::new(), slope: Vec::new() };
+            let activations = Activations { x: Vec::new(), slope: Vec::new(), norm: Vec::new() };
             Tile { member: i / each_member, index: i % each_member, activations, out }
         };
         let mut tiles: Vec<_> = cut(out).enumerate().map(tile).collect();
@@ -55,6 +59,13 @@ impl SavedActivations {
             for ((tile, x), slope) in tiles.iter_mut().zip(cut(x.sized(len))).zip(cut(slope.sized(len))) {
                 tile.activations.x.push(x);
                 tile.activations.slope.push(slope);
+            }
+        }
+        for (layer, (norm, width)) in self.norm.iter_mut().zip(&self.widths).enumerate() {
+            let full = kept(TILE, *width);
+            for (tile, norm) in tiles.iter_mut().zip(norm.sized(members * each_member * full).chunks_exact_mut(full)) {
+                let rows = tile.activations.x[layer].len() / width;
+                tile.activations.norm.push(&mut norm[..kept(rows, *width)]);
             }
         }
         tiles
@@ -73,7 +84,7 @@ impl SavedActivations {
     /// After the backward pass: the gradients of these layers. `input` is `rows × inputs`, `output_gradient`
     /// `members × rows × outputs`.
     pub fn weight_gradients(&self, layers: Vec<LayerMut<'_>>, input: &[f32], output_gradient: &[f32]) {
-        layers.into_par_iter().for_each(|LayerMut { layer, member, kernel, bias }| {
+        layers.into_par_iter().for_each(|LayerMut { layer, member, kernel, bias, norm }| {
             let x = match layer {
                 0 => input,
                 _ => self.of_member(&self.x[layer - 1], layer - 1, member),
@@ -85,7 +96,20 @@ impl SavedActivations {
             };
             outer(x, gradient, kernel, x.len() / self.rows, columns);
             column_sums(gradient, bias);
+            for (i, out) in norm.into_iter().flatten().enumerate() {
+                self.add_up_norms(layer, member, i, out);
+            }
         });
+    }
+
+    /// The gradient of a norm's scales (0) or shifts (1), of which each tile has a part.
+    fn add_up_norms(&self, layer: usize, member: usize, which: usize, out: &mut [f32]) {
+        let (tiles, full, width) = (self.rows.div_ceil(TILE), kept(TILE, out.len()), out.len());
+        let kept = self.norm[layer].first(self.members * tiles * full);
+        out.fill(0.0);
+        for tile in kept[member * tiles * full..][..tiles * full].chunks_exact(full) {
+            out.iter_mut().zip(&tile[which * width..]).for_each(|(sum, x)| *sum += x);
+        }
     }
 }
 
