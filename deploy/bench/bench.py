@@ -1,9 +1,9 @@
 """Runs the benchmarks of learner, evaluator and kernels and of their peers in turns, and prints what
 docs/performance.md shows. To be started by deploy/bench.sh.
 
-    bench.py ROUNDS
+    bench.py ROUNDS [algorithms]
 
-A round visits each configuration for some seconds, in which JAX, the learner and the machine's peaks are measured one
+With `algorithms` only their gradient steps beside JAX's. A round visits each configuration for some seconds, in which JAX, the learner and the machine's peaks are measured one
 after the other: machines may be shared, and change their speed. Figures are medians over the rounds; a ratio is the
 median of the rounds' ratios.
 """
@@ -23,15 +23,13 @@ CONFIGURATIONS = {
     "paper, 1 sample": {"hidden": 256, "critics": 10, "samples": 1, "predictions": 1},
     "demo": {"hidden": 128, "critics": 5, "samples": 1, "predictions": 0},
 }
-# Timed alone: no arithmetic is counted here, and there is no peer.
-ALONE = ["demo, IQL"]
 EPISODES = CANDIDATES = 10
 ROLLOUT_STEPS = 4
 PEAK_CALLS, PEAK_ROWS, PEAK_WIDTH = 1000, 128, 256
 # In kernels/benches/kernels.rs: which to run, ours, and what a library does in its place.
 KERNELS, OURS = "/20 in turn$|/mish", ("ours", "mish")
 LIBRARIES = {"gemm": "gemm", "gemm in f32": "gemm, f32", "mish by std's exp": "std's exp"}
-PYTHON = ".deps/venv/bin/python"
+PYTHON, JAX_STEP = ".deps/venv/bin/python", "algorithms/benches/jax_step.py"
 # Asked for fewer instructions than the CPU has, JAX's compiler keeps to them, too. Its library of products takes what it finds.
 ONLY_AVX2 = os.environ.get("QUAD_INSTRUCTIONS") == "avx2"
 PEER_ENVIRONMENT = {"XLA_FLAGS": "--xla_cpu_max_isa=AVX2"} if ONLY_AVX2 else {}
@@ -137,18 +135,27 @@ def moment(jax, *benches):
     return {"jax": jax, "seconds": seconds, "peak": peak, "threads": threads}
 
 
+def measure_algorithms(count):
+    """{algorithm, or its phase: its rounds}"""
+    peer = Peer(JAX_STEP, "--tuned")
+    names = subprocess.run([PYTHON, "-W", "ignore", JAX_STEP, "--names"], check=True, capture_output=True, text=True).stdout
+    rounds = {name: [] for name in names.splitlines() if name not in CONFIGURATIONS}
+    for _ in range(count):
+        for name, moments in rounds.items():
+            moments.append({"jax": min(peer.measure(name).values()), "ours": criterion("update", f"^update/{name}$")})
+    return rounds
+
+
 def measure(count):
     """{configuration: its rounds}, those of the evaluation as `rollout` and of the kernels as `kernels`."""
-    plain, tuned = Peer("algorithms/benches/jax_step.py"), Peer("algorithms/benches/jax_step.py", "--tuned")
+    plain, tuned = Peer(JAX_STEP), Peer(JAX_STEP, "--tuned")
     rollout = Peer("evaluator/benches/jax_rollout.py")
-    rounds = {name: [] for name in [*CONFIGURATIONS, *ALONE, "rollout", "kernels"]}
+    rounds = {name: [] for name in [*CONFIGURATIONS, "rollout", "kernels"]}
     for i in range(count):
         print(f"bench: round {i + 1} of {count}", file=sys.stderr)
         for name in CONFIGURATIONS:
             jax = {"plain": plain.measure(name), "tuned": tuned.measure(name)}
             rounds[name].append(moment(jax, ("update", f"^(peak/|update(, bf16)?/{name}$|{name}/)")))
-        for name in ALONE:
-            rounds[name].append(moment({}, ("update", f"^(peak/|update(, bf16)?/{name}$)")))
         rounds["rollout"].append(moment(rollout.measure(), ("update", "^peak/"), ("rollout", "")))
         rounds["kernels"].append(kernels())
     return rounds
@@ -199,9 +206,15 @@ def updates(all_rounds):
             [name, ms(lambda x: work.bound(x["peak"])), ms(ours), f"{100 * share:.0f} %", ms(plain), ratio(plain, ours)]
             + [ms(tuned), ratio(tuned, ours), *rounding]
         )
-    for name in ALONE:
-        rounds = all_rounds[name]
-        rows.append([name, "", ms(ours), "", "", "", "", "", ms(bf16) if has_bf16(rounds) else "", ""])
+    table(*rows)
+
+
+def algorithms(all_rounds):
+    rows = [["gradient step", "f32", "JAX, tuned", "ratio"]]
+    for name, rounds in all_rounds.items():
+        ours, jax = (lambda x: x["ours"][f"update/{name}"]), (lambda x: x["jax"])
+        times = [f"{1e3 * median(rounds, of):.2f} ms" for of in (ours, jax)]
+        rows.append([name, *times, f"{median(rounds, lambda x: jax(x) / ours(x)):.2f} ×"])
     table(*rows)
 
 
@@ -262,7 +275,11 @@ def kernel_rates(rounds):
 
 
 def main():
-    rounds = measure(count := int(sys.argv[1]))
+    count, only_algorithms = int(sys.argv[1]), sys.argv[2:] == ["algorithms"]
+    algorithms(measure_algorithms(count))
+    if only_algorithms:
+        return
+    rounds = measure(count)
     Path("target/bench.json").write_text(json.dumps(rounds, indent=1))
     machine([moment for name, moments in rounds.items() for moment in moments if name != "kernels"], count)
     updates(rounds)

@@ -18,13 +18,14 @@ from pathlib import Path
 for folder in "tests/golden", "algorithms/benches":
     sys.path.insert(0, str(Path(__file__).parents[2] / folder))
 
+import diffusion
 import gymnasium
 import jax
 import jax.numpy as jnp
 import networks
 import numpy as np
 import quad
-from jax_step import sample, single  # also has JAX compute in float32 and optimise
+from jax_step import single, traced  # also has JAX compute in float32 and optimise
 
 
 def main():
@@ -41,7 +42,8 @@ def main():
 
     @jax.jit
     def act(actor, critics, observation, key):
-        actions, states = sample(actor, observation[None], jax.random.normal(key, (steps, 1, candidates, a)))
+        noise = jax.random.normal(key, (steps, 1, candidates, a))
+        actions, states = traced(diffusion.sample)(actor, observation[None], noise, "mish")
         return actions[0, networks.values(critics, states, actions, "mish").mean(0)[0].argmax()]
 
     environment, key = gymnasium.make("Hopper-v4"), jax.random.key(0)
