@@ -75,14 +75,16 @@ fn tensor(shape: &[usize]) -> Tensor {
     Tensor::from_vec(numbers, shape, &Device::Cpu).expect("a tensor")
 }
 
+/// One episode.
 fn transitions(count: usize) -> Transitions {
+    let observations = numbers((count + 1) * DIMS.0);
     let arrays = Arrays {
         observation_dim: DIMS.0,
         action_dim: DIMS.1,
-        observations: numbers(count * DIMS.0),
+        observations: observations[..count * DIMS.0].to_vec(),
         actions: numbers(count * DIMS.1),
         rewards: numbers(count),
-        next_observations: numbers(count * DIMS.0),
+        next_observations: observations[DIMS.0..].to_vec(),
         terminals: vec![false; count],
         timeouts: (1..=count).map(|row| row == count).collect(),
     };

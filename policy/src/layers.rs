@@ -111,7 +111,8 @@ impl Layers {
     /// Scale and shift of a layer's norm, if it has one.
     pub fn norm<'a>(&self, weights: &'a [f32], layer: usize, member: usize) -> Option<[&'a [f32]; 2]> {
         let (inputs, outputs) = self.shape(layer);
-        let of = |kind| &weights[self.offsets[layer] + (self.members * (inputs + kind) + member) * outputs..][..outputs];
+        let of =
+            |kind| &weights[self.offsets[layer] + (self.members * (inputs + kind) + member) * outputs..][..outputs];
         self.is_normed(layer).then(|| [of(1), of(2)])
     }
 
