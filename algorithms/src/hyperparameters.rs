@@ -31,6 +31,10 @@ macro_rules! checked {
 }
 
 checked!(
+    /// Neither infinite nor NaN.
+    Finite(f32), |x| x.is_finite(), "finite"
+);
+checked!(
     /// Above 0 and finite.
     Positive(f32), |x| x > 0.0 && x.is_finite(), "above 0"
 );

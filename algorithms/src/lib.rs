@@ -9,6 +9,7 @@ mod agent;
 mod algorithm;
 mod align_iql;
 mod context;
+mod cql;
 mod definition;
 mod denoising;
 mod diffusion;
@@ -23,7 +24,6 @@ mod parts;
 mod pool;
 mod quad;
 mod random;
-#[allow(dead_code)] // until an algorithm uses all of it
 mod squashed;
 mod trained;
 mod values;
@@ -37,10 +37,11 @@ pub use parts::Parts;
 pub use values::{Values, fits, merge};
 
 /// All algorithms, the one that learns unless another is asked for first.
-pub const ALGORITHMS: [Definition; 7] = [
+pub const ALGORITHMS: [Definition; 8] = [
     quad::DEFINITION,
     iql::DEFINITION,
     align_iql::DEFINITION,
+    cql::DEFINITION,
     dql::DEFINITION,
     ivr::DEFINITION,
     onestep::DEFINITION,

@@ -1,7 +1,9 @@
 //! A network with its optimiser, and how both begin.
 
 use candle_core::{Result, Tensor};
-use quad_policy::{Adam, AdamStep, Ensemble, EnsembleShape, Gradients, Layout, Part, Start, Weighted, Weights};
+use quad_policy::{
+    Adam, AdamStep, Ensemble, EnsembleShape, Gradients, Layout, MlpConfig, Part, Start, Weighted, Weights,
+};
 
 use super::context::Context;
 use super::random::{Purpose, stream};
@@ -47,4 +49,15 @@ pub(super) fn learned(name: &str, begin: &[f32], context: &Context) -> Result<Tr
     let part = Part { name: name.to_owned(), shape: vec![begin.len()], start: Start::Constant(0.0) };
     let values = Tensor::from_slice(begin, begin.len(), &context.device)?;
     Trained::new(Weights::trainable(Layout::new(vec![part]), &values)?, 0.0)
+}
+
+/// Multiplies the last layer of networks with these hidden layers by a factor.
+pub(super) fn scale_last_layer(weights: &mut Weights, layers: &MlpConfig, factor: f64) -> Result<()> {
+    let last = format!("{}.", layers.hidden.len());
+    let of_last = weights.tensors("")?.into_iter().filter(|(name, _)| name.starts_with(&last));
+    let count = of_last.map(|(_, tensor)| tensor.elem_count()).sum();
+    weights.change(|values| {
+        let start = values.elem_count() - count; // it lies at the end
+        values.slice_set(&(values.narrow(0, start, count)? * factor)?, 0, start)
+    })
 }

@@ -18,6 +18,9 @@ pub enum RewardRule {
     /// `4(r - 0.5)`: Diffusion-QL's rule for AntMaze. Rewards of 0 and 1 become -2 and 2.
     #[serde(rename = "centre-times-4")]
     CentreTimes4,
+    /// `10(r - 0.5)`: CQL's rule for AntMaze. Rewards of 0 and 1 become -5 and 5.
+    #[serde(rename = "centre-times-10")]
+    CentreTimes10,
 }
 
 /// Training rewards as a function of recorded ones: `(r - subtract) · times`.
@@ -48,6 +51,7 @@ impl RewardRule {
             Self::AsIs => (0.0, 1.0),
             Self::Subtract1 => (1.0, 1.0),
             Self::CentreTimes4 => (0.5, 4.0),
+            Self::CentreTimes10 => (0.5, 10.0),
         };
         Some(RewardScaling { subtract, times })
     }
@@ -60,9 +64,13 @@ mod tests {
     #[test]
     fn each_name_says_what_its_rule_does_to_rewards_of_0_and_1() {
         // The returns are from -1 to 3.
-        for (name, of_0, of_1) in
-            [("locomotion", 0.0, 250.0), ("as-is", 0.0, 1.0), ("subtract-1", -1.0, 0.0), ("centre-times-4", -2.0, 2.0)]
-        {
+        for (name, of_0, of_1) in [
+            ("locomotion", 0.0, 250.0),
+            ("as-is", 0.0, 1.0),
+            ("subtract-1", -1.0, 0.0),
+            ("centre-times-4", -2.0, 2.0),
+            ("centre-times-10", -5.0, 5.0),
+        ] {
             let rule: RewardRule = serde_json::from_value(name.into()).unwrap();
             let scaling = rule.scaling(&[3.0, -1.0, 0.5]).unwrap();
             assert_eq!((scaling.apply(0.0), scaling.apply(1.0)), (of_0, of_1), "{name}");

@@ -16,6 +16,7 @@ import numpy as np
 from safetensors.numpy import load_file, save_file
 
 import align_iql
+import cql
 import dql
 import iql
 import ivr
@@ -47,8 +48,11 @@ FOLDERS = {
     "onestep-behavior": (21, "onestep-behavior", "small"),
     "onestep-critic": (22, "onestep-critic", "small"),
     "onestep-policy": (23, "onestep-policy", "small"),
+    "cql": (27, "cql", "small"),
+    "cql-lagrange": (28, "cql-lagrange", "small"),
+    "cql-cloning": (29, "cql-cloning", "small"),
 }
-ALGORITHMS = {variant: algorithm for algorithm in (quad, iql, ivr, xql, dql, align_iql, onestep) for variant in algorithm.VARIANTS}
+ALGORITHMS = {variant: algorithm for algorithm in (quad, iql, ivr, xql, dql, align_iql, onestep, cql) for variant in algorithm.VARIANTS}
 
 
 def flatten(tree):

@@ -1,0 +1,290 @@
+//! CQL (Kumar, Zhou, Tucker and Levine 2020, "Conservative Q-Learning for Offline Reinforcement Learning"): soft actor-critic
+//! whose critics are also pushed down at actions that the policy takes and up at those of the data, so that they do not promise
+//! more than the policy is worth. Equations are that paper's; docs/deviations.md says which of several codes is followed.
+
+#[cfg(test)]
+#[allow(clippy::unwrap_used)]
+#[path = "golden/cql.rs"]
+mod golden;
+
+use super::algorithm::{Algorithm, AlgorithmError, Measured, largest, measured, smaller};
+use super::context::{Context, Minibatch};
+use super::definition::{Definition, Metric, Reporting, metrics, read, readable};
+use super::denoising::normal;
+use super::hyperparameters::{Count, Finite, Positive, Rate, Share, Steps};
+use super::parts::Parts;
+use super::random::{Purpose, stream};
+use super::squashed::{Normal, Squashed};
+use super::trained::{Trained, ensemble, learned, scale_last_layer};
+use candle_core::{Result, Tensor};
+use quad_policy::{AdamStep, Ensemble, EnsembleShape, MlpConfig, PolicyConfig, Tensors, Weighted, Weights};
+use rand::Rng;
+use serde::Deserialize;
+
+/// What the learner has to know of it.
+pub(super) const DEFINITION: Definition = Definition {
+    name: "cql",
+    settings: include_str!("../../presets/cql.toml"),
+    metrics: METRICS,
+    report: Reporting::PLAIN,
+    check: readable::<Config>,
+    start: |table, context| Ok(Box::new(Cql::new(read(table)?, context)?)),
+};
+
+/// Critics, of whose values the smaller counts.
+const CRITICS: usize = 2;
+/// Bounds of log σ.
+const LOG_STD: (f32, f32) = (-20.0, 2.0);
+/// How much smaller than the others the last layers begin.
+const LAST_LAYER: f64 = 0.01;
+/// log α' at the beginning, and the largest α'.
+const LOG_ALPHA_PRIME: f32 = 1.0;
+const MOST_ALPHA_PRIME: f64 = 1e6;
+/// Bounds of actions that the policy clones: at ±1 the density of a squashed Gaussian has no limit.
+const CLONED: f64 = 0.999;
+
+const METRICS: &[Metric] = &metrics! {
+    q_mean: "Mean over the batch of the critics' target y = r + γ·mask·min_k Q̂_k(s', a') with a' from the policy; of several a' the best.";
+    critic_loss ["critic loss"]: "Mean over the batch of the sum over both critics of (Q_k(s, a) − y)² (the last term of CQL's Eq. 3).";
+    gap ["gap"]: "Mean over batch and critics of log Σ exp Q_k(s, ·) − Q_k(s, a), which the critics also descend (CQL's Eq. 4); below 0 where the data's action is worth more than all others together.";
+    actor_loss ["actor loss"]: "Mean over the batch of α·log π(a|s) − min_k Q_k(s, a) with a from the policy; while the policy is cloned, −log π of the data's action is in the place of −min_k Q_k.";
+    entropy ["entropy"]: "−mean over the batch of log π(a|s) with a from the policy; α holds it at −(dimensions of an action).";
+    alpha: "α, the weight of the entropy in the actor's loss, before its step.";
+    alpha_prime: "α', which the weight of the gap is multiplied by, before its step; rises while the gap is above the threshold. 0 without a threshold.";
+};
+
+/// CQL's hyper-parameters: the `[agent]` table of a preset.
+#[derive(Deserialize)]
+#[serde(deny_unknown_fields)]
+struct Config {
+    actor: MlpConfig,
+    critic: MlpConfig,
+    /// Discount γ.
+    gamma: Share,
+    /// Weight w of the gap in the critics' loss, the paper's α.
+    weight: Positive,
+    /// Gap to which α' drives the critics; without it there is no α'.
+    threshold: Option<Finite>,
+    /// Each state's gap counts as at least this.
+    least_gap: Option<Finite>,
+    /// Uniform actions, actions of the policy and actions of the policy at s' over which the gap of a state is taken: so many of
+    /// each.
+    actions: Count,
+    /// Next actions drawn per next state for the target; of several, the best counts.
+    samples: Count,
+    log_std: LogStd,
+    /// Also α's.
+    actor_learning_rate: Positive,
+    /// Also that of α'.
+    critic_learning_rate: Positive,
+    /// EMA rate of the target critics.
+    ema_rate: Rate,
+    phases: Phases,
+}
+
+/// What c₁ and c₂ begin with in log σ = c₁·x + c₂, where x comes from the policy's network.
+#[derive(Deserialize)]
+#[serde(deny_unknown_fields)]
+struct LogStd {
+    multiplier: Finite,
+    offset: Finite,
+}
+
+/// The phases' lengths in proportion: the policy clones the data, then it follows the critics.
+#[derive(Deserialize)]
+#[serde(deny_unknown_fields)]
+struct Phases {
+    cloning: u64,
+    learning: Steps,
+}
+
+impl Phases {
+    /// Whether the policy is cloned in this step of a run of so many.
+    fn is_cloning(&self, step: u64, total_steps: u64) -> bool {
+        let [step, total, cloning, learning] = [step, total_steps, self.cloning, *self.learning].map(u128::from);
+        step * (cloning + learning) < total * cloning
+    }
+}
+
+/// The random numbers of one update.
+struct Noise {
+    /// For the action of the actor's loss, `[B, 1, a]`.
+    policy: Tensor,
+    /// For the target's next actions, `[B, S, a]`.
+    target: Tensor,
+    /// Actions from all over the range, `[B, N, a]`.
+    uniform: Tensor,
+    /// For the gap's actions of the policy at s' and at s, `[B, N, a]` each.
+    next: Tensor,
+    current: Tensor,
+}
+
+/// CQL in the middle of a run.
+struct Cql {
+    config: Config,
+    context: Context,
+    actor: Squashed,
+    /// Q_1 and Q_2, and their EMA Q̂.
+    critics: Trained<Ensemble>,
+    target_critics: Ensemble,
+    /// log α, `[1]`.
+    log_alpha: Trained<Weights>,
+    /// log α', `[1]`.
+    log_alpha_prime: Option<Trained<Weights>>,
+}
+
+impl Cql {
+    fn new(config: Config, context: Context) -> std::result::Result<Self, AlgorithmError> {
+        let shape = EnsembleShape {
+            members: CRITICS,
+            observation_dim: context.observation_dim(),
+            action_dim: context.action_dim(),
+            layers: config.critic.clone(),
+            outputs: 1,
+        };
+        let LogStd { multiplier, offset } = config.log_std;
+        let mut actor = Squashed::new(&config.actor, LOG_STD, Some([*multiplier, *offset]), &context, 0)?;
+        let mut critics = ensemble(shape, &context, 1)?;
+        scale_last_layer(actor.network.network.weights_mut(), &config.actor, LAST_LAYER)?;
+        scale_last_layer(critics.network.weights_mut(), &config.critic, LAST_LAYER)?;
+        let number = |begin| learned("value", &[begin], &context);
+        Ok(Self {
+            target_critics: critics.network.copy()?,
+            log_alpha: number(0.0)?,
+            log_alpha_prime: config.threshold.map(|_| number(LOG_ALPHA_PRIME)).transpose()?,
+            actor,
+            critics,
+            config,
+            context,
+        })
+    }
+
+    /// The random numbers of update number `step`.
+    fn noise(&self, step: u64) -> Result<Noise> {
+        let Context { seed, batch_size, ref device, .. } = self.context;
+        let (generator, a) = (&mut stream(seed, Purpose::Noise, step), self.context.action_dim());
+        let each = (batch_size, *self.config.actions, a);
+        let uniform: Vec<f32> = (0..each.0 * each.1 * a).map(|_| generator.random_range(-1.0..1.0)).collect();
+        Ok(Noise {
+            policy: normal((batch_size, 1, a), generator, device)?,
+            target: normal((batch_size, *self.config.samples, a), generator, device)?,
+            uniform: Tensor::from_vec(uniform, each, device)?,
+            next: normal(each, generator, device)?,
+            current: normal(each, generator, device)?,
+        })
+    }
+
+    /// Update number `step`, from 0. All losses are of the networks as they are before it.
+    fn step(&mut self, step: u64, batch: &Minibatch, noise: &Noise) -> Result<Measured> {
+        let adam = |rate: f32| AdamStep { rate, clip: None, count: step + 1 };
+        let (slow, fast) = (adam(*self.config.actor_learning_rate), adam(*self.config.critic_learning_rate));
+        let current = self.actor.distribution(&batch.observations)?;
+        let next = self.actor.constant_distribution(&batch.next_observations)?;
+
+        // The policy towards large Q and entropy, and α so that the entropy is −(dimensions of an action).
+        let drawn = current.draw(&noise.policy)?;
+        let log_density = drawn.log_density.squeeze(1)?;
+        let worth = match self.config.phases.is_cloning(step, self.context.total_steps) {
+            true => current.log_density(&batch.actions.clamp(-CLONED, CLONED)?)?,
+            false => smaller(&self.critics.network.detach().values(&batch.observations, &drawn.actions.squeeze(1)?)?)?,
+        };
+        let alpha = self.log_alpha.network.values().detach().exp()?;
+        let actor_loss = (log_density.broadcast_mul(&alpha)? - worth)?.mean_all()?;
+        self.actor.descend(&actor_loss, slow)?;
+        let log_density = log_density.detach().mean_all()?;
+        let excess = (&log_density - self.context.action_dim() as f64)?;
+        self.log_alpha.descend(&(self.log_alpha.network.values().sum_all()? * excess)?.neg()?, slow)?;
+
+        // The critics towards r + γ·Q̂(s', a'), and at s down the gap between all actions and the data's.
+        let targets = self.targets(batch, &next, &noise.target)?;
+        let (q, gaps) = self.gaps(batch, &current.detach(), &next, noise)?;
+        let critic_loss = (q.broadcast_sub(&targets)?.sqr()?.mean_all()? * CRITICS as f64)?;
+        let gap = gaps.mean_all()?;
+        let (weight, alpha_prime) = self.weight(&gap.detach(), fast)?;
+        let conservative = (&gap * weight)?;
+        self.critics.descend(&(&critic_loss + (conservative * CRITICS as f64)?)?, fast)?;
+        self.target_critics.follow(&self.critics.network, *self.config.ema_rate)?;
+
+        measured([
+            ("q_mean", &targets.mean_all()?),
+            ("critic_loss", &critic_loss),
+            ("gap", &gap),
+            ("actor_loss", &actor_loss),
+            ("entropy", &log_density.neg()?),
+            ("alpha", &alpha),
+            ("alpha_prime", &alpha_prime),
+        ])
+    }
+
+    /// y = r + γ·mask·max_a' min_k Q̂_k(s', a') over the actions drawn with this noise, `[B, S, a]`; `[B]`.
+    fn targets(&self, batch: &Minibatch, next: &Normal, noise: &Tensor) -> Result<Tensor> {
+        let actions = next.draw(noise)?.actions;
+        let q = self.target_critics.values(&batch.next_observations, &actions.flatten(0, 1)?)?;
+        batch.target(*self.config.gamma, &largest(&smaller(&q)?.reshape(((), *self.config.samples))?, 1)?)
+    }
+
+    /// Q_k(s, a) of the data's actions, and log Σ exp Q_k(s, ·) − Q_k(s, a): Eq. 4 with the sum over uniform actions and those
+    /// of the policy at s and s', all at s, each divided by its density (appendix F); `[K, B]` each.
+    fn gaps(&self, batch: &Minibatch, current: &Normal, next: &Normal, noise: &Noise) -> Result<(Tensor, Tensor)> {
+        let (b, n, a) = noise.uniform.dims3()?;
+        let [next, current] = [next.draw(&noise.next)?, current.draw(&noise.current)?];
+        // [B, 1 + 3N, a]: one pass through the critics for all.
+        let actions = [&batch.actions.unsqueeze(1)?, &noise.uniform, &next.actions, &current.actions];
+        let actions = Tensor::cat(&actions, 1)?.flatten(0, 1)?;
+        let q = self.critics.network.values(&batch.observations, &actions)?.reshape((CRITICS, b, 1 + 3 * n))?;
+        let of_data = q.narrow(2, 0, 1)?.squeeze(2)?;
+        let uniform = Tensor::full(-(a as f32) * 2f32.ln(), (b, n), q.device())?;
+        let densities = Tensor::cat(&[&uniform, &next.log_density, &current.log_density], 1)?;
+        let corrected = q.narrow(2, 1, 3 * n)?.broadcast_sub(&densities)?;
+        let gaps = (log_sum_exp(&corrected)? - &of_data)?;
+        let gaps = match self.config.least_gap {
+            Some(least) => gaps.maximum(f64::from(*least))?,
+            None => gaps,
+        };
+        Ok((of_data, gaps))
+    }
+
+    /// The weight of the gap in the critics' loss, with α' if there is one (appendix, dual gradient descent), and α'. Moves α' up a
+    /// gap above the threshold.
+    fn weight(&mut self, gap: &Tensor, adam: AdamStep) -> Result<(Tensor, Tensor)> {
+        let weight = f64::from(*self.config.weight);
+        let (Some(learned), Some(threshold)) = (&mut self.log_alpha_prime, self.config.threshold) else {
+            return Ok(((gap.ones_like()? * weight)?, gap.zeros_like()?));
+        };
+        let alpha_prime = learned.network.values().exp()?.clamp(0.0, MOST_ALPHA_PRIME)?.sum_all()?;
+        let excess = ((gap - f64::from(*threshold))? * weight)?;
+        learned.descend(&(&alpha_prime * excess)?.neg()?, adam)?;
+        let alpha_prime = alpha_prime.detach();
+        Ok(((&alpha_prime * weight)?, alpha_prime))
+    }
+}
+
+/// log Σ exp over the last of three dimensions, which it removes.
+fn log_sum_exp(x: &Tensor) -> Result<Tensor> {
+    let most = x.max_keepdim(2)?.detach();
+    (x.broadcast_sub(&most)?.exp()?.sum_keepdim(2)?.log()? + most)?.squeeze(2)
+}
+
+impl Algorithm for Cql {
+    fn update(&mut self, step: u64, items: &[u32]) -> Result<Measured> {
+        let (batch, noise) = (self.context.batch(items)?, self.noise(step)?);
+        self.step(step, &batch, &noise)
+    }
+
+    /// Acts by the tanh of the mean.
+    fn policy(&self) -> Result<(PolicyConfig, Tensors)> {
+        self.actor.policy(&self.context)
+    }
+
+    fn parts(&mut self) -> Parts<'_> {
+        let parts = Parts::default()
+            .trained("critic", &mut self.critics)
+            .weights("target_critic", self.target_critics.weights_mut())
+            .trained("log_alpha", &mut self.log_alpha);
+        let parts = match &mut self.log_alpha_prime {
+            Some(log_alpha_prime) => parts.trained("log_alpha_prime", log_alpha_prime),
+            None => parts,
+        };
+        self.actor.parts(parts)
+    }
+}
