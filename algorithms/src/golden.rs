@@ -13,8 +13,8 @@ use super::parts::Parts;
 use candle_core::{Device, Tensor};
 use quad_dataset::{Arrays, Transitions};
 use quad_policy::{
-    Choice, Ensemble, Header, Layout, NoisePredictor, PolicyConfig, Precision, Tensors, Weights, load_policy,
-    read_tensors,
+    Choice, Ensemble, EnsembleShape, Header, Layout, NoisePredictor, PolicyConfig, Precision, SquashedActor, Tensors,
+    Weights, load_policy, read_tensors,
 };
 pub(super) use reader::{Golden, MAKE, goldens, run};
 
@@ -157,7 +157,7 @@ pub(super) fn check_actions(golden: &Golden, algorithm: &dyn Algorithm) {
     golden.close("select.actions", &Tensor::new(actions, &Device::Cpu).unwrap());
 }
 
-/// What a published diffusion policy makes of a golden folder's states and noise.
+/// What a published policy that draws candidates makes of a golden folder's states and noise.
 pub(super) struct Drawn {
     pub choice: Choice,
     /// Candidates, `[states · N_a, a]`.
@@ -168,20 +168,29 @@ pub(super) struct Drawn {
     pub v: Option<Tensor>,
 }
 
-/// Checks that the networks of a published diffusion policy draw and value candidates as a golden folder expects.
+/// Checks that the networks of a published policy draw and value candidates as a golden folder expects.
 pub(super) fn check_candidates(golden: &Golden, algorithm: &dyn Algorithm) -> Drawn {
     let (policy, tensors) = algorithm.policy().unwrap();
     let file = Header { policy: policy.clone(), scaling: None, origin: () }.to_safetensors(&tensors).unwrap();
     load_policy(&file, Precision::F32).unwrap();
-    let PolicyConfig::Diffusion { shape, choice } = policy else { panic!("{policy:?}") };
     let mut tensors = read_tensors(&file).unwrap();
     let mut weights = |layout: Layout, prefix: &str| Weights::take(layout, &mut tensors, prefix).unwrap();
-    let actor = NoisePredictor::new(shape.actor(), weights(shape.actor().layout(), "actor."), Precision::F32);
-    let critics = Ensemble::new(shape.critics(), weights(shape.critics().layout(), "critic."), Precision::F32);
-    let value = shape.value().map(|of| Ensemble::new(of.clone(), weights(of.layout(), "value."), Precision::F32));
-
+    let ensemble = |of: EnsembleShape, weights: Weights| Ensemble::new(of, weights, Precision::F32);
     let observations = golden.input("select_observations", &Device::Cpu);
-    let candidates = actor.sample(&observations, &chain_noise(golden, "select_noise", &Device::Cpu)).unwrap();
+    let noise = chain_noise(golden, "select_noise", &Device::Cpu);
+    let (choice, candidates, critics, value) = match policy {
+        PolicyConfig::Diffusion { shape, choice } => {
+            let actor = NoisePredictor::new(shape.actor(), weights(shape.actor().layout(), "actor."), Precision::F32);
+            let value = shape.value().map(|of| ensemble(of.clone(), weights(of.layout(), "value.")));
+            (choice, actor.sample(&observations, &noise), shape.critics(), value)
+        }
+        PolicyConfig::Squashed { shape, choice } => {
+            let actor = SquashedActor::new(ensemble(shape.actor(), weights(shape.actor().layout(), "actor.")));
+            (choice, actor.sample(&observations, &noise.squeeze(0).unwrap()), shape.critics(), None)
+        }
+        PolicyConfig::Gaussian { .. } => panic!("{policy:?} draws nothing"),
+    };
+    let (candidates, critics) = (candidates.unwrap(), ensemble(critics.clone(), weights(critics.layout(), "critic.")));
     let q = smaller(&critics.values(&observations, &candidates).unwrap()).unwrap();
     golden.close("select.candidates", &candidates);
     golden.close("select.q", &q);

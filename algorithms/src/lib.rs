@@ -14,6 +14,7 @@ mod definition;
 mod denoising;
 mod diffusion;
 mod dql;
+mod dtql;
 mod gaussian;
 mod hyperparameters;
 mod in_sample;
@@ -21,6 +22,7 @@ mod iql;
 mod ivr;
 mod onestep;
 mod parts;
+mod phases;
 mod pool;
 mod quad;
 mod random;
@@ -37,12 +39,13 @@ pub use parts::Parts;
 pub use values::{Values, fits, merge};
 
 /// All algorithms, the one that learns unless another is asked for first.
-pub const ALGORITHMS: [Definition; 8] = [
+pub const ALGORITHMS: [Definition; 9] = [
     quad::DEFINITION,
     iql::DEFINITION,
     align_iql::DEFINITION,
     cql::DEFINITION,
     dql::DEFINITION,
+    dtql::DEFINITION,
     ivr::DEFINITION,
     onestep::DEFINITION,
     xql::DEFINITION,

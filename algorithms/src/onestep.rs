@@ -13,6 +13,7 @@ use super::definition::{Definition, Metric, Reporting, metrics, read, readable};
 use super::gaussian::{first_half, log_density};
 use super::hyperparameters::{Count, Positive, Rate, Share, Steps};
 use super::parts::Parts;
+use super::phases;
 use super::random::{Purpose, stream};
 use super::trained::{Trained, ensemble};
 use candle_core::{DType, Result, Tensor};
@@ -67,21 +68,12 @@ struct Config {
 }
 
 /// The phases' lengths in proportion.
-#[derive(Deserialize)]
+#[derive(Clone, Copy, Deserialize)]
 #[serde(deny_unknown_fields)]
 struct Phases {
     behavior: Steps,
     critic: Steps,
     policy: Steps,
-}
-
-impl Phases {
-    /// The steps at which Q's phase and π's begin, in a run of so many.
-    fn begin(&self, total_steps: u64) -> [u64; 2] {
-        let [behavior, critic, policy] = [self.behavior, self.critic, self.policy].map(|share| u128::from(*share));
-        let before = |share| u128::from(total_steps) * share / (behavior + critic + policy);
-        [behavior, behavior + critic].map(|share| before(share) as u64)
-    }
 }
 
 /// What an update does, and how many of its kind came before it.
@@ -127,8 +119,14 @@ impl Onestep {
         Ok(Self { target_critic: critic.network.copy()?, behavior, critic, actor, items, config, context })
     }
 
+    /// The steps at which the phases begin.
+    fn begins(&self) -> [u64; 3] {
+        let Phases { behavior, critic, policy } = self.config.phases;
+        phases::begin(self.context.total_steps, [behavior, critic, policy])
+    }
+
     fn phase(&self, step: u64) -> Phase {
-        let [critic, policy] = self.config.phases.begin(self.context.total_steps);
+        let [_, critic, policy] = self.begins();
         match step {
             step if step < critic => Phase::Behavior(step),
             step if step < policy => Phase::Critic(step - critic),
@@ -230,8 +228,7 @@ impl Algorithm for Onestep {
     }
 
     fn phases(&self) -> Vec<u64> {
-        let [critic, policy] = self.config.phases.begin(self.context.total_steps);
-        vec![0, critic, policy]
+        self.begins().to_vec()
     }
 
     fn update(&mut self, step: u64, items: &[u32]) -> Result<Measured> {

@@ -18,6 +18,7 @@ from safetensors.numpy import load_file, save_file
 import align_iql
 import cql
 import dql
+import dtql
 import iql
 import ivr
 import onestep
@@ -51,8 +52,12 @@ FOLDERS = {
     "cql": (27, "cql", "small"),
     "cql-lagrange": (28, "cql-lagrange", "small"),
     "cql-cloning": (29, "cql-cloning", "small"),
+    "dtql-pretraining": (27, "dtql-pretraining", "small"),
+    "dtql": (28, "dtql", "small"),
+    "dtql-likelihood": (29, "dtql-likelihood", "small"),
 }
-ALGORITHMS = {variant: algorithm for algorithm in (quad, iql, ivr, xql, dql, align_iql, onestep, cql) for variant in algorithm.VARIANTS}
+MODULES = quad, iql, ivr, xql, dql, align_iql, onestep, cql, dtql
+ALGORITHMS = {variant: algorithm for algorithm in MODULES for variant in algorithm.VARIANTS}
 
 
 def flatten(tree):

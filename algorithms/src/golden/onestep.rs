@@ -95,14 +95,6 @@ fn a_dataset_of_single_transitions_is_refused_with_a_hint() {
 }
 
 #[test]
-fn a_run_of_any_length_is_divided_as_its_phases_are() {
-    let of_the_paper = Phases { behavior: Steps(500_000), critic: Steps(2_000_000), policy: Steps(100_000) };
-    for (total_steps, expected) in [(2_600_000, [500_000, 2_500_000]), (600, [115, 576]), (1, [0, 0])] {
-        assert_eq!(of_the_paper.begin(total_steps), expected);
-    }
-}
-
-#[test]
 fn each_phase_trains_its_network_alone() {
     let golden = goldens("onestep").remove(0);
     let mut onestep = short(&golden);

@@ -34,6 +34,7 @@ fn a_start_that_is_refused_leaves_no_folder() {
     let too_large = ["--agent", "critics=1", "--agent", "actor.hidden=[4096,4096]"];
     for (changes, said) in [
         (&["--algorithm", "onestep", "--agent", "phases.policy=0"][..], "0 is not at least 1"),
+        (&["--algorithm", "dtql", "--agent", "expectile=1"], "1 is not between 0 and 1"),
         (&["--agent", "diffusion_steps=1001"], "1001 is not a whole number from 1 to 1000"),
         (&too_large, "evaluators can be sent at most"),
     ] {

@@ -1,0 +1,291 @@
+//! Diffusion Trusted Q-Learning (Chen, Wang and Zhou 2024, "Diffusion Policies creating a Trust Region for Offline
+//! Reinforcement Learning"): a diffusion policy μ_φ only clones the data. How badly it denoises the actions of a second policy
+//! π_θ, of one step, says how far these are from the data's: inside that trust region π_θ moves towards large Q, and no chain
+//! of denoising steps is ever sampled. Where the authors' code says more than their paper, docs/deviations.md has it.
+
+#[cfg(test)]
+#[allow(clippy::unwrap_used)]
+#[path = "golden/dtql.rs"]
+mod golden;
+
+use super::algorithm::{Algorithm, Measured, measured, smaller};
+use super::context::{Context, Minibatch};
+use super::definition::{Definition, Metric, Reporting, metrics, read, readable};
+use super::denoising::normal;
+use super::gaussian::log_density;
+use super::hyperparameters::{Candidates, NotNegative, Positive, Quantile, Rate, Share, Steps};
+use super::iql::expectile_loss;
+use super::parts::Parts;
+use super::phases;
+use super::random::{Purpose, stream};
+use super::squashed::{Normal, Squashed};
+use super::trained::{Trained, ensemble, initial};
+use candle_core::{Result, Tensor};
+use quad_policy::{
+    AdamStep, Choice, Denoiser, DenoiserShape, Ensemble, EnsembleShape, MlpConfig, NoiseLevels, PolicyConfig, Reduce,
+    Rule, SquashedPolicy, SquashedShape, Tensors, Weighted, cosine_decay,
+};
+use rand_chacha::ChaCha8Rng;
+use serde::Deserialize;
+
+/// What the learner has to know of it.
+pub(super) const DEFINITION: Definition = Definition {
+    name: "dtql",
+    settings: include_str!("../../presets/dtql.toml"),
+    metrics: METRICS,
+    report: Reporting { counts: &["candidates"], ..Reporting::PLAIN },
+    check: readable::<Config>,
+    start: |table, context| Ok(Box::new(Dtql::new(read(table)?, context)?)),
+};
+
+/// Critics, of whose values the smaller counts.
+const CRITICS: usize = 2;
+/// What the data's actions are divided by before atanh, which is infinite at ±1.
+const ROOM: f64 = 1.001;
+
+const METRICS: &[Metric] = &metrics! {
+    q_mean: "Mean over the batch of the critics' target y = r + γ·mask·V(s').";
+    v_mean ["V"]: "Mean over the batch of the value V(s) before its step.";
+    value_loss ["value loss"]: "Expectile loss of V: mean over the batch of |expectile − 1(u < 0)|·u² with u = min_k Q_k(s, a) − V(s).";
+    critic_loss ["critic loss"]: "Sum over both critics of the mean over the batch of (Q_k(s, a) − y)².";
+    bc_loss ["BC loss"]: "Mean over batch and dimensions of the diffusion policy's squared error at the data's actions, ((D(a + σn; s, σ) − a)/c_out)². A network that always outputs 0 has loss 1 or so.";
+    trust_loss ["trust loss"]: "The same error at the one-step policy's actions. 0 in pre-training.";
+    q_loss ["Q loss"]: "−mean over the batch of min_k Q_k(s, a) at the one-step policy's actions. 0 in pre-training.";
+    likelihood_loss: "−mean over the batch of log π(a|s) at the data's actions, without the tanh's Jacobian. 0 in pre-training, and where `likelihood` is 0.";
+    actor_loss: "α·(trust loss) + (Q loss) + `likelihood`·(likelihood loss). 0 in pre-training.";
+    learning_rate: "The learning rate of both policies.";
+};
+
+/// DTQL's hyper-parameters: the `[agent]` table of a preset.
+#[derive(Deserialize)]
+#[serde(deny_unknown_fields)]
+struct Config {
+    /// The one-step policy π_θ.
+    actor: MlpConfig,
+    /// The diffusion policy μ_φ, behind a linear map as wide as its first layer.
+    diffusion: MlpConfig,
+    critic: MlpConfig,
+    value: MlpConfig,
+    /// Discount γ.
+    gamma: Share,
+    /// The expectile τ of the value function.
+    expectile: Quantile,
+    /// Strength α of the trust region beside Q.
+    alpha: NotNegative,
+    /// Strength of −log π_θ(a|s) at the data's actions.
+    likelihood: NotNegative,
+    /// Of both policies.
+    learning_rate: Positive,
+    /// Of critics and V.
+    critic_learning_rate: Positive,
+    /// Whether all learning rates fall to 0 along a cosine, from the end of pre-training on.
+    cosine: bool,
+    /// EMA rate of the target critics.
+    ema_rate: Rate,
+    /// Actions that an evaluated policy draws in each state.
+    candidates: Candidates,
+    /// Temperature of the softmax by which one of them is drawn, in units of Q.
+    temperature: Positive,
+    phases: Phases,
+}
+
+/// The phases' lengths in proportion.
+#[derive(Clone, Copy, Deserialize)]
+#[serde(deny_unknown_fields)]
+struct Phases {
+    pretraining: Steps,
+    policy: Steps,
+}
+
+/// Noise for the actions of a batch.
+struct Noising {
+    levels: NoiseLevels,
+    /// n, `[B, a]`.
+    noise: Tensor,
+}
+
+/// The random numbers of one update.
+struct Noise {
+    /// For the data's actions.
+    cloning: Noising,
+    /// By which π_θ draws its actions, `[B, a]`.
+    policy: Tensor,
+    /// For these.
+    trust: Noising,
+}
+
+/// DTQL in the middle of a run.
+struct Dtql {
+    config: Config,
+    context: Context,
+    /// μ_φ.
+    diffusion: Trained<Denoiser>,
+    /// π_θ.
+    actor: Squashed,
+    /// V.
+    value: Trained<Ensemble>,
+    /// Q_1 and Q_2, and their EMA, by which the policy chooses when it acts.
+    critics: Trained<Ensemble>,
+    target_critics: Ensemble,
+}
+
+impl Dtql {
+    fn new(config: Config, context: Context) -> Result<Self> {
+        let (observation_dim, action_dim) = (context.observation_dim(), context.action_dim());
+        let shape = DenoiserShape { observation_dim, action_dim, layers: config.diffusion.clone() };
+        let diffusion = Denoiser::new(&shape, initial(&shape.layout(), &context, 3)?);
+        let shape = |members, action_dim, layers: &MlpConfig| EnsembleShape {
+            members,
+            observation_dim,
+            action_dim,
+            layers: layers.clone(),
+            outputs: 1,
+        };
+        let critics = ensemble(shape(CRITICS, action_dim, &config.critic), &context, 1)?;
+        Ok(Self {
+            diffusion: Trained::new(diffusion, 0.0)?,
+            actor: Squashed::new(&config.actor, SquashedShape::LOG_STD, None, &context, 0)?,
+            value: ensemble(shape(1, 0, &config.value), &context, 2)?,
+            target_critics: critics.network.copy()?,
+            critics,
+            config,
+            context,
+        })
+    }
+
+    /// The step at which π_θ begins to learn.
+    fn pretraining(&self) -> u64 {
+        let Phases { pretraining, policy } = self.config.phases;
+        phases::begin(self.context.total_steps, [pretraining, policy])[1]
+    }
+
+    /// Update number `step`: critics and diffusion policy in both phases, then the one-step policy in the second.
+    fn step(&mut self, step: u64, batch: &Minibatch, noise: &Noise) -> Result<Measured> {
+        let pretraining = self.pretraining();
+        let decay = match self.config.cosine {
+            true => cosine_decay(step.saturating_sub(pretraining), self.context.total_steps - pretraining),
+            false => 1.0,
+        };
+        let rate = *self.config.learning_rate * decay;
+        let adam = AdamStep { rate, clip: None, count: step + 1 };
+        let mut measured =
+            self.learn_values(batch, AdamStep { rate: *self.config.critic_learning_rate * decay, ..adam })?;
+        measured.extend(self.clone_data(batch, &noise.cloning, adam)?);
+        if step >= pretraining {
+            measured.extend(self.improve(batch, noise, AdamStep { count: step - pretraining + 1, ..adam })?);
+            self.target_critics.follow(&self.critics.network, *self.config.ema_rate)?;
+        }
+        measured.push(("learning_rate", rate));
+        Ok(measured)
+    }
+
+    /// V(s) towards an expectile of the smaller Q(s, a), and Q(s, a) towards r + γ·V(s'), both as they are before this step.
+    fn learn_values(&mut self, batch: &Minibatch, adam: AdamStep) -> Result<Measured> {
+        let next = self.value.network.detach().state_values(&batch.next_observations)?.squeeze(0)?;
+        let targets = batch.target(*self.config.gamma, &next)?;
+        let q = self.critics.network.values(&batch.observations, &batch.actions)?;
+        let v = self.value.network.state_values(&batch.observations)?.squeeze(0)?;
+        let value_loss = expectile_loss(&(smaller(&q.detach())? - &v)?, *self.config.expectile)?;
+        let critic_loss = (q.broadcast_sub(&targets)?.sqr()?.mean_all()? * CRITICS as f64)?;
+        self.value.descend(&value_loss, adam)?;
+        self.critics.descend(&critic_loss, adam)?;
+        measured([
+            ("q_mean", &targets.mean_all()?),
+            ("v_mean", &v.mean_all()?),
+            ("value_loss", &value_loss),
+            ("critic_loss", &critic_loss),
+        ])
+    }
+
+    /// μ_φ towards the data's actions.
+    fn clone_data(&mut self, batch: &Minibatch, noising: &Noising, adam: AdamStep) -> Result<Measured> {
+        let loss = denoising_loss(&self.diffusion.network, &batch.observations, &batch.actions, noising)?;
+        self.diffusion.descend(&loss, adam)?;
+        measured([("bc_loss", &loss)])
+    }
+
+    /// π_θ towards actions that the critics value and that μ_φ, which is fixed, denoises well.
+    fn improve(&mut self, batch: &Minibatch, noise: &Noise, adam: AdamStep) -> Result<Measured> {
+        let distribution = self.actor.distribution(&batch.observations)?;
+        let actions = distribution.draw(&noise.policy.unsqueeze(1)?)?.actions.squeeze(1)?;
+        let diffusion = self.diffusion.network.detach();
+        let trust_loss = denoising_loss(&diffusion, &batch.observations, &actions, &noise.trust)?;
+        let q = smaller(&self.critics.network.detach().values(&batch.observations, &actions)?)?;
+        let q_loss = q.mean_all()?.neg()?;
+        let mut actor_loss = ((&trust_loss * f64::from(*self.config.alpha))? + &q_loss)?;
+        let mut measurements = Vec::new();
+        if *self.config.likelihood > 0.0 {
+            let likelihood_loss = likelihood_loss(&distribution, &batch.actions)?;
+            actor_loss = (actor_loss + (&likelihood_loss * f64::from(*self.config.likelihood))?)?;
+            measurements = measured([("likelihood_loss", &likelihood_loss)])?;
+        }
+        self.actor.descend(&actor_loss, adam)?;
+        measurements.extend(measured([("trust_loss", &trust_loss), ("q_loss", &q_loss), ("actor_loss", &actor_loss)])?);
+        Ok(measurements)
+    }
+
+    /// The random numbers of update number `step`.
+    fn noise(&self, step: u64) -> Result<Noise> {
+        let mut generator = stream(self.context.seed, Purpose::Noise, step);
+        let (batch, action_dim) = (self.context.batch_size, self.context.action_dim());
+        let rows = |generator: &mut ChaCha8Rng| normal((batch, action_dim), generator, &self.context.device);
+        let levels = NoiseLevels::draw(batch, &mut generator);
+        let cloning = Noising { levels, noise: rows(&mut generator)? };
+        let policy = rows(&mut generator)?;
+        let levels = NoiseLevels::draw(batch, &mut generator);
+        Ok(Noise { cloning, policy, trust: Noising { levels, noise: rows(&mut generator)? } })
+    }
+}
+
+/// Mean of ((D_φ(a + σn; s, σ) − a)/c_out)², `[]`, of actions `[B, a]`, through which the gradient flows twice: the noisy ones
+/// and the clean ones.
+fn denoising_loss(diffusion: &Denoiser, observations: &Tensor, actions: &Tensor, noising: &Noising) -> Result<Tensor> {
+    let device = actions.device();
+    let noisy = (actions + noising.noise.broadcast_mul(&noising.levels.sigma(device)?)?)?;
+    let error = (diffusion.denoise(observations, &noisy, &noising.levels)? - actions)?;
+    error.broadcast_div(&noising.levels.output_scale(device)?)?.sqr()?.mean_all()
+}
+
+/// −E[log N(atanh(a/1.001))] of the data's actions, `[]`: not of a, whose density would also have the tanh's Jacobian, which does
+/// not depend on θ.
+fn likelihood_loss(distribution: &Normal, actions: &Tensor) -> Result<Tensor> {
+    let scaled = (actions / ROOM)?;
+    let u = (((1.0 + &scaled)?.log()? - (1.0 - &scaled)?.log()?)? * 0.5)?;
+    log_density(&u, &distribution.mean, &distribution.log_std)?.mean_all()?.neg()
+}
+
+impl Algorithm for Dtql {
+    fn phases(&self) -> Vec<u64> {
+        vec![0, self.pretraining()]
+    }
+
+    fn update(&mut self, step: u64, items: &[u32]) -> Result<Measured> {
+        let (batch, noise) = (self.context.batch(items)?, self.noise(step)?);
+        self.step(step, &batch, &noise)
+    }
+
+    /// The one-step policy as it is; one of its candidates is drawn by what the target critics say of them.
+    fn policy(&self) -> Result<(PolicyConfig, Tensors)> {
+        let Config { actor, critic, candidates, temperature, .. } = &self.config;
+        let shape = SquashedShape {
+            observation_dim: self.context.observation_dim(),
+            action_dim: self.context.action_dim(),
+            actor: actor.clone(),
+            critic: critic.clone(),
+            critics: CRITICS,
+        };
+        let rule = Rule::Softmax { temperature: **temperature };
+        let choice = Choice { candidates: **candidates, value: Reduce::Min, rule };
+        let tensors = SquashedPolicy::tensors(&self.actor.network.network, &self.target_critics)?;
+        Ok((PolicyConfig::Squashed { shape, choice }, tensors))
+    }
+
+    fn parts(&mut self) -> Parts<'_> {
+        let parts = Parts::default()
+            .trained("diffusion", &mut self.diffusion)
+            .trained("value", &mut self.value)
+            .trained("critic", &mut self.critics)
+            .weights("target_critic", self.target_critics.weights_mut());
+        self.actor.parts(parts)
+    }
+}
