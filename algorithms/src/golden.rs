@@ -188,7 +188,7 @@ pub(super) fn check_candidates(golden: &Golden, algorithm: &dyn Algorithm) -> Dr
             let actor = SquashedActor::new(ensemble(shape.actor(), weights(shape.actor().layout(), "actor.")));
             (choice, actor.sample(&observations, &noise.squeeze(0).unwrap()), shape.critics(), None)
         }
-        PolicyConfig::Gaussian { .. } => panic!("{policy:?} draws nothing"),
+        other => panic!("{other:?}"),
     };
     let (candidates, critics) = (candidates.unwrap(), ensemble(critics.clone(), weights(critics.layout(), "critic.")));
     let q = smaller(&critics.values(&observations, &candidates).unwrap()).unwrap();
