@@ -49,6 +49,9 @@ pub enum AlgorithmError {
     /// The dataset has nothing that the algorithm learns from.
     #[error("no transition of the dataset has a next action, which this algorithm learns from")]
     NoNextAction,
+    /// The dataset has no episode that the algorithm learns from.
+    #[error("no episode of the dataset has {0} transitions (agent.shortest_episode)")]
+    ShortEpisodes(usize),
     /// A tensor cannot be computed or moved.
     #[error("candle failed")]
     Candle(#[from] candle_core::Error),
@@ -61,6 +64,9 @@ impl AlgorithmError {
             Self::NoNextAction => {
                 "a transition has one if the next row of the file continues its episode: `learner datasets inspect` says how long \
                  episodes are; other algorithms learn from single transitions (--algorithm iql, say)"
+            }
+            Self::ShortEpisodes(_) => {
+                "`learner datasets inspect` says how long episodes are; --agent shortest_episode=1 keeps them all"
             }
             Self::Policy(_) | Self::Agent(_) | Self::Candle(_) => {
                 "`learner presets TASK` prints hyper-parameters that work; smaller networks and batches take less memory"

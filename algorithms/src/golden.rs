@@ -95,8 +95,11 @@ pub(super) fn context(golden: &Golden, device: &Device) -> Context {
         actions: numbers("actions"),
         rewards: numbers("rewards"),
         next_observations: numbers("next_observations"),
-        // None leads to the next: they are rows at random.
-        timeouts: vec![true; terminals.len()],
+        // Unless it is said, none leads to the next: they are rows at random.
+        timeouts: match golden.inputs.contains_key("timeouts") {
+            true => numbers("timeouts").iter().map(|timeout| *timeout == 1.0).collect(),
+            false => vec![true; terminals.len()],
+        },
         terminals,
     };
     Context {

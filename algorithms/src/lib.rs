@@ -26,6 +26,8 @@ mod phases;
 mod pool;
 mod quad;
 mod random;
+mod returns;
+mod sfbc;
 mod squashed;
 mod trained;
 mod values;
@@ -39,7 +41,7 @@ pub use parts::Parts;
 pub use values::{Values, fits, merge};
 
 /// All algorithms, the one that learns unless another is asked for first.
-pub const ALGORITHMS: [Definition; 9] = [
+pub const ALGORITHMS: [Definition; 10] = [
     quad::DEFINITION,
     iql::DEFINITION,
     align_iql::DEFINITION,
@@ -48,6 +50,7 @@ pub const ALGORITHMS: [Definition; 9] = [
     dtql::DEFINITION,
     ivr::DEFINITION,
     onestep::DEFINITION,
+    sfbc::DEFINITION,
     xql::DEFINITION,
 ];
 

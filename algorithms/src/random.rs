@@ -12,6 +12,8 @@ pub enum Purpose {
     Weights = u64::from_be_bytes(*b"weights "),
     /// The noise of an update; counted by gradient step.
     Noise = u64::from_be_bytes(*b"noise   "),
+    /// Actions of a clone in the data's states; counted by transition.
+    Actions = u64::from_be_bytes(*b"actions "),
 }
 
 /// The stream of a run's seed for a purpose.

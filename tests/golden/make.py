@@ -23,6 +23,7 @@ import iql
 import ivr
 import onestep
 import quad
+import sfbc
 import xql
 
 HERE = Path(__file__).parent
@@ -55,8 +56,11 @@ FOLDERS = {
     "dtql-pretraining": (27, "dtql-pretraining", "small"),
     "dtql": (28, "dtql", "small"),
     "dtql-likelihood": (29, "dtql-likelihood", "small"),
+    "sfbc-behavior": (40, "sfbc-behavior", "small"),
+    "sfbc-critic": (41, "sfbc-critic", "small"),
+    "sfbc-planning": (42, "sfbc-planning", "small"),
 }
-MODULES = quad, iql, ivr, xql, dql, align_iql, onestep, cql, dtql
+MODULES = quad, iql, ivr, xql, dql, align_iql, onestep, cql, dtql, sfbc
 ALGORITHMS = {variant: algorithm for algorithm in MODULES for variant in algorithm.VARIANTS}
 
 

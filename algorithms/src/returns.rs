@@ -1,0 +1,120 @@
+//! Returns of a dataset's episodes as a critic's targets: standardised, and planned anew with values of states.
+
+use super::parts::Parts;
+use candle_core::{DType, Device, Result, Tensor};
+use std::ops::Range;
+
+/// Returns are divided by at least this.
+const LEAST_DEVIATION: f64 = 0.1;
+
+/// The returns of n transitions, on the CPU.
+pub(super) struct Returns {
+    gamma: f64,
+    rewards: Vec<f32>,
+    /// Where episodes lie among the transitions.
+    pub episodes: Vec<Range<usize>>,
+    /// V(s) as far as planning has come, `[n]`.
+    values: Tensor,
+    /// Standardised returns, `[n]`.
+    pub targets: Tensor,
+    /// What they were standardised by: mean and standard deviation, `[2]`.
+    scale: Tensor,
+}
+
+impl Returns {
+    /// The returns to the episodes' ends, discounted by `gamma`.
+    pub fn new(rewards: Vec<f32>, episodes: Vec<Range<usize>>, gamma: f32) -> Result<Self> {
+        let zeros = |count: usize| Tensor::zeros(count, DType::F32, &Device::Cpu);
+        let (values, targets, scale) = (zeros(rewards.len())?, zeros(rewards.len())?, zeros(2)?);
+        let mut returns = Self { gamma: f64::from(gamma), rewards, episodes, values, targets, scale };
+        returns.standardise(&returns.planned(None))?;
+        Ok(returns)
+    }
+
+    /// Standardised values `[m]` in units of the return.
+    pub fn unscaled(&self, values: &Tensor) -> Result<Tensor> {
+        let scale: Vec<f32> = self.scale.to_vec1()?;
+        values.affine(f64::from(scale[1]), f64::from(scale[0]))
+    }
+
+    /// Keeps values of the states from number `first` on, in units of the return, `[m]`.
+    pub fn keep(&mut self, values: &Tensor, first: usize) -> Result<()> {
+        self.values.slice_set(&values.to_device(&Device::Cpu)?, 0, first)
+    }
+
+    /// The mean of the values of some states.
+    pub fn mean_value(&self, states: Range<usize>) -> Result<f32> {
+        let values: Vec<f32> = self.values.narrow(0, states.start, states.len())?.to_vec1()?;
+        Ok(values.iter().sum::<f32>() / values.len().max(1) as f32)
+    }
+
+    /// Makes new returns with the values of all states.
+    pub fn plan(&mut self) -> Result<()> {
+        let returns = self.planned(Some(&self.values.to_vec1()?));
+        self.standardise(&returns)
+    }
+
+    /// Returns backwards through each episode: R_i = r_i + γ·R_{i+1}, or the state's value if that is larger.
+    fn planned(&self, values: Option<&[f32]>) -> Vec<f64> {
+        let mut returns = vec![0.0; self.rewards.len()];
+        for episode in &self.episodes {
+            let mut after = 0.0;
+            for i in episode.clone().rev() {
+                after = f64::from(self.rewards[i]) + self.gamma * after;
+                if let Some(value) = values.map(|values| f64::from(values[i]))
+                    && (value > after || value.is_nan())
+                {
+                    after = value;
+                }
+                returns[i] = after;
+            }
+        }
+        returns
+    }
+
+    fn standardise(&mut self, returns: &[f64]) -> Result<()> {
+        let count = returns.len() as f64;
+        let mean = returns.iter().sum::<f64>() / count;
+        let deviation = (returns.iter().map(|x| (x - mean).powi(2)).sum::<f64>() / count).sqrt();
+        // Not their maximum, which would drop a NaN.
+        let deviation = if deviation < LEAST_DEVIATION { LEAST_DEVIATION } else { deviation };
+        self.targets = Tensor::from_iter(returns.iter().map(|x| ((x - mean) / deviation) as f32), &Device::Cpu)?;
+        self.scale = Tensor::new(&[mean as f32, deviation as f32], &Device::Cpu)?;
+        Ok(())
+    }
+
+    /// What planning changes.
+    pub fn parts<'a>(&'a mut self, parts: Parts<'a>) -> Parts<'a> {
+        let Self { values, targets, scale, .. } = self;
+        parts.number("values", values).number("targets", targets).number("scale", scale)
+    }
+}
+
+#[cfg(test)]
+#[allow(clippy::unwrap_used)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn returns_reach_to_the_end_of_an_episode_and_plans_improve_them() {
+        let mut returns = Returns::new(vec![1.0, 2.0, 0.0, 0.0, 4.0], vec![0..2, 2..5], 0.5).unwrap();
+        assert_eq!(returns.planned(None), [2.0, 2.0, 1.0, 2.0, 4.0]);
+        let (targets, deviation): (Vec<f32>, f32) = (returns.targets.to_vec1().unwrap(), 0.96f32.sqrt());
+        assert!((targets[4] - 1.8 / deviation).abs() < 1e-6, "{targets:?}");
+        let of_target = returns.unscaled(&returns.targets).unwrap().to_vec1::<f32>().unwrap();
+        assert!((of_target[4] - 4.0).abs() < 1e-6, "{of_target:?}");
+        // A value counts where it is larger, and so does it for what came before.
+        let values = [0.0, 6.0, 0.0, 1.0, 4.5];
+        assert_eq!(returns.planned(Some(&values)), [4.0, 6.0, 1.125, 2.25, 4.5]);
+        returns.keep(&Tensor::new(&values[3..], &Device::Cpu).unwrap(), 3).unwrap();
+        assert_eq!(returns.mean_value(2..5).unwrap(), 5.5 / 3.0);
+        assert!(returns.planned(Some(&[0.0, f32::NAN, 0.0, 0.0, 0.0]))[0].is_nan());
+    }
+
+    #[test]
+    fn returns_that_hardly_differ_are_not_blown_up() {
+        let returns = Returns::new(vec![1.0, 1.001], vec![0..1, 1..2], 0.5).unwrap();
+        let targets: Vec<f32> = returns.targets.to_vec1().unwrap();
+        assert!((targets[1] - 0.005).abs() < 1e-5, "{targets:?}");
+    }
+}
