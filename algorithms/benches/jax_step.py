@@ -185,8 +185,10 @@ def scanned(step, state, inputs):
 
     @functools.partial(jax.jit, donate_argnums=0)
     def steps(state, inputs):
-        return jax.lax.scan(lambda state, _: step(state, inputs), state, length=5)
+        return jax.lax.scan(step, state, inputs)
 
+    # Each step has inputs of its own: what depends on the same ones would be computed once.
+    inputs = jax.tree.map(lambda x: jnp.stack([x] * 5), inputs)
     state = jax.tree.map(jnp.copy, state)
 
     def run():

@@ -49,6 +49,32 @@ fn has_bf16() -> bool {
 thread_local! {
     /// A block of columns of the right side.
     static BLOCK: RefCell<Vec<Line<f32>>> = RefCell::default();
+    /// The left side, if it had to be copied.
+    static LEFT: RefCell<Vec<f32>> = RefCell::default();
+}
+
+/// Numbers apart at which rows crowd into few places of a core's caches.
+const CROWDED: usize = 512;
+
+/// The left side `m × k` of a product: as it is, or copied to `room` with a gap behind each row where its rows in memory are so
+/// far apart that they would drive each other out of the cache.
+///
+/// # Safety
+/// The matrix must span that many elements.
+unsafe fn spread(m: usize, k: usize, a: Strided<f32>, room: &mut Vec<f32>) -> Strided<f32> {
+    let apart = a.row.max(a.column);
+    if !apart.is_multiple_of(CROWDED) {
+        return a;
+    }
+    let (rows, columns) = if a.column == 1 { (m, k) } else { (k, m) };
+    let wider = columns + LANES;
+    room.resize(rows * wider, 0.0);
+    for (i, row) in room.chunks_exact_mut(wider).enumerate() {
+        // SAFETY: row i of the matrix as it lies in memory.
+        row[..columns].copy_from_slice(unsafe { std::slice::from_raw_parts(a.first.add(i * apart), columns) });
+    }
+    let (row, column) = if a.column == 1 { (wider, 1) } else { (1, wider) };
+    Strided { first: room.as_ptr(), row, column }
 }
 
 /// What is read after a block, two cache lines of it for each of the block's `k` rows.
@@ -143,7 +169,9 @@ panel!("avx512f", f32, _mm512_set1_ps, _mm512_loadu_ps, |sum, x, b| _mm512_fmadd
 /// [`serves`] must hold for `n`, and the three matrices must span that many elements.
 #[target_feature(enable = "avx512f")]
 pub(crate) unsafe fn multiply(m: usize, n: usize, k: usize, a: Strided<f32>, b: *const f32, c: *mut f32) {
-    let mut block_of_b = BLOCK.take();
+    let (mut block_of_b, mut left) = (BLOCK.take(), LEFT.take());
+    // SAFETY: the caller's.
+    let a = unsafe { spread(m, k, a, &mut left) };
     block_of_b.resize(k * COLUMNS / LANES, Line([0.0; LANES]));
     let block = block_of_b.as_mut_ptr().cast::<f32>();
     for j in (0..n).step_by(COLUMNS) {
@@ -158,6 +186,7 @@ pub(crate) unsafe fn multiply(m: usize, n: usize, k: usize, a: Strided<f32>, b: 
         }
     }
     BLOCK.set(block_of_b);
+    LEFT.set(left);
 }
 
 /// `c[m × n] = a[m × k] · b`, where `b` has `n / 32` blocks of `k × 32`, one behind the other.
@@ -223,10 +252,11 @@ unsafe fn transpose(from: *const f32, from_row: usize, to: *mut f32, to_row: usi
 /// [`serves`] must hold for `k` and `n`, and the three matrices must span that many elements.
 #[target_feature(enable = "avx512f")]
 pub(crate) unsafe fn multiply_transposed(m: usize, k: usize, n: usize, a: *const f32, b: *const f32, c: *mut f32) {
-    let mut block_of_b = BLOCK.take();
+    let (mut block_of_b, mut left) = (BLOCK.take(), LEFT.take());
     block_of_b.resize(n * COLUMNS / LANES, Line([0.0; LANES]));
     let block = block_of_b.as_mut_ptr().cast::<f32>();
-    let a = Strided { first: a, row: n, column: 1 };
+    // SAFETY: the caller's.
+    let a = unsafe { spread(m, n, Strided { first: a, row: n, column: 1 }, &mut left) };
     for j in (0..k).step_by(COLUMNS) {
         // SAFETY: rows j..j + 32 of `b` become the columns of a block, n × 32.
         unsafe {
@@ -239,4 +269,5 @@ pub(crate) unsafe fn multiply_transposed(m: usize, k: usize, n: usize, a: *const
         }
     }
     BLOCK.set(block_of_b);
+    LEFT.set(left);
 }

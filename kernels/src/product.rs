@@ -22,6 +22,8 @@ pub enum Matrix<'a> {
     RowMajor(&'a [f32]),
     /// The transpose of the matrix that has these elements, row by row.
     TransposeOf(&'a [f32]),
+    /// The transpose of some columns, from one on, of the matrix that has these elements, row by row, and so many columns.
+    TransposeOfColumns(&'a [f32], usize, usize),
 }
 
 /// First element, column stride, row stride.
@@ -31,12 +33,16 @@ impl Matrix<'_> {
     /// # Panics
     /// If it has not `rows × columns` elements.
     fn strided(self, rows: usize, columns: usize) -> Strided {
-        let (elements, column, row) = match self {
-            Self::RowMajor(elements) => (elements, 1, columns),
-            Self::TransposeOf(elements) => (elements, rows, 1),
+        let (elements, column, row, from, len) = match self {
+            Self::RowMajor(elements) => (elements, 1, columns, 0, rows * columns),
+            Self::TransposeOf(elements) => (elements, rows, 1, 0, rows * columns),
+            Self::TransposeOfColumns(elements, from, all) => {
+                assert!(from + rows <= all, "columns of an operand");
+                (elements, all, 1, from, all * columns)
+            }
         };
-        assert_eq!(elements.len(), rows * columns, "operands of a product");
-        (elements.as_ptr(), column as isize, row as isize)
+        assert_eq!(elements.len(), len, "operands of a product");
+        (elements[from..].as_ptr(), column as isize, row as isize)
     }
 }
 
@@ -178,7 +184,12 @@ pub fn product_transposed(g: &[f32], w: &[f32], out: &mut [f32], k: usize, n: us
 
 /// `out[k × n] = x[m × k]ᵀ · g[m × n]`: the gradient of `w` in `product`.
 pub fn outer(x: &[f32], g: &[f32], out: &mut [f32], k: usize, n: usize) {
-    multiply([k, x.len() / k, n], Matrix::TransposeOf(x), g, out);
+    outer_rows(x, g, out, (0, k), n);
+}
+
+/// Those rows of [`outer`]'s result, from row `from` on, that `out` has room for.
+pub fn outer_rows(x: &[f32], g: &[f32], out: &mut [f32], (from, k): (usize, usize), n: usize) {
+    multiply([out.len() / n, x.len() / k, n], Matrix::TransposeOfColumns(x, from, k), g, out);
 }
 
 #[cfg(test)]
@@ -199,7 +210,17 @@ mod tests {
     fn products_match_their_definition() {
         let mut generator = ChaCha8Rng::seed_from_u64(0);
         let mut numbers = |len: usize| (0..len).map(|_| generator.random_range(-1.0..1.0)).collect::<Vec<f32>>();
-        for (m, k, n) in [(1, 3, 1), (5, 14, 32), (7, 11, 23), (12, 32, 64), (29, 64, 96), (41, 96, 32), (16, 33, 32)] {
+        for (m, k, n) in [
+            (1, 3, 1),
+            (5, 14, 32),
+            (7, 11, 23),
+            (12, 32, 64),
+            (29, 64, 96),
+            (41, 96, 32),
+            (16, 33, 32),
+            (9, 512, 32),
+            (7, 32, 512),
+        ] {
             let (x, w, g) = (numbers(m * k), numbers(k * n), numbers(m * n));
             let sum = |len: usize, term: &dyn Fn(usize) -> (f32, f32)| -> f64 {
                 (0..len).map(term).map(|(a, b)| f64::from(a) * f64::from(b)).sum()
@@ -229,6 +250,12 @@ mod tests {
             let mut out = vec![f32::NAN; k * n];
             outer(&x, &g, &mut out, k, n);
             assert_close(&out, |i| sum(m, &|p| (x[p * k + i / n], g[p * n + i % n])), &format!("{k} × {m}ᵀ × {n}"));
+            let (whole, from) = (out.clone(), k / 3);
+            let (above, below) = out.split_at_mut(from * n);
+            above.fill(f32::NAN);
+            outer_rows(&x, &g, above, (0, k), n);
+            outer_rows(&x, &g, below, (from, k), n);
+            assert_eq!(out, whole, "{k} × {m}ᵀ × {n} in two parts, bit for bit");
         }
     }
 }

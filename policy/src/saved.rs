@@ -5,7 +5,7 @@ use crate::network::Activations;
 use quad_kernels::Buffer;
 use quad_kernels::activation::column_sums;
 use quad_kernels::norm::kept;
-use quad_kernels::product::outer;
+use quad_kernels::product::outer_rows;
 use rayon::prelude::*;
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 
@@ -94,7 +94,12 @@ impl SavedActivations {
                 Some(delta) => self.of_member(delta, layer, member),
                 None => &output_gradient[member * self.rows * columns..][..self.rows * columns],
             };
-            outer(x, gradient, kernel, x.len() / self.rows, columns);
+            let inputs = kernel.len() / columns;
+            // One network alone would leave threads idle.
+            let rows = if self.members == 1 { inputs.min(TILE) } else { inputs };
+            kernel.par_chunks_mut(rows * columns).enumerate().for_each(|(i, kernel)| {
+                outer_rows(x, gradient, kernel, (i * rows, inputs), columns);
+            });
             column_sums(gradient, bias);
             for (i, out) in norm.into_iter().flatten().enumerate() {
                 self.add_up_norms(layer, member, i, out);
