@@ -220,6 +220,7 @@ mod tests {
             (16, 33, 32),
             (9, 512, 32),
             (7, 32, 512),
+            (256, 256, 32),
         ] {
             let (x, w, g) = (numbers(m * k), numbers(k * n), numbers(m * n));
             let sum = |len: usize, term: &dyn Fn(usize) -> (f32, f32)| -> f64 {
