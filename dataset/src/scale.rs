@@ -54,6 +54,11 @@ impl Scale {
     }
 }
 
+/// The map with which each column of these numbers has mean 0 and standard deviation 1 over the rows that count.
+pub(crate) fn standard_units(values: &[f32], width: usize, counts: impl Fn(usize) -> bool) -> Affine {
+    affine(values, width, counts, standard)
+}
+
 /// Scales a recording.
 pub(crate) fn apply(scaling: &Scaling, recording: &mut Recording) {
     if let Some(affine) = &scaling.observations {

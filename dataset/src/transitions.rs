@@ -178,6 +178,16 @@ impl Transitions {
         &self.scaling
     }
 
+    /// Units in which the observations and actions that are learnt from have mean 0 and standard deviation 1, number by number;
+    /// one that never changes keeps its size.
+    pub fn standard_units(&self) -> Scaling {
+        let counts = |row: usize| self.rows.binary_search(&(row as u32)).is_ok();
+        Scaling {
+            observations: Some(scale::standard_units(&self.observations, self.observation_dim, counts)),
+            actions: Some(scale::standard_units(&self.actions, self.action_dim, counts)),
+        }
+    }
+
     /// What the file holds, from the rewards as they were recorded.
     pub fn statistics(&self) -> &Statistics {
         &self.statistics

@@ -35,7 +35,7 @@ pub enum PolicyError {
     #[error("this policy draws no candidates, so there is nothing to choose among")]
     NoCandidates,
     /// It is to say what actions are worth, but has no critics.
-    #[error("this policy has no critics: its file holds one network, whose output is the action")]
+    #[error("this policy has no critics, which would say what a single action is worth")]
     NoCritics,
     /// It is to choose by a value function, but has none.
     #[error("the rule `nearest` takes a value function, which this policy does not have")]

@@ -4,6 +4,7 @@ use crate::choice::Choice;
 use crate::diffusion::{ACTOR, CRITIC, DiffusionPolicy, DiffusionShape, VALUE};
 use crate::error::PolicyError;
 use crate::gaussian::{GaussianPolicy, GaussianShape};
+use crate::planner::{Planner, PlannerShape};
 use crate::policy::Policy;
 use crate::precision::Precision;
 use crate::scaled::scaled;
@@ -53,6 +54,13 @@ pub enum PolicyConfig {
         /// Shape of its networks.
         shape: ScorePolicyShape,
         /// Which samples they are.
+        choice: Choice,
+    },
+    /// The first actions of one of several plans.
+    Planner {
+        /// What it is beside its weights.
+        shape: PlannerShape,
+        /// Which plan it is.
         choice: Choice,
     },
 }
@@ -143,6 +151,10 @@ pub fn load_policy(file: &[u8], precision: Precision) -> Result<Box<dyn Policy>,
         }
         PolicyConfig::Gaussian { shape } => Box::new(GaussianPolicy::load(shape, &mut tensors)?),
         PolicyConfig::Score { shape, choice } => Box::new(ScorePolicy::load(shape, choice, &mut tensors, precision)?),
+        PolicyConfig::Planner { shape, choice } => {
+            let units = shape.units.clone();
+            scaled(Box::new(Planner::load(shape, choice, &mut tensors)?), Some(units))?
+        }
     };
     match tensors.into_keys().next() {
         Some(name) => Err(PolicyError::Unexpected(name)),

@@ -17,6 +17,9 @@
 //!   reads one from a file whose [`Header`] says what it is: [`DiffusionPolicy`] (`diffusion`), [`SquashedPolicy`]
 //!   (`squashed`) and [`ScorePolicy`] (`score`) take one of N_a samples (`candidates`), or the mean of some, by their [`Choice`]
 //!   (`choice`), [`GaussianPolicy`] (`gaussian`) a mean; one with a [`Scaling`] is asked in its user's units (`scaled`).
+//! - [`WindowModel`] and [`WindowValue`] (`window_networks`): networks over windows of consecutive steps, of the layers in
+//!   `window_layers`, `convolution` and `group_norm`; `window` lists their tensors. [`Planner`] (`planner`) acts by plans that
+//!   `planning` draws with them.
 //! - [`Precision`] (`precision`): how exactly networks are evaluated that no gradient is taken of.
 //! - Below: `layers` (where each layer lies in the vector), `network` (one network on one tile of rows, over the crate
 //!   `kernels`), `saved` and `kept_gradient` (what forward and backward passes leave), `operation` (candle's custom
@@ -31,13 +34,18 @@ mod action_gradients;
 mod candidates;
 mod choice;
 mod composed;
+mod convolution;
 mod dense;
+mod differentiable;
 mod diffusion;
 mod dpm_solver;
 mod edm;
 mod ensemble;
 mod episode;
 mod error;
+#[cfg(test)]
+#[allow(clippy::unwrap_used)]
+mod finite_differences;
 mod gaussian;
 #[cfg(test)]
 #[allow(clippy::unwrap_used)]
@@ -45,6 +53,7 @@ mod golden;
 #[cfg(feature = "cuda")]
 mod gpu;
 mod gradient;
+mod group_norm;
 #[cfg(test)]
 #[allow(clippy::unwrap_used)]
 mod implementations;
@@ -59,6 +68,8 @@ mod operation;
 mod optimiser;
 mod packed;
 mod plain;
+mod planner;
+mod planning;
 mod policy;
 mod precision;
 mod sampler;
@@ -73,6 +84,9 @@ mod squashed;
 mod statistics;
 mod weighted;
 mod weights;
+mod window;
+mod window_layers;
+mod window_networks;
 
 pub use choice::{Choice, Reduce, Rule};
 pub use diffusion::{DiffusionPolicy, DiffusionShape};
@@ -87,6 +101,8 @@ pub use kind::{Header, PolicyConfig, load_policy, read_header, read_tensors, wri
 pub use mlp_config::{Epsilon, Initial, MlpConfig};
 pub use noise_predictor::NoisePredictor;
 pub use optimiser::{Adam, AdamStep, cosine_decay};
+pub use planner::{Guidance, Planner, PlannerShape};
+pub use planning::{Planning, with_first_state};
 pub use policy::{Policy, Sampled};
 pub use precision::Precision;
 pub use quad_kernels::activation::Activation;
@@ -99,3 +115,5 @@ pub use squashed::{SquashedActor, SquashedPolicy, SquashedShape};
 pub use statistics::mean_and_variance;
 pub use weighted::Weighted;
 pub use weights::{Layout, Part, Start, Tensors, Weights, take};
+pub use window::{Attention, WindowConfig, WindowError};
+pub use window_networks::{WindowModel, WindowValue};

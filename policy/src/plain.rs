@@ -8,7 +8,7 @@ use quad_kernels::activation::Activation;
 
 /// x·tanh(softplus(x)) as x·n/(n + 2) with n = e^x (e^x + 2). From 20 on it is x, to the last bit of f32; the bound keeps
 /// value and derivative finite everywhere (the derivative of candle's own Mish is NaN from 89 on).
-fn mish(x: &Tensor) -> Result<Tensor> {
+pub(crate) fn mish(x: &Tensor) -> Result<Tensor> {
     // As a tensor, not a number: that would be sent to the device each time.
     let e = x.minimum(&Tensor::full(20f32, x.shape(), x.device())?)?.exp()?;
     let n = (&e * (&e + 2.0)?)?;
@@ -27,7 +27,7 @@ pub(crate) fn activate(f: Activation, x: &Tensor) -> Result<Tensor> {
 
 /// Each row over its numbers: (x - mean)/√(variance + ε)·scale + shift, for `x [K, rows, width]` and `[K, 1, width]`.
 /// (candle-nn's own has no gradient, and says nothing.)
-fn layer_norm(x: &Tensor, scale: &Tensor, shift: &Tensor, epsilon: f64) -> Result<Tensor> {
+pub(crate) fn layer_norm(x: &Tensor, scale: &Tensor, shift: &Tensor, epsilon: f64) -> Result<Tensor> {
     let centred = x.broadcast_sub(&x.mean_keepdim(D::Minus1)?)?;
     let deviation = (centred.sqr()?.mean_keepdim(D::Minus1)? + epsilon)?.sqrt()?;
     centred.broadcast_div(&deviation)?.broadcast_mul(scale)?.broadcast_add(shift)

@@ -44,9 +44,22 @@ impl Schedule {
     /// β_t = 1 - exp(-0.1/T - 0.5·(10 - 0.1)·(2t - 1)/T²) for t = 1..T.
     pub fn variance_preserving(steps: usize, reverse: Reverse) -> Self {
         let total = steps as f64;
+        let alpha = |t: usize| (-0.1 / total - 0.5 * (10.0 - 0.1) * (2 * t - 1) as f64 / (total * total)).exp();
+        Self::of(steps, reverse, alpha)
+    }
+
+    /// ᾱ_t = f(t/T)/f(0) with f(x) = cos²(π/2·(x + 0.008)/1.008), each β_t at most 0.999 (Nichol and Dhariwal 2021); the
+    /// variance of a reverse step is the posterior's.
+    pub fn cosine(steps: usize) -> Self {
+        let falls = |t: usize| ((t as f64 / steps as f64 + 0.008) / 1.008 * std::f64::consts::FRAC_PI_2).cos().powi(2);
+        Self::of(steps, Reverse::Posterior, |t| (falls(t) / falls(t - 1)).max(0.001))
+    }
+
+    /// The schedule with these α_t for t = 1..T.
+    fn of(steps: usize, reverse: Reverse, alpha: impl Fn(usize) -> f64) -> Self {
         let mut before = 1.0; // ᾱ_{t-1}
         let step = |t: usize| {
-            let alpha = (-0.1 / total - 0.5 * (10.0 - 0.1) * (2 * t - 1) as f64 / (total * total)).exp();
+            let alpha = alpha(t);
             let alpha_bar = before * alpha;
             let shrink = match reverse {
                 Reverse::Posterior => (1.0 - before) / (1.0 - alpha_bar),
@@ -63,6 +76,22 @@ impl Schedule {
             step
         };
         Self { steps: (1..=steps).map(step).collect(), reverse }
+    }
+
+    /// The variance of the noise of a reverse step, 0 at t = 1.
+    pub fn variance(&self, t: usize) -> f32 {
+        self.steps[t - 1].noise.powi(2)
+    }
+
+    /// x_t → x_{t-1} where the clean x_0 is predicted rather than the noise: the posterior's mean, plus noise `z` for t > 1. All of
+    /// one shape.
+    pub fn reverse_to_clean(&self, t: usize, x: &Tensor, clean: &Tensor, z: Option<&Tensor>) -> Result<Tensor> {
+        let Step { from_clean, from_noisy, noise, .. } = self.steps[t - 1];
+        let mean = ((clean * f64::from(from_clean))? + (x * f64::from(from_noisy))?)?;
+        match z {
+            Some(z) if t > 1 => mean + (z * f64::from(noise))?,
+            _ => Ok(mean),
+        }
     }
 
     /// sqrt(ᾱ_t) and sqrt(1 - ᾱ_t) for each t in 1..=T, `[B, width]` each, a row for each t with its number in all
@@ -87,13 +116,7 @@ impl Schedule {
     ///
     /// `epsilon` is the predicted noise, `z` standard normal.
     pub fn reverse(&self, t: usize, x: &Tensor, epsilon: &Tensor, z: Option<&Tensor>) -> Result<Tensor> {
-        let Step { from_clean, from_noisy, noise, .. } = self.steps[t - 1];
-        let scale = |x: &Tensor, by: f32| x * f64::from(by);
-        let mean = (scale(&self.clean(t, x, epsilon)?, from_clean)? + scale(x, from_noisy)?)?;
-        let next = match z {
-            Some(z) if t > 1 => (mean + scale(z, noise)?)?,
-            _ => mean,
-        };
+        let next = self.reverse_to_clean(t, x, &self.clean(t, x, epsilon)?, z)?;
         if self.reverse == Reverse::ClipSample { next.clamp(-1f32, 1f32) } else { Ok(next) }
     }
 

@@ -87,6 +87,11 @@ impl Layout {
         Self(parts.into())
     }
 
+    /// Its parts.
+    pub(crate) fn parts(&self) -> &[Part] {
+        &self.0
+    }
+
     /// Numbers in the vector.
     pub fn count(&self) -> usize {
         self.0.iter().map(Part::count).sum()

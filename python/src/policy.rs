@@ -215,8 +215,8 @@ impl PyPolicy {
         self.origin.step
     }
 
-    /// "diffusion" or "squashed" (a Gaussian through a tanh), which draw actions and choose one, or "gaussian", which acts by
-    /// its mean.
+    /// "diffusion" or "squashed" (a Gaussian through a tanh), which draw actions and choose one; "planner", which draws plans and
+    /// chooses one; or "gaussian", which acts by its mean.
     #[getter]
     fn kind(&self) -> &'static str {
         match self.config {
@@ -224,6 +224,7 @@ impl PyPolicy {
             PolicyConfig::Squashed { .. } => "squashed",
             PolicyConfig::Gaussian { .. } => "gaussian",
             PolicyConfig::Score { .. } => "score",
+            PolicyConfig::Planner { .. } => "planner",
         }
     }
 

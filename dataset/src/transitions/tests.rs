@@ -74,3 +74,13 @@ fn windows_lie_within_episodes() {
     transitions.gather(&Vec::from_iter(2..4), &mut batch);
     assert_eq!((batch.observations, batch.next_observations), (vec![3.0, 4.0], vec![4.0, 5.0]));
 }
+
+#[test]
+fn standard_units_are_of_the_rows_that_are_learnt_from() {
+    let units = transitions(d4rl()).standard_units();
+    let affine = units.observations.unwrap();
+    // 0, 1, 3, 4 and 5: the mean of the squares is 10.2, that of the numbers 2.6.
+    assert!((affine.offset[0] - 2.6).abs() < 1e-6 && (affine.scale[0] - 3.44_f32.sqrt()).abs() < 1e-6, "{affine:?}");
+    let affine = units.actions.unwrap();
+    assert!((affine.offset[0] - 0.026).abs() < 1e-6 && (affine.scale[0] - 0.01 * 3.44_f32.sqrt()).abs() < 1e-6);
+}
