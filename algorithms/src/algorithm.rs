@@ -52,6 +52,9 @@ pub enum AlgorithmError {
     /// The dataset has no episode that the algorithm learns from.
     #[error("no episode of the dataset has {0} transitions (agent.shortest_episode)")]
     ShortEpisodes(usize),
+    /// The dataset has no window of this many transitions to learn from.
+    #[error("no episode of the dataset has {0} transitions, which this algorithm plans ahead, and none terminates")]
+    NoWindow(usize),
     /// A tensor cannot be computed or moved.
     #[error("candle failed")]
     Candle(#[from] candle_core::Error),
@@ -68,6 +71,7 @@ impl AlgorithmError {
             Self::ShortEpisodes(_) => {
                 "`learner datasets inspect` says how long episodes are; --agent shortest_episode=1 keeps them all"
             }
+            Self::NoWindow(_) => "a shorter horizon (--agent network.horizon=4, say), or longer episodes",
             Self::Policy(_) | Self::Agent(_) | Self::Candle(_) => {
                 "`learner presets TASK` prints hyper-parameters that work; smaller networks and batches take less memory"
             }

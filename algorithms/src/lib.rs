@@ -12,6 +12,7 @@ mod context;
 mod cql;
 mod definition;
 mod denoising;
+mod diffuser;
 mod diffusion;
 mod dql;
 mod dtql;
@@ -41,11 +42,12 @@ pub use parts::Parts;
 pub use values::{Values, fits, merge};
 
 /// All algorithms, the one that learns unless another is asked for first.
-pub const ALGORITHMS: [Definition; 10] = [
+pub const ALGORITHMS: [Definition; 11] = [
     quad::DEFINITION,
     iql::DEFINITION,
     align_iql::DEFINITION,
     cql::DEFINITION,
+    diffuser::DEFINITION,
     dql::DEFINITION,
     dtql::DEFINITION,
     ivr::DEFINITION,

@@ -17,6 +17,7 @@ from safetensors.numpy import load_file, save_file
 
 import align_iql
 import cql
+import diffuser
 import dql
 import dtql
 import iql
@@ -59,8 +60,10 @@ FOLDERS = {
     "sfbc-behavior": (40, "sfbc-behavior", "small"),
     "sfbc-critic": (41, "sfbc-critic", "small"),
     "sfbc-planning": (42, "sfbc-planning", "small"),
+    "diffuser": (40, "diffuser", "small"),
+    "diffuser-attention": (41, "diffuser-attention", "small"),
 }
-MODULES = quad, iql, ivr, xql, dql, align_iql, onestep, cql, dtql, sfbc
+MODULES = quad, iql, ivr, xql, dql, align_iql, onestep, cql, dtql, sfbc, diffuser
 ALGORITHMS = {variant: algorithm for algorithm in MODULES for variant in algorithm.VARIANTS}
 
 
