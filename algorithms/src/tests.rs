@@ -164,8 +164,10 @@ fn every_value_is_finite_and_every_weight_that_is_trained_has_a_gradient() {
         }
         for (name, moment) in agent.parts().save().unwrap().iter().filter(|(name, _)| name.starts_with("adam_m")) {
             let moment: Vec<f32> = moment.flatten_all().unwrap().to_vec1().unwrap();
-            let good =
-                moment.iter().all(|x| x.is_finite()) && moment.iter().filter(|x| **x == 0.0).count() * 2 < moment.len();
+            let zeros = moment.iter().filter(|x| **x == 0.0).count();
+            // Where a window has one step left, four of five taps of Diffuser's convolutions see only what is beside it.
+            let most = if definition.name == "diffuser" { moment.len() * 4 / 5 } else { (moment.len() - 1) / 2 };
+            let good = moment.iter().all(|x| x.is_finite()) && zeros <= most;
             assert!(good, "{}: {name} has a gradient that is 0 or not finite", definition.name);
         }
     }
@@ -184,7 +186,12 @@ fn a_nan_is_never_dropped() {
             weights.change(|values| values.slice_set(&(values * f64::NAN)?, 0, 0)).unwrap();
             let values = train(&mut agent, STEPS);
             // By these the policy acts, but nothing is learned from them: they are averages of networks that are watched.
-            let unread = [("align-iql", "target_actor"), ("dtql", "target_critic")].contains(&(definition.name, name));
+            let unread = match definition.name {
+                "align-iql" => name == "target_actor",
+                "diffuser" => name.starts_with("target"),
+                "dtql" => name == "target_critic",
+                _ => false,
+            };
             assert!(
                 unread || values.iter().flatten().any(|value| value.is_nan()),
                 "{}: a NaN in {name} is lost",

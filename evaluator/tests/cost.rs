@@ -6,8 +6,8 @@ use std::sync::atomic::{AtomicUsize, Ordering::Relaxed};
 
 use candle_core::{DType, Device, Tensor};
 use quad_policy::{
-    Choice, DiffusionShape, GaussianShape, Header, MlpConfig, Policy, PolicyConfig, Precision, Rule, ScorePolicyShape,
-    SquashedShape, load_policy,
+    Attention, Choice, DiffusionShape, GaussianShape, Guidance, Header, MlpConfig, PlannerShape, Policy, PolicyConfig,
+    Precision, Rule, Scaling, ScorePolicyShape, SquashedShape, WindowConfig, load_policy,
 };
 
 /// What is not counted, such as the embedding of each denoising step: little of what an evaluator gives, bytes.
@@ -67,11 +67,29 @@ fn score(widths: &[usize], candidates: u32) -> Box<dyn Policy> {
     loaded(PolicyConfig::Score { shape, choice: Choice::best_of(candidates) })
 }
 
+fn planner(network: WindowConfig, plans: u32) -> Box<dyn Policy> {
+    let shape = PlannerShape {
+        observation_dim: 11,
+        action_dim: 3,
+        network,
+        diffusion_steps: 3,
+        guidance: Guidance { steps: 1, scale: 0.1, stop: 0 },
+        replan_every: 1,
+        units: Scaling::default(),
+    };
+    loaded(PolicyConfig::Planner { shape, choice: Choice::best_of(plans) })
+}
+
+/// A planner's networks with eight groups.
+fn windows(horizon: usize, channels: usize, multipliers: &[usize], attention: Option<Attention>) -> WindowConfig {
+    WindowConfig { horizon, channels, multipliers: multipliers.to_vec(), groups: 8, attention }
+}
+
 #[test]
 fn actions_take_no_more_memory_than_was_said() {
     let best_of = Choice::best_of;
     let nearest = Choice { rule: Rule::Nearest, ..best_of(1000) };
-    let cases: [(&str, Box<dyn Policy>, usize); 10] = [
+    let cases: [(&str, Box<dyn Policy>, usize); 14] = [
         ("the paper's", diffusion(256, 10, 5, best_of(50)), 10),
         ("many critics", diffusion(1, 4096, 1, best_of(32)), 64),
         ("many steps", diffusion(4, 1, 1000, best_of(8)), 256),
@@ -82,6 +100,14 @@ fn actions_take_no_more_memory_than_was_said() {
         ("critics with a norm", squashed(64, true), 10),
         ("a score network", score(&[512, 256, 128], 32), 10),
         ("a score network of one block", score(&[64], 1000), 64),
+        ("Diffuser's for Hopper", planner(windows(32, 32, &[1, 2, 4, 8], None), 64), 1),
+        (
+            "Diffuser's for HalfCheetah",
+            planner(windows(4, 32, &[1, 4, 8], Some(Attention { heads: 4, width: 32 })), 64),
+            1,
+        ),
+        ("many plans", planner(windows(16, 16, &[1, 2, 4], None), 8), 64),
+        ("a plan of one step", planner(windows(1, 32, &[1], Some(Attention { heads: 16, width: 64 })), 1000), 4),
     ];
     for (name, policy, n) in cases {
         let said = policy.memory(n) as usize;

@@ -4,7 +4,7 @@ use crate::choice::Choice;
 use crate::diffusion::{ACTOR, CRITIC, DiffusionPolicy, DiffusionShape, VALUE};
 use crate::error::PolicyError;
 use crate::gaussian::{GaussianPolicy, GaussianShape};
-use crate::planner::{Planner, PlannerShape};
+use crate::planner::{self, Planner, PlannerShape};
 use crate::policy::Policy;
 use crate::precision::Precision;
 use crate::scaled::scaled;
@@ -12,6 +12,7 @@ use crate::score::{FREQUENCIES, ScorePolicy, ScorePolicyShape};
 use crate::score_network::ScoreShape;
 use crate::squashed::{SquashedPolicy, SquashedShape};
 use crate::weights::{Layout, Tensors, Weights, check_finite};
+use crate::window_networks::{WindowModel, WindowValue};
 use candle_core::safetensors::Load;
 use candle_core::{DType, Device, Tensor};
 use quad_kernels::scaling::Scaling;
@@ -94,6 +95,10 @@ impl PolicyConfig {
                 add(CRITIC, shape.critic().layout())?;
                 let frequencies = Tensor::ones(ScoreShape::FREQUENCIES, DType::F32, &Device::Cpu)?;
                 tensors.insert(FREQUENCIES.to_owned(), frequencies);
+            }
+            Self::Planner { shape, .. } => {
+                add(planner::MODEL, WindowModel::layout(&shape.network, shape.width()))?;
+                add(planner::VALUE, WindowValue::layout(&shape.network, shape.width()))?;
             }
         }
         Ok(tensors)

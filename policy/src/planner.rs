@@ -19,8 +19,8 @@ use std::sync::Arc;
 /// Most denoising steps that are believed, and most steps of guidance in each.
 const MOST_STEPS: usize = 1000;
 /// Before the names of the networks' tensors.
-const MODEL: &str = "model.";
-const VALUE: &str = "value.";
+pub(crate) const MODEL: &str = "model.";
+pub(crate) const VALUE: &str = "value.";
 
 /// What a planner is beside its weights.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]

@@ -13,8 +13,8 @@ fn transitions(dims: (usize, usize), lengths: &[usize]) -> Transitions {
     let numbers = |width: usize, from: f32| (0..n * width).map(|i| ((i / width) as f32 + from) / 100.0).collect();
     let ends: Vec<usize> =
         lengths.iter().scan(0, |end, length| Some(*end + length).inspect(|sum| *end = *sum)).collect();
-    let flags =
-        |odd: usize| (0..n).map(|row| ends.iter().position(|end| row + 1 == *end).is_some_and(|i| i % 2 == odd));
+    let ends_of = |odd: usize| -> Vec<usize> { ends.iter().copied().skip(odd).step_by(2).collect() };
+    let flags = |ends: Vec<usize>| (1..=n).map(|count| ends.contains(&count)).collect();
     Transitions::of(Arrays {
         observation_dim: dims.0,
         action_dim: dims.1,
@@ -22,8 +22,8 @@ fn transitions(dims: (usize, usize), lengths: &[usize]) -> Transitions {
         actions: numbers(dims.1, 0.0),
         rewards: numbers(1, 0.0),
         next_observations: numbers(dims.0, 1.0),
-        terminals: flags(1).collect(),
-        timeouts: flags(0).collect(),
+        terminals: flags(ends_of(1)),
+        timeouts: flags(ends_of(0)),
     })
     .unwrap()
 }

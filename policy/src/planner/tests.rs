@@ -24,13 +24,9 @@ fn shape(replan_every: usize) -> PlannerShape {
 
 fn file(shape: PlannerShape, plans: u32) -> Vec<u8> {
     let generator = &mut ChaCha8Rng::seed_from_u64(5);
-    let mut weights =
-        |layout| Weights::constant(Clone::clone(&layout), Weights::initial(&layout, generator, &Device::Cpu).unwrap());
-    let (config, width) = (shape.network.clone(), shape.width());
-    let model = WindowModel::new(config.clone(), weights(WindowModel::layout(&config, width)));
-    let value = WindowValue::new(config.clone(), weights(WindowValue::layout(&config, width)));
     let policy = PolicyConfig::Planner { shape, choice: Choice::best_of(plans) };
-    Header { policy, scaling: None, origin: () }.to_safetensors(&Planner::tensors(&model, &value).unwrap()).unwrap()
+    let tensors = policy.tensors(|layout| Weights::initial(layout, generator, &Device::Cpu)).unwrap();
+    Header { policy, scaling: None, origin: () }.to_safetensors(&tensors).unwrap()
 }
 
 fn policy(replan_every: usize, plans: u32) -> Box<dyn Policy> {
