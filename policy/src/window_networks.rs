@@ -182,7 +182,7 @@ mod tests {
         let largest = |x: &Tensor| x.abs().unwrap().max_all().unwrap().to_scalar::<f32>().unwrap();
         for (fast, plain) in [(fast, plain), (of_fast, of_plain)] {
             let difference = largest(&(&fast - &plain).unwrap()) / largest(&plain);
-            assert!(difference < 1e-5, "{difference}");
+            assert!(difference < 1e-4, "{difference}");
         }
         let constant = network(Weights::constant(layout.clone(), values.clone()));
         check_gradients(&[x.clone()], |x| of(&constant, &x[0]));
