@@ -127,7 +127,10 @@ def values(algorithm, task):
 
 def phases(algorithm):
     """The shares of the phases in which the algorithm trains networks, one if it has none."""
-    shares = values(algorithm, TASK)["agent"].get("phases", {"all": 1})
+    preset = values(algorithm, TASK)
+    if updates := preset["agent"].get("value_updates"):
+        return [updates, preset["steps"] - updates]
+    shares = preset["agent"].get("phases", {"all": 1})
     return [share for name, share in shares.items() if share > 0 and name != "planning"]
 
 

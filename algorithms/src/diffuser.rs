@@ -62,7 +62,7 @@ struct Config {
     /// Of both networks.
     learning_rate: Positive,
     /// Updates in which the value network learns, the first of a run.
-    value_steps: Steps,
+    value_updates: Steps,
     /// EMA rate of the networks that plan.
     ema_rate: Rate,
     /// They follow in updates whose number, from 0, is a multiple of this …
@@ -184,7 +184,7 @@ impl Diffuser {
         }
         let first_action = error.narrow(1, 0, 1)?.narrow(2, 0, self.context.action_dim())?.mean_all()?;
         let return_mean = batch.returns.mean_all()?;
-        if step >= *self.config.value_steps {
+        if step >= *self.config.value_updates {
             let known =
                 [("model_loss", &model_loss), ("first_action_loss", &first_action), ("return_mean", &return_mean)];
             return measured(known);
@@ -213,7 +213,7 @@ impl Algorithm for Diffuser {
     }
 
     fn phases(&self) -> Vec<u64> {
-        let ends = Some(*self.config.value_steps).filter(|ends| *ends < self.context.total_steps);
+        let ends = Some(*self.config.value_updates).filter(|ends| *ends < self.context.total_steps);
         [0].into_iter().chain(ends).collect()
     }
 

@@ -1,14 +1,12 @@
 """One update of Diffuser (Janner et al. 2022), and how it plans. Windows are [..., H, a + o], each step action then state."""
 
-import inspect
 import math
-from functools import partial
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from networks import ADAM, adam_step, follow, mish, near, random_moments, single
+from networks import ADAM, adam_step, compiled, follow, mish, near, random_moments, single
 
 TAPS = 5
 # Large rates, so that a mistake in an optimiser or an average is far larger than float32's rounding.
@@ -17,7 +15,7 @@ AGENT = {
     "terminal_penalty": 100.0,
     "first_action_weight": 10.0,
     "learning_rate": 0.02,
-    "value_steps": 1500,
+    "value_updates": 1500,
     "ema_rate": 0.05,
     "ema_every": 10,
     "ema_start": 1000,
@@ -147,20 +145,13 @@ def worth(p, x, t, groups):
     return linear(p, "head.1", mish(linear(p, "head.0", x)))[:, 0]
 
 
-def fast(function):
-    """The function, compiled; its groups and attention are not traced. It gives NumPy arrays."""
-    static = [name for name in ("groups", "attention") if name in inspect.signature(function).parameters]
-    compiled = jax.jit(function, static_argnames=static)
-    return lambda *arguments: jax.tree.map(np.asarray, compiled(*arguments))
-
-
 # Losses and their gradients.
 
 
-def model_loss(p, noisy, windows, t, weights, action_dim, groups, attention):
-    """The weighted loss; also that of the first action, unweighted."""
+def model_loss(p, noisy, windows, t, weights, groups, attention):
+    """The weighted loss; also the unweighted one of each number of the first step."""
     error = (clean(p, noisy, t, groups, attention) - windows) ** 2
-    return jnp.mean(weights * error), jnp.mean(jnp.where(jnp.arange(error.shape[-1]) < action_dim, error[:, 0], 0), 0)
+    return jnp.mean(weights * error), jnp.mean(error[:, 0], 0)
 
 
 def value_loss(p, noisy, returns, t, groups):
@@ -168,17 +159,16 @@ def value_loss(p, noisy, returns, t, groups):
     return jnp.mean((values - returns) ** 2), values
 
 
-model_gradient = fast(jax.value_and_grad(model_loss, has_aux=True))
-value_gradient = fast(jax.value_and_grad(value_loss, has_aux=True))
-fast_clean = fast(clean)
-
-
-@fast
-@partial(jax.value_and_grad, has_aux=True)
-def pull(x, p, t, groups):
-    """The gradient of the windows' values with respect to them; and the values."""
+def sum_of_values(x, p, t, groups):
+    """Its gradient is that of each window's value; also the values."""
     values = worth(p, x, t, groups)
     return values.sum(), values
+
+
+model_gradient = compiled(jax.value_and_grad(model_loss, has_aux=True))
+value_gradient = compiled(jax.value_and_grad(value_loss, has_aux=True))
+pull = compiled(jax.value_and_grad(sum_of_values, has_aux=True))
+fast_clean = compiled(clean)
 
 
 # One update.
@@ -191,7 +181,7 @@ def schedule(steps):
     return beta, np.cumprod(1 - beta)
 
 
-def networks(config):
+def static(config):
     """Groups and, where there is attention, its heads and width."""
     network = config["agent"]["network"]
     attention = network.get("attention")
@@ -201,27 +191,31 @@ def networks(config):
 def update(config, state, inputs):
     """All that must come out."""
     agent, step, a = config["agent"], config["step"], config["action_dim"]
-    groups, attention = networks(config)
+    groups, attention = static(config)
     windows, t, returns = inputs["windows"], inputs["t"], inputs["returns"]
     _, alpha_bar = schedule(agent["diffusion_steps"])
     share = alpha_bar[t][:, None, None]
     noisy = np.sqrt(share) * windows + np.sqrt(1 - share) * inputs["epsilon"]
-    noisy[:, 0, a:] = windows[:, 0, a:]
+    is_first = (np.arange(windows.shape[1]) == 0)[:, None]
+    is_action = np.arange(windows.shape[2]) < a
+    noisy = np.where(is_first & ~is_action, windows, noisy)
 
-    weights = np.ones(windows.shape[1:])
-    weights[0, :a], weights[0, a:] = agent["first_action_weight"], 0
-    (loss, first), gradients = model_gradient(state["model"], noisy, windows, t, weights, a, groups, attention)
-    out = {"noisy_windows": noisy, "model_loss": loss, "first_action_loss": first.sum() / a}
+    weights = np.where(is_first, np.where(is_action, agent["first_action_weight"], 0.0), 1.0)
+    (loss, first), gradients = model_gradient(state["model"], noisy, windows, t, weights, groups, attention)
+    out = {"noisy_windows": noisy, "model_loss": loss, "first_action_loss": first[:a].mean()}
     out |= adam_step(state, "model", gradients, agent["learning_rate"], step)
-    (loss, values), gradients = value_gradient(state["value"], noisy, returns, t, groups)
-    out |= {"value_loss": loss, "value_mean": values.mean(), "return_mean": returns.mean()}
-    out |= adam_step(state, "value", gradients, agent["learning_rate"], step)
+    out |= {"value": state["value"], "return_mean": returns.mean()}
+    learning = ["model"]
+    if step < agent["value_updates"]:
+        learning.append("value")
+        (loss, values), gradients = value_gradient(state["value"], noisy, returns, t, groups)
+        out |= {"value_loss": loss, "value_mean": values.mean()}
+        out |= adam_step(state, "value", gradients, agent["learning_rate"], step)
 
-    for name in "model", "value":
-        out[f"target_{name}"] = state[f"target_{name}"]
-        if step % agent["ema_every"] == 0:
-            rate = agent["ema_rate"] if step >= agent["ema_start"] else 1
-            out[f"target_{name}"] = follow(state[f"target_{name}"], out[name], rate)
+    out |= {f"target_{name}": state[f"target_{name}"] for name in ("model", "value")}
+    if step % agent["ema_every"] == 0:
+        rate = agent["ema_rate"] if step >= agent["ema_start"] else 1
+        out |= {f"target_{name}": follow(state[f"target_{name}"], out[name], rate) for name in learning}
     return out, None
 
 
@@ -230,7 +224,7 @@ def act(config, state, inputs):
     are before the update.
     """
     agent, a, noise = config["agent"], config["action_dim"], inputs["select_noise"]
-    groups, attention = networks(config)
+    groups, attention = static(config)
     steps, n, plans, horizon, width = noise.shape
     beta, alpha_bar = schedule(steps)
     first = np.repeat(inputs["select_observations"], plans, 0)

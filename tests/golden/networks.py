@@ -23,9 +23,11 @@ ADAM = {"beta1": 0.9, "beta2": 0.999, "epsilon": 1e-8}
 
 
 def compiled(function):
-    """The function, compiled once for each shape of its arguments and each activation; it gives NumPy arrays."""
-    activations = [name for name in inspect.signature(function).parameters if name.endswith("activation")]
-    fast = jax.jit(function, static_argnames=activations)
+    """The function, compiled once for each shape of its arguments, each activation, and each number of groups or heads of
+    attention; it gives NumPy arrays.
+    """
+    static = [name for name in inspect.signature(function).parameters if name.endswith(("activation", "groups", "attention"))]
+    fast = jax.jit(function, static_argnames=static)
     return lambda *arguments: jax.tree.map(np.asarray, fast(*arguments))
 
 
