@@ -177,7 +177,7 @@ fast_clean = compiled(clean)
 def schedule(steps):
     """β and ᾱ at 0 … T."""
     f = np.cos((np.arange(steps + 1) / steps + 0.008) / 1.008 * math.pi / 2) ** 2
-    beta = np.concatenate([[0.0], np.minimum(1 - f[1:] / f[:-1], 0.999)])
+    beta = np.append(0.0, np.minimum(1 - f[1:] / f[:-1], 0.999))
     return beta, np.cumprod(1 - beta)
 
 
