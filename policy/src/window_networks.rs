@@ -185,7 +185,7 @@ mod tests {
             assert!(difference < 1e-4, "{difference}");
         }
         let constant = network(Weights::constant(layout.clone(), values.clone()));
-        check_gradients(&[x.clone()], |x| of(&constant, &x[0]));
+        check_gradients(std::slice::from_ref(&x), |x| of(&constant, &x[0]));
     }
 
     #[test]
