@@ -6,7 +6,7 @@
 
 use candle_core::{Device, Result, Tensor};
 use criterion::measurement::WallTime;
-use criterion::{BenchmarkGroup, Criterion, criterion_group, criterion_main};
+use criterion::{BenchmarkGroup, Criterion, criterion_group};
 use quad_algorithms::{ALGORITHMS, Agent, Context, Definition, Values};
 use quad_dataset::{Arrays, Transitions};
 use quad_kernels::activation::{Activation, activate, activate_with_slope};
@@ -224,4 +224,11 @@ fn parts_of(group: &mut BenchmarkGroup<'_, WallTime>, experiment: &Experiment, s
 }
 
 criterion_group!(benches, peaks, updates, parts);
-criterion_main!(benches);
+
+fn main() {
+    // As the learner has it (quad_runtime::choose_threads): candle's own pool and Rayon's would take turns on the cores.
+    // SAFETY: there is no other thread yet.
+    unsafe { std::env::set_var("CANDLE_NUM_THREADS", "1") };
+    benches();
+    Criterion::default().configure_from_args().final_summary();
+}
