@@ -16,6 +16,9 @@ use crate::Definition;
 pub struct Values {
     /// What the algorithm is, in a few words.
     pub about: String,
+    /// What a gradient step costs with the values for `hopper-medium-v2`: billions of additions and multiplications in the products of
+    /// its networks, of which two cores do some 100 to 200 a second.
+    pub gflop: String,
     /// Patterns of the tasks for which its authors give values.
     pub given: Vec<String>,
     /// Keys of an experiment by pattern.

@@ -72,11 +72,11 @@ fn list_presets(args: &PresetsArgs) -> anyhow::Result<()> {
         let word = |key| task.word(key).unwrap_or("-");
         of_tasks.push([&*task.name, word("environment"), word("dataset"), &task.about].map(str::to_owned));
     }
-    let header = ["algorithm", "what it is", "its authors give values for"];
+    let header = ["algorithm", "what it is", "its authors give values for", "GFLOP a step"];
     let mut of_algorithms = Table::new(&header.map(|name| (name, Left)));
     for definition in &ALGORITHMS {
         let values = Values::of(definition)?;
-        of_algorithms.push([definition.name.to_owned(), values.about, values.given.join(", ")]);
+        of_algorithms.push([definition.name.to_owned(), values.about, values.given.join(", "), values.gflop]);
     }
     print(&format!("{}\n{}", of_tasks.render(Style::Text), of_algorithms.render(Style::Text)))
 }
