@@ -110,7 +110,7 @@ fn tasks_and_algorithms_are_listed_with_what_their_authors_give() {
         let file: Table = std::fs::read_to_string(file).unwrap().parse().unwrap();
         assert!(row.contains(file["about"].as_str().unwrap()), "{row}");
     }
-    assert!(algorithms[0].starts_with("quad ") && algorithms[0].ends_with("*-v0, *-v2"), "{list}");
+    assert!(algorithms[0].starts_with("quad ") && algorithms[0].contains(" *-v0, *-v2 "), "{list}");
 }
 
 #[test]
