@@ -21,7 +21,7 @@ AGENT = {
     "ema_start": 1000,
 }
 SMALL = {"diffusion_steps": 4, "guidance": {"steps": 2, "scale": 0.5, "stop": 1}, "candidates": 5, "replan_every": 2}
-PAPER = {"diffusion_steps": 20, "guidance": {"steps": 2, "scale": 0.1, "stop": 2}, "candidates": 64, "replan_every": 1}
+PAPER = {"diffusion_steps": 20, "guidance": {"steps": 2, "scale": 0.1, "stop": 2}, "candidates": 4, "replan_every": 1}
 # The step: one in which the networks that plan move, or in which they become copies.
 STEPS = {"diffuser": 1000, "diffuser-attention": 990}
 VARIANTS = tuple(STEPS)
@@ -53,7 +53,7 @@ def make_config(variant, size):
         "algorithm": "diffuser",
         "observation_dim": 11 if paper else 5,
         "action_dim": 3 if paper else 2,
-        "batch_size": 64 if paper else 6,
+        "batch_size": 8 if paper else 6,
         "total_steps": 2000,
         "step": STEPS[variant],
         "adam": ADAM,
