@@ -16,8 +16,8 @@ Examples:
   # List the runs and their states.
   learner sweep studies/demo.toml --list
 
-  # The runs of one task and seed: what one machine trains overnight.
-  learner sweep studies/table1.toml --only task=hopper-medium-v2 --only seed=0
+  # A part of it: one method on one task, with one seed.
+  learner sweep studies/table1.toml --only task=hopper-medium-v2 --only seed=0 --only method=iql
 
   # All runs, but short ones, into a folder of their own.
   learner sweep studies/table1.toml short --set steps=200 --set eval_interval=100
