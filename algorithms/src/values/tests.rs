@@ -8,6 +8,7 @@ use crate::ALGORITHMS;
 fn values() -> Values {
     let file = toml! {
         about = "an example"
+        gflop = "1"
         given = ["*-v2", "antmaze-*"]
         steps = 1
         seed = 0

@@ -5,7 +5,7 @@ use super::*;
 
 /// The file of an algorithm whose authors give values for these tasks.
 fn values(given: &[&str]) -> Values {
-    toml::from_str(&format!("about = \"an example\"\ngiven = {given:?}")).unwrap()
+    toml::from_str(&format!("about = \"an example\"\ngflop = \"1\"\ngiven = {given:?}")).unwrap()
 }
 
 #[test]
