@@ -59,7 +59,7 @@ struct Config {
     terminal_penalty: NotNegative,
     /// Weight of the first action in the model's loss.
     first_action_weight: Positive,
-    /// Of both networks.
+    /// Learning rate of both networks.
     learning_rate: Positive,
     /// Updates in which the value network learns, the first of a run.
     value_updates: Steps,

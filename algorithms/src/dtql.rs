@@ -74,9 +74,9 @@ struct Config {
     alpha: NotNegative,
     /// Strength of −log π_θ(a|s) at the data's actions.
     likelihood: NotNegative,
-    /// Of both policies.
+    /// Learning rate of both policies.
     learning_rate: Positive,
-    /// Of critics and V.
+    /// Learning rate of critics and V.
     critic_learning_rate: Positive,
     /// Whether all learning rates fall to 0 along a cosine, from the end of pre-training on.
     cosine: bool,

@@ -107,7 +107,7 @@ pub(super) struct Drawn {
 }
 
 impl Normal {
-    /// The same distributions as constants.
+    /// Makes constants of the distributions.
     pub fn detach(&self) -> Self {
         Self { mean: self.mean.detach(), log_std: self.log_std.detach() }
     }

@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from networks import ADAM, adam_step, compiled, follow, mish, near, random_moments, single
+from networks import adam_step, compiled, configuration, follow, mish, near, random_moments, single
 
 TAPS = 5
 # Large rates, so that a mistake in an optimiser or an average is far larger than float32's rounding.
@@ -49,16 +49,9 @@ NETWORKS = {
 def make_config(variant, size):
     size = "small" if size == "narrow" else size
     paper = size == "hopper"
-    return {
-        "algorithm": "diffuser",
-        "observation_dim": 11 if paper else 5,
-        "action_dim": 3 if paper else 2,
-        "batch_size": 8 if paper else 6,
-        "total_steps": 2000,
-        "step": STEPS[variant],
-        "adam": ADAM,
-        "agent": {"network": NETWORKS[variant, size]} | AGENT | (PAPER if paper else SMALL),
-    }
+    agent = {"network": NETWORKS[variant, size]} | AGENT | (PAPER if paper else SMALL)
+    config = configuration("diffuser", 8 if paper else 6, STEPS[variant], agent)
+    return config if paper else config | {"observation_dim": 5, "action_dim": 2}
 
 
 # Layers over windows x [B, L, C], by the names of their parameters.

@@ -8,10 +8,10 @@ import numpy as np
 
 from diffusion import predict_noise, random_predictor, repeated, schedule
 from networks import (
-    ADAM,
     adam_step,
     clip_by_norm,
     compiled,
+    configuration,
     fast_values,
     follow,
     near,
@@ -51,16 +51,7 @@ VARIANTS = {"dql": (1000, {"samples": 1}), "dql-max-backup": (995, {"samples": 1
 def make_config(variant, size):
     networks = dict.fromkeys(("actor", "critic"), shape([SIZES[size]["hidden"]] * 3))
     step, agent = VARIANTS[variant]
-    return {
-        "algorithm": "dql",
-        "observation_dim": 11,
-        "action_dim": 3,
-        "batch_size": SIZES[size]["batch_size"],
-        "total_steps": 2000,
-        "step": step,
-        "adam": ADAM,
-        "agent": networks | AGENT | agent,
-    }
+    return configuration("dql", SIZES[size]["batch_size"], step, networks | AGENT | agent)
 
 
 # The policy: the reverse chain, with the variance of the posterior.

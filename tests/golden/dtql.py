@@ -8,9 +8,9 @@ import numpy as np
 
 from implicit import log_density
 from networks import (
-    ADAM,
     adam_step,
     compiled,
+    configuration,
     ensemble,
     follow,
     mlp,
@@ -64,16 +64,7 @@ def make_config(variant, size):
         "critic": shape(hidden, "mish", True) | {"norm_epsilon": "torch"},
         "value": shape(hidden),
     }
-    return {
-        "algorithm": "dtql",
-        "observation_dim": 11,
-        "action_dim": 3,
-        "batch_size": SIZES[size]["batch_size"],
-        "total_steps": 2000,
-        "step": step,
-        "adam": ADAM,
-        "agent": networks | AGENT | switches,
-    }
+    return configuration("dtql", SIZES[size]["batch_size"], step, networks | AGENT | switches)
 
 
 # Networks. V and the actor are ensembles of one.

@@ -9,9 +9,9 @@ import jax.numpy as jnp
 import numpy as np
 
 from networks import (
-    ADAM,
     adam_step,
     compiled,
+    configuration,
     decayed,
     ensemble,
     fast_values,
@@ -55,16 +55,7 @@ def value_networks(size):
 
 
 def make_config(algorithm, size, agent):
-    return {
-        "algorithm": algorithm,
-        "observation_dim": 11,
-        "action_dim": 3,
-        "batch_size": SIZES[size]["batch_size"],
-        "total_steps": 2000,
-        "step": 700,
-        "adam": ADAM,
-        "agent": agent,
-    }
+    return configuration(algorithm, SIZES[size]["batch_size"], 700, agent)
 
 
 # Networks.

@@ -103,6 +103,20 @@ def shape(hidden, activation="mish", norm=False):
     return {"hidden": hidden, "activation": activation, "norm": norm}
 
 
+def configuration(algorithm, batch_size, step, agent):
+    """What a folder's config.json says, at Hopper's sizes."""
+    return {
+        "algorithm": algorithm,
+        "observation_dim": 11,
+        "action_dim": 3,
+        "batch_size": batch_size,
+        "total_steps": 2000,
+        "step": step,
+        "adam": ADAM,
+        "agent": agent,
+    }
+
+
 # Random numbers, rounded to float32 before anything is computed from them: both sides start from the same values.
 
 

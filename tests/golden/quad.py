@@ -9,10 +9,10 @@ import numpy as np
 import guidance
 from diffusion import denoise, fast_noise, predict_noise, random_predictor, sample, schedule
 from networks import (
-    ADAM,
     adam_step,
     clip_by_norm,
     compiled,
+    configuration,
     decayed,
     fast_values,
     follow,
@@ -80,16 +80,8 @@ def make_config(variant, size):
     batch_size = sizes.pop("batch_size")
     sizes.pop("select")
     hidden = [sizes.pop("hidden")] * 3
-    return {
-        "algorithm": "quad",
-        "observation_dim": 11,
-        "action_dim": 3,
-        "batch_size": batch_size,
-        "total_steps": 2000,
-        "step": VARIANTS[variant].step,
-        "adam": ADAM,
-        "agent": {"actor": shape(hidden), "critic": shape(hidden)} | AGENT | sizes | VARIANTS[variant].agent,
-    }
+    agent = {"actor": shape(hidden), "critic": shape(hidden)} | AGENT | sizes | VARIANTS[variant].agent
+    return configuration("quad", batch_size, VARIANTS[variant].step, agent)
 
 
 # Losses and their gradients.

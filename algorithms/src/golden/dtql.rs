@@ -51,7 +51,7 @@ fn state(dtql: &mut Dtql) -> Vec<(String, Vec<f32>)> {
     dtql.parts().save().unwrap().iter().map(|(name, tensor)| (name.clone(), numbers(tensor))).collect()
 }
 
-/// Of five steps with phases of 2 : 3, two are pre-training, in which the policy and what it chooses by stay as they are.
+/// Two of five steps are pre-training where the phases are 2 : 3; in these the policy and what it chooses by stay as they are.
 #[test]
 fn the_policy_begins_to_learn_when_pre_training_ends() {
     let golden = goldens("dtql").remove(0);

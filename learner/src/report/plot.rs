@@ -12,7 +12,7 @@ use plotters::style::register_font;
 use quad_run::results::statistics::Estimate;
 
 const SIZE: (u32, u32) = (900, 540);
-/// Of a picture's panels, so many stand side by side; each is half as wide and high as a picture.
+/// Panels of a picture that stand side by side; each is half as wide and high as a picture.
 const COLUMNS: usize = 3;
 /// Pixels of a PNG for each of an SVG.
 const FINER: u32 = 2;
