@@ -7,8 +7,8 @@ use serde::{Deserialize, Serialize};
 use std::fmt;
 use std::str::FromStr;
 
-/// How many actions are drawn in each state, and which of them is taken, or the mean of which. It travels in a policy's file; an operator may have the
-/// policy scored with another.
+/// How many actions are drawn in each state, and which of them is taken, or the mean of which. It travels in a policy's file; an
+/// operator may have the policy scored with another.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Choice {
