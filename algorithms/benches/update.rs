@@ -12,7 +12,7 @@ use quad_dataset::{Arrays, Transitions};
 use quad_kernels::activation::{Activation, activate, activate_with_slope};
 use quad_kernels::product::{Matrix::RowMajor, by_gemm};
 use quad_policy::{
-    Adam, AdamStep, DiffusionShape, Ensemble, Gradients, Layout, NoisePredictor, Precision, Weighted, Weights,
+    Adam, AdamStep, DiffusionShape, Ensemble, Gradients, Layout, NoisePredictor, Precision, Weighted, Weights, open_gpu,
 };
 use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
@@ -98,7 +98,7 @@ fn updates(criterion: &mut Criterion) {
     }
     // An update ends with its numbers on the host, so that nothing of it is left for the GPU to do.
     if cfg!(feature = "cuda") {
-        groups.push(("update on cuda", Device::new_cuda(0).expect("a GPU"), Precision::F32));
+        groups.push(("update on cuda", open_gpu().expect("a GPU"), Precision::F32));
     }
     for (group, device, precision) in groups {
         let mut group = criterion.benchmark_group(group);

@@ -14,7 +14,7 @@ use candle_core::{Device, Tensor};
 use quad_dataset::{Arrays, Transitions};
 use quad_policy::{
     Choice, Ensemble, EnsembleShape, Header, Layout, NoisePredictor, PolicyConfig, Precision, SquashedActor, Tensors,
-    Weights, load_policy, read_tensors,
+    Weights, load_policy, open_gpu, read_tensors,
 };
 pub(super) use reader::{Golden, MAKE, goldens, run};
 
@@ -50,7 +50,7 @@ pub(super) fn fresh_ones(algorithm: &str) -> Vec<Golden> {
 pub(super) fn devices() -> Vec<Device> {
     let mut devices = vec![Device::Cpu];
     if cfg!(feature = "cuda") {
-        match Device::new_cuda(0) {
+        match open_gpu() {
             Ok(gpu) => devices.push(gpu),
             Err(error) => {
                 let required = std::env::var_os("QUAD_REQUIRE_PEERS").is_some_and(|value| value == "1");

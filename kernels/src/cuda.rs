@@ -6,8 +6,10 @@
 
 use crate::activation::Activation;
 use crate::optimiser::AdamRates;
+use cudarc::driver::result::{device, mem_pool};
+use cudarc::driver::sys::CUmemPool_attribute;
 use cudarc::driver::{
-    CudaModule, CudaSlice, CudaStream, CudaView, CudaViewMut, DriverError, LaunchConfig, PushKernelArg,
+    CudaContext, CudaFunction, CudaSlice, CudaStream, CudaView, CudaViewMut, DriverError, LaunchConfig, PushKernelArg,
 };
 use cudarc::nvrtc::{CompileError, compile_ptx};
 use std::sync::{Arc, Mutex, PoisonError};
@@ -51,15 +53,50 @@ pub struct ReverseStep {
     pub bound: f32,
 }
 
-/// The translated kernels. A process trains on one GPU.
-fn module(stream: &CudaStream) -> Result<Arc<CudaModule>> {
-    static MODULE: Mutex<Option<Arc<CudaModule>>> = Mutex::new(None);
-    let mut module = MODULE.lock().unwrap_or_else(PoisonError::into_inner);
-    if let Some(module) = &*module {
-        return Ok(module.clone());
+/// The translated kernels.
+struct Kernels {
+    activate: CudaFunction,
+    reverse_step: CudaFunction,
+    squares: CudaFunction,
+    adam: CudaFunction,
+    ema: CudaFunction,
+}
+
+/// The kernels, which the first call translates. A process trains on one GPU.
+fn kernels(stream: &CudaStream) -> Result<Arc<Kernels>> {
+    static KERNELS: Mutex<Option<Arc<Kernels>>> = Mutex::new(None);
+    let mut kernels = KERNELS.lock().unwrap_or_else(PoisonError::into_inner);
+    if let Some(kernels) = &*kernels {
+        return Ok(kernels.clone());
     }
-    let loaded = stream.context().load_module(compile_ptx(include_str!("cuda.cu"))?)?;
-    Ok(module.insert(loaded).clone())
+    let module = stream.context().load_module(compile_ptx(include_str!("cuda.cu"))?)?;
+    let translated = Kernels {
+        activate: module.load_function("activate")?,
+        reverse_step: module.load_function("reverse_step")?,
+        squares: module.load_function("squares")?,
+        adam: module.load_function("adam")?,
+        ema: module.load_function("ema")?,
+    };
+    Ok(kernels.insert(Arc::new(translated)).clone())
+}
+
+/// Spares a process that computes on one stream two costs: without this, the driver gives the memory that is free back
+/// whenever the host waits for the GPU, so that each update begins without any; and each array has two events, which would
+/// order streams.
+///
+/// # Errors
+/// The driver refuses.
+pub fn prepare(context: &CudaContext) -> Result<()> {
+    let mut all = u64::MAX;
+    let threshold = CUmemPool_attribute::CU_MEMPOOL_ATTR_RELEASE_THRESHOLD;
+    // SAFETY: the pool is that of the context's device, and this attribute is an unsigned number of 64 bits.
+    unsafe {
+        let pool = device::get_default_mem_pool(context.cu_device())?;
+        mem_pool::set_attribute(pool, threshold, (&raw mut all).cast())?;
+    }
+    // SAFETY: cudarc records events only where there are streams that it has made, and there are none.
+    unsafe { context.disable_event_tracking() };
+    Ok(())
 }
 
 /// Enough blocks that each number has a thread.
@@ -86,12 +123,12 @@ pub fn activate(
         Some(Activation::Tanh) => 3,
         None => 4,
     };
-    let function = module(stream)?.load_function("activate")?;
+    let kernels = kernels(stream)?;
     // SAFETY: the kernel writes every number.
     let mut out = unsafe { stream.alloc::<f32>(if slope { 2 * count } else { count })? };
     let (mut y, mut derivative) = out.split_at_mut(count);
     let (all, member, width, none) = (count as u32, (count / members) as u32, width as u32, 0_u64);
-    let mut launch = stream.launch_builder(&function);
+    let mut launch = stream.launch_builder(&kernels.activate);
     launch.arg(z).arg(bias).arg(&mut y);
     if slope {
         launch.arg(&mut derivative)
@@ -112,11 +149,11 @@ pub fn reverse(
 ) -> Result<CudaSlice<f32>> {
     let count = x.len();
     assert!(epsilon.len() == count && z.len() == count, "equally many numbers");
-    let function = module(stream)?.load_function("reverse_step")?;
+    let kernels = kernels(stream)?;
     // SAFETY: the kernel writes every number.
     let mut out = unsafe { stream.alloc::<f32>(count)? };
     let all = count as u32;
-    let mut launch = stream.launch_builder(&function);
+    let mut launch = stream.launch_builder(&kernels.reverse_step);
     launch.arg(x).arg(epsilon).arg(z).arg(&mut out).arg(&all);
     launch.arg(&step.deviation).arg(&step.scale).arg(&step.clean_bound).arg(&step.from_clean);
     launch.arg(&step.from_noisy).arg(&step.noise).arg(&step.bound);
@@ -137,17 +174,16 @@ pub fn adam(
 ) -> Result<CudaSlice<f32>> {
     let count = gradient.len();
     assert!(parameters.len() == count && moments.len() == 2 * count, "two moments of each number");
-    let module = module(stream)?;
-    let (squares, adam) = (module.load_function("squares")?, module.load_function("adam")?);
+    let kernels = kernels(stream)?;
     // SAFETY: the kernels write every number.
     let (mut partial, mut norm) = unsafe { (stream.alloc::<f32>(SUMS)?, stream.alloc::<f32>(1)?) };
     let all = count as u32;
-    let mut launch = stream.launch_builder(&squares);
+    let mut launch = stream.launch_builder(&kernels.squares);
     launch.arg(gradient).arg(&mut partial).arg(&all);
     // SAFETY: the arguments are those of the kernel, which has a block for each of the sums.
     unsafe { launch.launch(threads(SUMS * BLOCK as usize))? };
     let (mut first, mut second) = moments.split_at_mut(count);
-    let mut launch = stream.launch_builder(&adam);
+    let mut launch = stream.launch_builder(&kernels.adam);
     launch.arg(parameters).arg(&mut first).arg(&mut second).arg(gradient).arg(&partial).arg(&mut norm);
     launch.arg(&all).arg(&clip).arg(&rates.rate).arg(&rates.decay).arg(&rates.correction);
     // SAFETY: the arguments are those of the kernel, and the lengths were checked above.
@@ -164,9 +200,9 @@ pub fn ema(
 ) -> Result<()> {
     let count = target.len();
     assert!(online.len() == count, "equally many numbers");
-    let function = module(stream)?.load_function("ema")?;
+    let kernels = kernels(stream)?;
     let all = count as u32;
-    let mut launch = stream.launch_builder(&function);
+    let mut launch = stream.launch_builder(&kernels.ema);
     launch.arg(target).arg(online).arg(&all).arg(&rate);
     // SAFETY: the arguments are those of the kernel, and the lengths were checked above.
     unsafe { launch.launch(threads(count))? };

@@ -1,10 +1,19 @@
 //! Candle's tensors on a GPU as the kernels of `quad_kernels::cuda` take them.
 
 use candle_core::cuda_backend::cudarc::driver::{CudaSlice, CudaStream, CudaView, CudaViewMut};
-use candle_core::{CpuStorage, CudaStorage, Error, InplaceOp1, Layout, Result, Shape, Storage, Tensor, bail};
+use candle_core::{CpuStorage, CudaStorage, Device, Error, InplaceOp1, Layout, Result, Shape, Storage, Tensor, bail};
 use quad_kernels::cuda::CudaError;
 use std::cell::Cell;
 use std::sync::Arc;
+
+/// Makes candle's calls of the driver fewer.
+///
+/// # Errors
+/// The driver refuses.
+pub(crate) fn prepare(device: &Device) -> Result<()> {
+    let Device::Cuda(device) = device else { bail!("the device is not a GPU") };
+    quad_kernels::cuda::prepare(device.cuda_stream().context()).map_err(Error::wrap)
+}
 
 fn range(layout: &Layout) -> Result<std::ops::Range<usize>> {
     match layout.contiguous_offsets() {

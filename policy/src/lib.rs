@@ -23,8 +23,8 @@
 //! - [`Precision`] (`precision`): how exactly networks are evaluated that no gradient is taken of.
 //! - Below: `layers` (where each layer lies in the vector), `network` (one network on one tile of rows, over the crate
 //!   `kernels`), `saved` and `kept_gradient` (what forward and backward passes leave), `operation` (candle's custom
-//!   operations), `packed` (kernels packed once), `slices` (candle's tensors as slices), `gpu` (the same on a GPU), `statistics` (mean and variance
-//!   over an ensemble).
+//!   operations), `packed` (kernels packed once), `slices` (candle's tensors as slices), `gpu` (the same on a GPU), `device`
+//!   (a GPU to compute on), `statistics` (mean and variance over an ensemble).
 //!
 //! Everything that draws random numbers takes them as an argument or from a seeded generator.
 
@@ -36,6 +36,7 @@ mod choice;
 mod composed;
 mod convolution;
 mod dense;
+mod device;
 mod differentiable;
 mod diffusion;
 mod dpm_solver;
@@ -89,6 +90,7 @@ mod window_layers;
 mod window_networks;
 
 pub use choice::{Choice, Reduce, Rule};
+pub use device::open_gpu;
 pub use diffusion::{DiffusionPolicy, DiffusionShape};
 pub use dpm_solver::{ContinuousNoise, DpmSolver};
 pub use edm::{Denoiser, DenoiserShape, NoiseLevels};

@@ -33,5 +33,5 @@ fn gpu() -> anyhow::Result<candle_core::Device> {
         true => "does `nvidia-smi` show a GPU on this machine, and a driver for CUDA 13? --device cpu needs neither",
         false => "build a learner that can by deploy/cuda.sh, or train with --device cpu",
     };
-    candle_core::Device::new_cuda(0).context("this learner cannot train on a GPU here").hint(hint)
+    quad_policy::open_gpu().context("this learner cannot train on a GPU here").hint(hint)
 }

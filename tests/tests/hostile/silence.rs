@@ -1,5 +1,6 @@
 //! A peer that reads nothing.
 
+use std::path::Path;
 use std::process::Command;
 use std::{env, fs};
 
@@ -11,12 +12,16 @@ use quad_tests::system::Scratch;
 use quad_tests::{PATIENCE, eventually};
 
 const STRANGER: &str = "QUAD_TESTS_STRANGER";
+/// The file by which the stranger learns that the learner knows it.
+const KNOWN: &str = "known";
 
 /// Asks for weights again and again, wants all that is published, and then reads nothing: the process stops itself.
 async fn read_nothing(endpoint: &str) {
     let (session, run) = (client(endpoint).await, name("run"));
     let _all = session.declare_subscriber("quad/run/**").callback(drop).await.unwrap();
     let _token = session.liveliness().declare_token(keys::live_evaluator(&run, &name("stranger"))).await.unwrap();
+    // Without this, a busy machine might stop the process before it has sent the token.
+    eventually("the learner knows the stranger", PATIENCE, || Path::new(KNOWN).exists().then_some(()));
     for _ in 0..150 {
         session.get(keys::weights_at(&run, ENDLESS.eval_interval)).timeout(PATIENCE).callback(drop).await.unwrap();
     }
@@ -35,8 +40,10 @@ async fn a_peer_that_reads_nothing_holds_up_neither_jobs_nor_snapshots() {
     learner.wait_for_scores(0);
     let mut command = Command::new(env::current_exe().unwrap());
     command.args(["--exact", "silence::a_peer_that_reads_nothing_holds_up_neither_jobs_nor_snapshots"]);
-    command.env(STRANGER, learner.endpoint());
+    command.env(STRANGER, learner.endpoint()).current_dir(scratch.path());
     let stranger = Process::start("stranger", scratch.path(), command);
+    learner.process.wait_for_log("evaluator stranger is here", PATIENCE);
+    fs::write(scratch.path().join(KNOWN), "").unwrap();
     let stat = format!("/proc/{}/stat", stranger.id());
     let scored = eventually("the stranger has stopped", PATIENCE, || {
         fs::read_to_string(&stat).ok()?.contains(") T ").then(|| learner.scores().len())
