@@ -36,14 +36,16 @@ class Walk:
 class Learner:
     """A learner at work, and the folder of its run."""
 
-    def __init__(self, folder, data, *arguments, environment="walk", steps=60, interval=20):
+    def __init__(self, folder, data, *arguments, environment="walk", steps=60, interval=20, episodes=8):
         self.folder = folder
         command = ["learner", "train", "--task", "own-data", "--env", environment, "--dataset", str(data)]
         command += ["--run-dir", str(folder), "--listen", "tcp/127.0.0.1:0", *SMALL]
-        command += ["--steps", str(steps), "--eval-interval", str(interval), "--episodes", "8", *arguments]
+        command += ["--steps", str(steps), "--eval-interval", str(interval), "--episodes", str(episodes)]
+        command += arguments
         self.process = subprocess.Popen(command, stderr=subprocess.PIPE, stdout=subprocess.DEVNULL, text=True)
         endpoints = folder / "endpoints.json"
         wait(lambda: endpoints.exists() or self.process.poll() is not None)
+        assert endpoints.exists(), self.process.stderr.read()
         self.endpoint = json.loads(endpoints.read_text())["zenoh"][0]
 
     def end(self, timeout=60):

@@ -28,7 +28,8 @@ class Worker:
     def start(self) -> None:
         self._again = None
         self._started = time.monotonic()
-        environment = {"RAYON_NUM_THREADS": "1", "OMP_NUM_THREADS": "1", **os.environ}
+        # One thread moves all of a worker's environments, whatever this process uses: they share NumPy's generator.
+        environment = {"OMP_NUM_THREADS": "1", **os.environ, "RAYON_NUM_THREADS": "1"}
         command = [sys.executable, "-m", "quad_rl._worker"]
         # A session of its own: a terminal's Ctrl-C is this process's to pass on.
         self.process = subprocess.Popen(

@@ -13,11 +13,12 @@ import sys
 import threading
 import time
 import traceback
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from typing import IO, Any
 
 import cloudpickle  # type: ignore[import-untyped]
 import numpy as np
+from numpy.random.mtrand import set_bit_generator
 from numpy.typing import NDArray
 
 from quad_rl import _quad_rl
@@ -38,12 +39,28 @@ def _call(function: Callable[..., Any], *arguments: Any, **keywords: Any) -> Any
         raise EnvironmentFailed(f"{type(error).__name__}: {error} ({place})") from None
 
 
+def _draw_from(generator: np.random.MT19937, seed: int) -> None:
+    """Has NumPy's global functions draw from this generator, as they would after `np.random.seed(seed)`."""
+    set_bit_generator(generator)
+    np.random.seed(seed)
+
+
+def _action_spaces(environment: Any) -> Iterator[Any]:
+    """An environment's, and those of the environments that it wraps."""
+    while environment is not None:
+        space = getattr(environment, "action_space", None)
+        if hasattr(space, "seed"):
+            yield space
+        environment = getattr(environment, "env", None)
+
+
 class Made:
     """An environment of the user's, with observations and actions as plain rows of numbers."""
 
     def __init__(self, environment: Any, score: str | tuple[float, float]) -> None:
         self.environment = environment
         self.score_rule = score
+        self.generator = np.random.MT19937()
         self.info: dict[str, Any] = {}
         self.broken = False
         self.space = getattr(environment, "observation_space", None)
@@ -72,11 +89,22 @@ class Made:
             observation = flatten(self.space, observation)
         return np.ascontiguousarray(observation, dtype=np.float64).ravel()
 
+    def _turn(self, method: Callable[..., Any], *arguments: Any, **keywords: Any) -> Any:
+        # The process's environments take turns, one a step.
+        set_bit_generator(self.generator)
+        self.broken = True
+        result = _call(method, *arguments, **keywords)
+        self.broken = False
+        return result
+
     def reset(self, seed: int) -> NDArray[np.float64]:
         # Many simulators take seeds of 32 bits at most.
-        self.broken = True
-        observation, _ = _call(self.environment.reset, seed=seed % 2**31)
-        self.broken = False
+        seed %= 2**31
+        # Some draw from NumPy's global generator or from the action space, which Gymnasium's reset does not seed.
+        _draw_from(self.generator, seed)
+        for space in _action_spaces(self.environment):
+            space.seed(seed)
+        observation, _ = self._turn(self.environment.reset, seed=seed)
         return self._row(observation)
 
     def step(self, action: NDArray[np.float32]) -> tuple[NDArray[np.float64], float, bool, bool]:
@@ -84,9 +112,7 @@ class Made:
             action = action.reshape(self.action_shape)
         if self.bounds is not None:
             action = np.clip(action, *self.bounds)
-        self.broken = True
-        observation, reward, terminated, truncated, self.info = _call(self.environment.step, action)
-        self.broken = False
+        observation, reward, terminated, truncated, self.info = self._turn(self.environment.step, action)
         return self._row(observation), float(reward), bool(terminated), bool(truncated)
 
     def score(self, episode_return: float) -> float:
@@ -114,7 +140,10 @@ class Factory:
         if seed != self.seed:
             self.close()
             self.seed = seed
-        return self.free.pop() if self.free else Made(_call(self.make_environment, seed), self.score)
+        if self.free:
+            return self.free.pop()
+        _draw_from(np.random.MT19937(), seed % 2**31)
+        return Made(_call(self.make_environment, seed), self.score)
 
     def release(self, made: Made) -> None:
         if made.broken:
