@@ -49,6 +49,8 @@ dataset.save("y")
 problems = dataset.inspect()["problems"]
 rows: list[dict[str, object]] = [dict(row) for row in quad_rl.runs("z")]
 value: float = quad_rl.metrics("z")[0]["train/q_mean"]
+run: quad_rl.Run = quad_rl.train(dataset, run_dir="r", steps=5, scale="states", fresh=True, set={"batch_size": 64})
+policy, address, score = run.policy(step=5), run.page.upper(), run.scores[-1]["score"] + run.metrics[0]["step"]
 """
 WRONG = """
 import quad_rl
@@ -57,6 +59,7 @@ quad_rl.Policy.load("x").act([0.0], 3)
 quad_rl.Dataset.from_arrays(observations=[])
 quad_rl.runs(5)
 quad_rl.metrics(["z"])
+quad_rl.train("x")
 """
 
 
@@ -69,17 +72,17 @@ def test_a_type_checker_accepts_right_calls_and_no_others(tmp_path):
         return [line for line in checked.stdout.splitlines() if ": error: " in line]
 
     assert errors(SAMPLE) == []
-    assert {line.split(":")[1] for line in errors(WRONG)} == {"3", "4", "5", "6", "7"}
+    assert {line.split(":")[1] for line in errors(WRONG)} == {"3", "4", "5", "6", "7", "8"}
 
 
 def test_everything_public_says_what_it_takes(tmp_path):
     import quad_rl
 
-    for name in ("Policy", "Episodes", "Dataset"):
+    for name in ("Policy", "Episodes", "Dataset", "Run"):
         for member in dir(getattr(quad_rl, name)):
             documented = member.startswith("_") or getattr(getattr(quad_rl, name), member).__doc__
             assert documented, f"{name}.{member}"
-    assert quad_rl.runs.__doc__ and quad_rl.metrics.__doc__
+    assert quad_rl.runs.__doc__ and quad_rl.metrics.__doc__ and quad_rl.train.__doc__
     checked = subprocess.run([sys.executable, "-m", "mypy", "--strict", "--cache-dir", str(tmp_path), "-p", "quad_rl"],
                              capture_output=True, text=True, timeout=100)
     assert checked.returncode == 0, checked.stdout

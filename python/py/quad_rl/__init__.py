@@ -1,8 +1,9 @@
-"""QUAD from Python: trained policies, evaluators for your own environments, data from arrays, results of runs."""
+"""QUAD from Python: training, trained policies, evaluators for your own environments, data from arrays, results of runs."""
 
 from quad_rl._dataset import Dataset
 from quad_rl._evaluate import Evaluators, evaluate
 from quad_rl._quad_rl import Episodes, Policy
 from quad_rl._runs import metrics, runs
+from quad_rl._train import Run, train
 
-__all__ = ["Dataset", "Episodes", "Evaluators", "Policy", "evaluate", "metrics", "runs"]
+__all__ = ["Dataset", "Episodes", "Evaluators", "Policy", "Run", "evaluate", "metrics", "runs", "train"]

@@ -1,0 +1,209 @@
+"""Training from Python: the program `learner train`, started, shown and stopped."""
+
+from __future__ import annotations
+
+import ctypes
+import glob
+import json
+import os
+import re
+import shutil
+import signal
+import subprocess
+import sys
+import sysconfig
+import tempfile
+from collections.abc import Iterator, Mapping
+from functools import cached_property
+from os import PathLike
+from pathlib import Path
+from typing import Any
+
+from quad_rl import _quad_rl
+from quad_rl._dataset import Dataset
+from quad_rl._runs import metrics, runs
+
+_LINE = re.compile(r"\S+Z +([A-Z]+) (.*)")
+_STEP = re.compile(r"step (\d+)/(\d+) ")
+_PAGE = re.compile(r"page: (\S+)")
+# Characters of the bar.
+_BAR = 20
+# Found here, since a process that was just forked should look for nothing.
+_PRCTL = ctypes.CDLL(None).prctl
+_PR_SET_PDEATHSIG = 1
+
+
+class Run:
+    """A run in its folder: what `train` gives. Made of any run's folder, it shows a run that was trained elsewhere."""
+
+    def __init__(self, folder: str | PathLike[str]) -> None:
+        self.folder = Path(folder)
+
+    def policy(self, step: int | None = None, precision: str = "f32") -> _quad_rl.Policy:
+        """The policy after that gradient step, of which there must be a snapshot; by default the last one.
+
+        Raises FileNotFoundError if there is none, else as `Policy.load`.
+        """
+        there = sorted((self.folder / "snapshots").glob(f"step_{'*' if step is None else f'{step:09}'}.safetensors"))
+        if not there:
+            after = "" if step is None else f" after step {step}"
+            raise FileNotFoundError(f"{self.folder} has no snapshot{after}")
+        return _quad_rl.Policy.load(there[-1], precision)
+
+    @property
+    def scores(self) -> list[dict[str, Any]]:
+        """Its rows of `runs`: a dictionary for each evaluation."""
+        return [row for row in runs(glob.escape(str(self.folder))) if row["step"] is not None]
+
+    @property
+    def metrics(self) -> list[dict[str, float]]:
+        """What `metrics` gives for it: a dictionary for each step that has metrics."""
+        return metrics(self.folder)
+
+    @cached_property
+    def page(self) -> str:
+        """Address of its page, which `learner page` serves from the first access to the end of this process."""
+        process = _start("page", str(self.folder), "--http=127.0.0.1:0")
+        said = []
+        for _, text in _said(process):
+            if page := _PAGE.match(text):
+                return page[1]
+            said.append(text)
+        raise _error(process, said)
+
+    def __repr__(self) -> str:
+        return f"Run({str(self.folder)!r})"
+
+
+def train(
+    dataset: Dataset | str | PathLike[str],
+    *,
+    run_dir: str | PathLike[str],
+    algorithm: str | None = None,
+    steps: int | None = None,
+    scale: str | None = None,
+    task: str | None = "own-data",
+    **options: Any,
+) -> Run:
+    """Trains by the program `learner train`, to the end of the run and of its evaluations, and shows how far it is.
+
+    dataset: what `--dataset` takes, or a Dataset, which the learner gets as a temporary file.
+    run_dir: folder of the run. If it contains a run of the same configuration, that run continues.
+    algorithm, steps, scale, task: as the program's; `learner train --help` says what they are.
+    options: any other option of the program, with _ for -: `eval_interval=5000`, `fresh=True`. A dictionary gives an
+        option several times: `agent={"tau": 0.5}, set={"batch_size": 64}`.
+
+    An interrupt (Ctrl-C) ends the learner in order, and the same call continues the run; a second one ends it at once. The
+    learner also ends with this process. Raises RuntimeError with the learner's own error and hint.
+    """
+    own = {"task": task, "algorithm": algorithm, "steps": steps, "scale": scale, "run_dir": os.fspath(run_dir)}
+    with tempfile.TemporaryDirectory() as folder:
+        if isinstance(dataset, Dataset):
+            path = Path(folder, "dataset.hdf5")
+            dataset.save(path)
+            dataset = path
+        process = _start("train", f"--dataset={os.fspath(dataset)}", *_flags(own | options))
+        display = _Display()
+        error: list[str] = []
+        try:
+            display.follow(process, error)
+        except BaseException:
+            process.terminate()  # In order.
+            try:
+                display.follow(process, error)
+            except KeyboardInterrupt:
+                process.terminate()  # At once.
+            process.wait()
+            display.say("\n".join(error))
+            raise
+    if process.wait() != 0:
+        raise _error(process, error)
+    return Run(run_dir)
+
+
+class _Display:
+    """Shows what a learner says. In a notebook or on a terminal, its line of progress is a bar that stays in its place."""
+
+    def __init__(self) -> None:
+        notebook = "ipykernel" in sys.modules
+        self._out = sys.stdout if notebook else sys.stderr
+        self._draws = notebook or self._out.isatty()
+        self._bar = ""
+
+    def follow(self, process: subprocess.Popen[str], error: list[str]) -> None:
+        """Until it has ended. What is no line of its log is the error, and not shown."""
+        for level, text in _said(process):
+            step = _STEP.match(text)
+            if not level:
+                error.append(text)
+            elif step and self._draws:
+                done = _BAR * int(step[1]) // int(step[2])
+                text = f"{'█' * done}{'░' * (_BAR - done)} {text}"
+                # A line that a terminal breaks cannot be drawn over.
+                self._write(text[: shutil.get_terminal_size().columns - 1] if self._out.isatty() else text)
+            else:
+                self.say(text if level == "INFO" else f"{level} {text}")
+
+    def say(self, text: str) -> None:
+        self._write(text, "\n")
+        self._bar = ""
+
+    def _write(self, text: str, end: str = "") -> None:
+        start = "\r" if self._bar else ""
+        print(start + text.ljust(len(self._bar)), end=end, file=self._out, flush=True)
+        self._bar = text
+
+
+def _start(*arguments: str) -> subprocess.Popen[str]:
+    """Starts the learner beside this Python, or else on the PATH."""
+    path = os.pathsep.join([sysconfig.get_path("scripts"), os.environ.get("PATH", "")])
+    program = shutil.which("learner", path=path)
+    if program is None:
+        raise RuntimeError(f"there is no program `learner` in {path}\nhint: the wheel of deploy/wheel.sh contains it")
+    return subprocess.Popen(
+        [program, *arguments],
+        stdin=subprocess.DEVNULL,
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.PIPE,
+        encoding="utf-8",
+        errors="replace",
+        # A session of its own: a terminal's Ctrl-C is this process's to pass on.
+        start_new_session=True,
+        preexec_fn=_end_with_parent,
+    )
+
+
+def _end_with_parent() -> None:
+    """Has the system end this process in order when the thread is gone that started it."""
+    _PRCTL(_PR_SET_PDEATHSIG, signal.SIGTERM)
+
+
+def _said(process: subprocess.Popen[str]) -> Iterator[tuple[str, str]]:
+    """Level and text of each line of its log; a line that is no log's has no level."""
+    assert process.stderr
+    for line in process.stderr:
+        logged = _LINE.fullmatch(line.rstrip("\n"))
+        yield (logged[1], logged[2]) if logged else ("", line.rstrip("\n"))
+
+
+def _error(process: subprocess.Popen[str], said: list[str]) -> RuntimeError:
+    code = process.wait()
+    how = f"the learner was ended by {signal.Signals(-code).name}" if code < 0 else f"the learner ended with exit code {code}"
+    return RuntimeError("\n".join(said).removeprefix("error: ") or how)
+
+
+def _flags(options: Mapping[str, Any]) -> Iterator[str]:
+    for name, value in options.items():
+        flag = "--" + name.replace("_", "-")
+        if value is True:
+            yield flag
+        elif isinstance(value, Mapping):
+            yield from (f"{flag}={key}={_toml(one)}" for key, one in value.items())
+        elif value is not None and value is not False:
+            yield f"{flag}={value}"
+
+
+def _toml(value: Any) -> str:
+    if isinstance(value, Mapping):
+        return "{" + ", ".join(f"{key} = {_toml(one)}" for key, one in value.items()) + "}"
+    return json.dumps(value)
