@@ -58,7 +58,7 @@ impl CandidatePolicy {
     }
 
     /// The noise of all candidates, `noises × states × candidates × action_dim`.
-    fn noise(&self, states: &mut [EpisodeState]) -> Vec<f32> {
+    fn drawn(&self, states: &mut [EpisodeState]) -> Vec<f32> {
         let (n, row) = (states.len(), self.choice.candidates as usize * self.action_dim());
         let noises = self.networks.actor.noises();
         let mut noise = vec![0.0; noises * n * row];
@@ -152,9 +152,13 @@ impl Policy for CandidatePolicy {
         bytes(sampling + critics.shape().memory(states, candidates) + of_states)
     }
 
+    fn noise(&self) -> Vec<usize> {
+        vec![self.networks.actor.noises(), self.choice.candidates as usize, self.action_dim()]
+    }
+
     fn act(&self, observations: &[f32], states: &mut [EpisodeState], actions: &mut [f32]) -> Result<(), PolicyError> {
         let (action_dim, candidates) = (self.action_dim(), self.choice.candidates as usize);
-        let (drawn, worth) = self.draw(observations, self.noise(states))?;
+        let (drawn, worth) = self.draw(observations, self.drawn(states))?;
         let of_each = drawn.chunks_exact(candidates * action_dim).zip(worth.chunks_exact(candidates)).zip(states);
         for (action, ((drawn, worth), state)) in actions.chunks_exact_mut(action_dim).zip(of_each) {
             mean_of(&self.choice.pick(worth, state)?, drawn, action);
@@ -163,7 +167,7 @@ impl Policy for CandidatePolicy {
     }
 
     fn sample(&self, observations: &[f32], states: &mut [EpisodeState]) -> Result<Sampled, PolicyError> {
-        let (observations, drawn) = self.candidates(observations, self.noise(states))?;
+        let (observations, drawn) = self.candidates(observations, self.drawn(states))?;
         let values = self.values(&observations, &drawn)?;
         let actions = read(&drawn, <[f32]>::to_vec)?;
         check_numbers("a sampled action", &actions)?;

@@ -85,6 +85,15 @@ impl Choice {
         }
     }
 
+    /// How many uniform numbers [`Rule`] takes to choose in a state.
+    pub fn uniforms(&self) -> usize {
+        match self.rule {
+            Rule::Softmax { .. } if self.candidates > 1 => 1,
+            Rule::Average { actions, .. } if self.candidates > 1 => actions.min(self.candidates) as usize,
+            _ => 0,
+        }
+    }
+
     /// Which of a state's candidates are taken: one, or several of which the mean is the action. `worth` has what the rule
     /// compares of each: its value, or -(Q - V)².
     pub(crate) fn pick(&self, worth: &[f32], state: &mut EpisodeState) -> Result<Vec<usize>, PolicyError> {

@@ -24,12 +24,12 @@ impl EpisodeState {
     }
 
     /// Standard normal numbers.
-    pub(crate) fn fill_normal(&mut self, out: &mut [f32]) {
+    pub fn fill_normal(&mut self, out: &mut [f32]) {
         out.fill_with(|| StandardNormal.sample(&mut self.noise));
     }
 
     /// A number in [0, 1).
-    pub(crate) fn uniform(&mut self) -> f64 {
+    pub fn uniform(&mut self) -> f64 {
         self.noise.random()
     }
 }

@@ -189,6 +189,11 @@ impl Policy for Planner {
         bytes(drawn + observations + rows.min(CHUNK as u128) * self.shape.numbers())
     }
 
+    fn noise(&self) -> Vec<usize> {
+        let plans = self.choice.candidates as usize;
+        vec![self.shape.diffusion_steps, plans, self.shape.network.horizon, self.shape.width()]
+    }
+
     /// In a state that has a plan left, its next action; else that of a new plan.
     fn act(&self, observations: &[f32], states: &mut [EpisodeState], actions: &mut [f32]) -> Result<(), PolicyError> {
         let (plans, taken) = (self.choice.candidates as usize, self.taken());

@@ -38,6 +38,12 @@ pub trait Policy: Send + Sync {
         EpisodeState::new(seed)
     }
 
+    /// The shape of the standard normal numbers that [`Self::act`] draws in a state of an episode that begins; empty if it draws
+    /// none. [`Choice::uniforms`] says how many uniform ones follow.
+    fn noise(&self) -> Vec<usize> {
+        Vec::new()
+    }
+
     /// Acts in each of n states.
     ///
     /// `observations` is `n × observation_dim`, `actions` (written) `n × action_dim`; `states` has what the policy carries

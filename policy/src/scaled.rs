@@ -81,6 +81,10 @@ impl Policy for Scaled {
         self.policy.begin(seed)
     }
 
+    fn noise(&self) -> Vec<usize> {
+        self.policy.noise()
+    }
+
     fn act(&self, observations: &[f32], states: &mut [EpisodeState], actions: &mut [f32]) -> Result<(), PolicyError> {
         self.policy.act(&self.observations(observations), states, actions)?;
         self.to_user(actions);

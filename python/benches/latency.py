@@ -1,9 +1,10 @@
-"""Latency of one action and throughput of 1,000 observations, beside the same network in JAX (one jitted function), in one run.
+"""Latency of one action and throughput of 1,000 observations, beside the policy's ONNX model in onnxruntime, which NumPy gives
+its noise, and the same network in JAX (one jitted function), in one run.
 
     python python/benches/latency.py [SNAPSHOT]
 
 Without a file of a diffusion policy that takes the best of its candidates, one of the paper's size is made with `learner`.
-It needs jax (the version in tests/requirements.txt).
+It needs jax (the version in tests/requirements.txt), onnx and onnxruntime.
 """
 
 import json
@@ -17,6 +18,7 @@ from pathlib import Path
 import jax
 import jax.numpy as jnp
 import numpy as np
+import onnxruntime
 from safetensors import safe_open
 
 import quad_rl
@@ -80,6 +82,19 @@ def in_jax(path):
     return partial(jax.jit(act), tensors), partial(jax.jit(values), tensors)
 
 
+def in_onnx(policy, path):
+    """act(observations) of its model."""
+    quad_rl.export_onnx(policy, path)
+    session, rng = onnxruntime.InferenceSession(path), np.random.default_rng(0)
+    noise = policy.noise(1)["noise"].shape[1:]
+
+    def act(observations):
+        drawn = rng.standard_normal((len(observations), *noise), np.float32)
+        return session.run(["actions"], {"observations": observations, "noise": drawn})[0]
+
+    return act
+
+
 def milliseconds(call, rounds):
     for i in range(10):
         call(i)
@@ -95,6 +110,7 @@ def main():
     with tempfile.TemporaryDirectory() as folder:
         path = sys.argv[1] if len(sys.argv) > 1 else paper_sized(Path(folder))
         policy, (act, values) = quad_rl.Policy.load(path), in_jax(path)
+        model = in_onnx(policy, Path(folder) / "policy.onnx")
     states = np.random.default_rng(1).normal(size=(1000, policy.observation_size)).astype(np.float32)
     actions = policy.act(states, seed=0)
     # The same networks, and the same distribution of actions.
@@ -106,6 +122,7 @@ def main():
     for rows, rounds in ((1, 1000), (1000, 15)):
         for name, call in {
             "quad_rl": lambda i: policy.act(states[:rows], seed=i),
+            "ONNX": lambda i: model(states[:rows]),
             "JAX": lambda i: np.asarray(act(keys[i], states[:rows])),
         }.items():
             median, p99 = milliseconds(call, rounds)

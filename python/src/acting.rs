@@ -3,9 +3,10 @@
 use std::process;
 use std::sync::OnceLock;
 
-use numpy::PyArrayDyn;
+use numpy::{PyArray, PyArrayDyn, PyArrayMethods};
 use pyo3::exceptions::{PyRuntimeError, PyValueError};
 use pyo3::prelude::*;
+use pyo3::types::PyDict;
 use quad_policy::{EpisodeState, Policy, PolicyError};
 
 use crate::arrays::Rows;
@@ -67,6 +68,26 @@ pub fn parts<'a>(
 /// What the policy carries through the episodes of these seeds.
 pub fn begin(policy: &dyn Policy, seeds: &[u64]) -> Vec<EpisodeState> {
     seeds.iter().map(|seed| policy.begin(*seed)).collect()
+}
+
+/// What a policy draws in the first step of these episodes, by name: what is not drawn is not there.
+pub fn noise<'py>(py: Python<'py>, policy: &dyn Policy, states: &mut [EpisodeState]) -> PyResult<Bound<'py, PyDict>> {
+    let (shape, draws) = (policy.noise(), policy.choice().map_or(0, |choice| choice.uniforms()));
+    let row = if shape.is_empty() { 0 } else { shape.iter().product() };
+    let (mut normal, mut uniform) = (vec![0.0; states.len() * row], Vec::with_capacity(states.len() * draws));
+    for (i, state) in states.iter_mut().enumerate() {
+        state.fill_normal(&mut normal[i * row..][..row]);
+        // The last f32 below 1 rather than 1 itself.
+        uniform.extend((0..draws).map(|_| (state.uniform() as f32).min(1.0_f32.next_down())));
+    }
+    let inputs = PyDict::new(py);
+    if row > 0 {
+        inputs.set_item("noise", PyArray::from_vec(py, normal).reshape([&[states.len()], &shape[..]].concat())?)?;
+    }
+    if draws > 0 {
+        inputs.set_item("uniform", PyArray::from_vec(py, uniform).reshape([states.len(), draws])?)?;
+    }
+    Ok(inputs)
 }
 
 /// A seed for each of n rows: `seed + i`, or what a sequence says, or fresh ones.

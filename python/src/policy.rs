@@ -10,7 +10,7 @@ use pyo3::types::{PyBytes, PyDict, PyTuple};
 use quad_policy::{Header, Policy, PolicyConfig, PolicyError, Precision, load_policy};
 use quad_protocol::Origin;
 
-use crate::acting::{Array, act, begin, compute, not_seeds, parts, seeds};
+use crate::acting::{Array, act, begin, compute, noise, not_seeds, parts, seeds};
 use crate::arrays::{Like, Rows};
 use crate::choosing::{Changes, as_dictionary, choosing};
 use crate::episodes::Episodes;
@@ -170,6 +170,24 @@ impl PyPolicy {
         rows.array(py, values, &[])
     }
 
+    /// The noise that `act` draws with these arguments in n states: the inputs of what `export_onnx` writes, beside the observations.
+    ///
+    /// A dictionary, empty if the policy draws nothing, of "noise", standard normal numbers [n, ...], and, where the rule draws too,
+    /// "uniform", numbers within [0, 1), [n, draws]; float32. Raises as `act`.
+    #[pyo3(signature = (n, *, candidates = None, rule = None, value = None, seed = None))]
+    fn noise<'py>(
+        &self,
+        py: Python<'py>,
+        n: usize,
+        candidates: Option<i64>,
+        rule: Option<String>,
+        value: Option<String>,
+        seed: Option<&Bound<'py, PyAny>>,
+    ) -> PyResult<Bound<'py, PyDict>> {
+        let policy = choosing(&self.policy, Changes { candidates, rule, value })?;
+        noise(py, &*policy, &mut begin(&*policy, &seeds(seed, n)?))
+    }
+
     /// Begins an episode for each seed (an int, or a sequence of them). In each, the policy draws as an evaluator does from
     /// step to step: the same seed and observations give the same actions, bit for bit.
     ///
@@ -238,6 +256,11 @@ impl PyPolicy {
     #[getter]
     fn choice<'py>(&self, py: Python<'py>) -> PyResult<Option<Bound<'py, PyDict>>> {
         self.policy.choice().map(|choice| as_dictionary(py, choice)).transpose()
+    }
+
+    /// The file that it was loaded from, as `from_bytes` takes it.
+    fn to_bytes<'py>(&self, py: Python<'py>) -> Bound<'py, PyBytes> {
+        PyBytes::new(py, &self.file)
     }
 
     fn __repr__(&self) -> String {

@@ -36,12 +36,13 @@ def arrays(seed=0, n=1200):
     }
 
 
-def train(folder, data, *arguments):
+def train(folder, data, *arguments, layers=True):
+    """The last snapshot of a run, by default with narrow networks."""
     command = ["learner", "train", "--dataset", str(data), "--run-dir", str(folder), "--set", "batch_size=32"]
-    layers = ["--agent", "critic=" + SMALL % ("mish", "false"), "--agent", "actor=" + SMALL % ("mish", "false")]
+    narrow = ["--agent", "critic=" + SMALL % ("mish", "false"), "--agent", "actor=" + SMALL % ("mish", "false")]
     given = [a.split("=")[0] for a in arguments]
-    layers = [x for pair in zip(layers[::2], layers[1::2]) if pair[1].split("=")[0] not in given for x in pair]
-    subprocess.run([*command, *layers, *arguments], check=True, capture_output=True, timeout=60)
+    narrow = [x for pair in zip(narrow[::2], narrow[1::2]) if layers and pair[1].split("=")[0] not in given for x in pair]
+    subprocess.run([*command, *narrow, *arguments], check=True, capture_output=True, timeout=60)
     return sorted((folder / "snapshots").iterdir())[-1]
 
 

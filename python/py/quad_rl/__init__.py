@@ -5,5 +5,6 @@ from quad_rl._evaluate import Evaluators, evaluate
 from quad_rl._quad_rl import Episodes, Policy
 from quad_rl._runs import metrics, runs
 from quad_rl._train import Run, train
+from quad_rl.onnx import export_onnx
 
-__all__ = ["Dataset", "Episodes", "Evaluators", "Policy", "Run", "evaluate", "metrics", "runs", "train"]
+__all__ = ["Dataset", "Episodes", "Evaluators", "Policy", "Run", "evaluate", "export_onnx", "metrics", "runs", "train"]

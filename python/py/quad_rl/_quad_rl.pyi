@@ -40,6 +40,15 @@ class Policy:
     def value(
         self, observations: ArrayLike, actions: ArrayLike, *, value: str | None = None
     ) -> NDArray[np.float32]: ...
+    def noise(
+        self,
+        n: int,
+        *,
+        candidates: int | None = None,
+        rule: str | None = None,
+        value: str | None = None,
+        seed: int | Sequence[int] | NDArray[np.integer[Any]] | None = None,
+    ) -> dict[str, NDArray[np.float32]]: ...
     def begin(
         self,
         seeds: int | Sequence[int] | NDArray[np.integer[Any]],
@@ -48,6 +57,7 @@ class Policy:
         rule: str | None = None,
         value: str | None = None,
     ) -> Episodes: ...
+    def to_bytes(self) -> bytes: ...
     @property
     def observation_size(self) -> int: ...
     @property

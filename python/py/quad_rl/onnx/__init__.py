@@ -1,0 +1,43 @@
+"""Policies as ONNX models, which run without this package: in C++, in ROS 2, on a robot."""
+
+from __future__ import annotations
+
+from os import PathLike
+
+from quad_rl._quad_rl import Policy
+
+
+def export_onnx(
+    policy: Policy | str | PathLike[str],
+    path: str | PathLike[str],
+    *,
+    candidates: int | None = None,
+    rule: str | None = None,
+    value: str | None = None,
+) -> None:
+    """Writes a policy, or that of a snapshot's file, as an ONNX model of opset 17, in float32.
+
+    It acts as `Policy.act` does with the same `candidates`, `rule` and `value`, which are fixed in the model. The number of
+    states, n, is free.
+
+    Inputs: `observations` [n, observation_size] and what `policy.noise(n, ...)` has: `noise`, standard normal numbers, and
+    `uniform`, numbers within [0, 1). Fill them anew for each action.
+
+    Outputs: `actions` [n, action_size]; `values` [n, candidates], as of `Policy.sample`, if the policy draws; `plan`
+    [n, steps, action_size] if a planner follows a plan for several steps: its first action is in `actions`, and the model need
+    be asked again only after the last.
+
+    Raises ImportError without the package onnx, ValueError for a choice that the policy cannot make, OSError if the file cannot be
+    written.
+    """
+    try:
+        from quad_rl.onnx.export import model
+    except ImportError as error:
+        if error.name != "onnx":
+            raise
+        raise ImportError("export_onnx takes the package onnx\nhint: pip install 'quad-rl[onnx]', or onnx itself", name="onnx") from error
+    if not isinstance(policy, Policy):
+        policy = Policy.load(policy)
+    written = model(policy, candidates=candidates, rule=rule, value=value).SerializeToString()
+    with open(path, "wb") as file:
+        file.write(written)

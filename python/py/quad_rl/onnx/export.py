@@ -1,0 +1,64 @@
+"""The model of a policy: units, what draws, critics, and the choice."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from onnx import ModelProto
+
+from quad_rl._quad_rl import Policy
+from quad_rl.onnx import diffusion, gaussian, planner, score, squashed
+from quad_rl.onnx.choosing import choose
+from quad_rl.onnx.file import File
+from quad_rl.onnx.graph import Graph, Value
+from quad_rl.onnx.mlp import of_actions, of_states
+
+DRAW = {"diffusion": diffusion.draw, "score": score.draw, "squashed": squashed.draw}
+
+
+def to_network(file: File, observations: Value) -> Value:
+    for units in file.units:
+        if of := units.get("observations"):
+            observations = (observations - of["offset"]) / of["scale"]
+    return observations
+
+
+def to_user(file: File, actions: Value) -> Value:
+    for units in reversed(file.units):
+        if of := units.get("actions"):
+            actions = actions * of["scale"] + of["offset"]
+    return actions
+
+
+def critics(file: File, choice: dict[str, Any], observations: Value, drawn: Value) -> tuple[Value, Value]:
+    """The critics' values of what was drawn, and what the rule compares; both [n, candidates]."""
+    graph, candidates = drawn.graph, choice["candidates"]
+    of_members = of_actions(file, "critic.", file.shape["critic"], observations, drawn, candidates)
+    values = graph("ReduceMin" if choice["value"] == "min" else "ReduceMean", of_members, axes=[0], keepdims=0)
+    if choice["rule"] != "nearest":
+        return values, values
+    away = values - of_states(file, "value.", file.shape["value"], observations).reshape(-1, 1)
+    return values, 0.0 - away * away
+
+
+def model(policy: Policy, **changes: Any) -> ModelProto:
+    # What it draws, for one state; this refuses what `act` refuses.
+    drawn = policy.noise(1, **changes, seed=0)
+    choice = {**(policy.choice or {}), **{name: change for name, change in changes.items() if change is not None}}
+    file, graph, a = File(policy.to_bytes()), Graph(), policy.action_size
+    observations = to_network(file, graph.input("observations", (policy.observation_size,)))
+    inputs = {name: graph.input(name, array.shape[1:]) for name, array in drawn.items()}
+    if file.kind == "gaussian":
+        return graph.model({"actions": (to_user(file, gaussian.mean(file, observations)), (a,))}, repr(policy))
+    candidates, rule = choice["candidates"], choice["rule"]
+    if file.kind == "planner":
+        steps = file.shape["replan_every"]
+        plans, values = planner.plan(file, observations, inputs["noise"], candidates)
+        taken = choose(plans, values, rule, candidates, inputs.get("uniform")).reshape(-1, steps, a)
+        plan = to_user(file, taken)
+        first = {"actions": (plan.at(1, 0), (a,)), "values": (values, (candidates,))}
+        return graph.model({**first, "plan": (plan, (steps, a))} if steps > 1 else {**first}, repr(policy))
+    actions = DRAW[file.kind](file, observations, inputs["noise"], candidates)
+    values, worth = critics(file, choice, observations, actions)
+    taken = to_user(file, choose(actions, worth, rule, candidates, inputs.get("uniform")))
+    return graph.model({"actions": (taken, (a,)), "values": (values, (candidates,))}, repr(policy))

@@ -1,0 +1,96 @@
+"""ONNX models act as the policies do that they are of: every algorithm's, and every way to choose."""
+
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import onnx
+import onnxruntime
+import pytest
+from conftest import OBSERVATION, train
+
+from quad_rl import Policy, export_onnx
+
+PRESETS = Path(__file__).parents[2] / "presets"
+ALGORITHMS = sorted(preset.stem for preset in PRESETS.glob("*.toml") if preset.stem != "tasks")
+OWN = ["--task", "own-data", "--env", "my-robot", "--steps", "2", "--set", "batch_size=8"]
+RULES = ["best", "nearest", "softmax:0.1", "average:0.1:4", "average:0.01:20"]
+
+
+def batches():
+    """Random observations, one, three and five at a time, and extreme ones."""
+    states = np.random.default_rng(8).normal(3.0, 2.0, (17, OBSERVATION)).astype(np.float32)
+    states[9:13] *= np.array([[1e2], [1e3], [-1e4], [0.0]], np.float32)
+    return [states[:1], states[1:4], states[4:9], states[9:10], states[9:13], states[13:]]
+
+
+def largest(array):
+    return np.abs(array).reshape(len(array), -1).max(1)
+
+
+def close(found, expected, by):
+    """Beside a row's largest number, if that is above 1."""
+    assert found.shape == expected.shape
+    away = largest(found - expected) / np.maximum(1.0, largest(expected))
+    assert (away <= by).all(), away
+
+
+def compare(policy, path, **choice):
+    """The model of this choice beside the policy."""
+    export_onnx(policy, path, **choice)
+    onnx.checker.check_model(path, full_check=True)
+    # In float32, norms of nearly equal numbers leave some plans 1.1e-5 from float64 natively, and 4e-6 in the model.
+    by = 5e-5 if policy.kind == "planner" else 1e-5
+    session = onnxruntime.InferenceSession(path, providers=["CPUExecutionProvider"])
+    for seed, states in enumerate(batches()):
+        inputs = {"observations": states, **policy.noise(len(states), seed=seed, **choice)}
+        assert {given.name for given in session.get_inputs()} == set(inputs)
+        found = dict(zip((out.name for out in session.get_outputs()), session.run(None, inputs)))
+        if policy.choice:
+            asked = {name: choice[name] for name in ("candidates", "value") if name in choice}
+            close(found["values"], policy.sample(states, seed=seed, **asked)[1], by)
+        episodes = policy.begin(range(seed, seed + len(states)), **choice)
+        close(found["actions"], episodes.act(states), by)
+        for later in range(1, found.get("plan", states[:, None]).shape[1]):
+            close(found["plan"][:, later], episodes.act(states), by)
+
+
+@pytest.mark.parametrize("algorithm", ALGORITHMS)
+def test_a_policy_of_each_algorithm_acts_alike(algorithm, data, tmp_path):
+    compare(Policy.load(train(tmp_path / "run", data, *OWN, "--algorithm", algorithm, layers=False)), tmp_path / "policy.onnx")
+
+
+@pytest.mark.parametrize("name", ["norm", "scaled", "dql", "dtql"])
+def test_networks_units_and_processes_of_all_kinds(snapshots, name, tmp_path):
+    compare(Policy.load(snapshots[name]), tmp_path / "policy.onnx")
+
+
+@pytest.mark.parametrize("rule", RULES)
+def test_every_choice_that_a_call_may_ask_for(snapshots, rule, tmp_path):
+    policy = Policy.load(snapshots["align-iql"])
+    for candidates, value in [(1, "mean"), (6, "min"), (30, "mean")]:
+        compare(policy, tmp_path / "policy.onnx", candidates=candidates, rule=rule, value=value)
+
+
+@pytest.mark.parametrize("flags", [
+    ["replan_every=1", "guidance={steps=2, scale=3.0, stop=0}", "network={horizon=6, channels=8, multipliers=[1, 4], groups=2, "
+     "attention={heads=2, width=3}}"],
+    ["diffusion_steps=1", "replan_every=2", "network={horizon=5, channels=4, multipliers=[4], groups=2}"],
+    ["diffusion_steps=3", "guidance={steps=1, scale=1.0, stop=9}"],
+])
+def test_plans_of_all_kinds(data, flags, tmp_path):
+    given = [part for flag in flags for part in ("--agent", flag)]
+    run = train(tmp_path / "run", data, *OWN, "--algorithm", "diffuser", "--scale", "states,actions", *given, layers=False)
+    compare(Policy.load(run), tmp_path / "policy.onnx")
+
+
+def test_what_cannot_be_is_refused(snapshots, tmp_path):
+    for message, choice in {"takes a value function": {"rule": "nearest"}, "candidates is 0": {"candidates": 0},
+                            'value is "max"': {"value": "max"}}.items():
+        with pytest.raises(ValueError, match=message):
+            export_onnx(snapshots["quad"], tmp_path / "policy.onnx", **choice)
+    assert not (tmp_path / "policy.onnx").exists()
+    without = "import sys; sys.modules['onnx'] = None; import quad_rl; quad_rl.export_onnx(sys.argv[1], 'policy.onnx')"
+    ended = subprocess.run([sys.executable, "-c", without, snapshots["quad"]], capture_output=True, text=True, timeout=60)
+    assert "hint: pip install" in ended.stderr and "ImportError" in ended.stderr
