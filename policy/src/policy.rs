@@ -38,8 +38,8 @@ pub trait Policy: Send + Sync {
         EpisodeState::new(seed)
     }
 
-    /// The shape of the standard normal numbers that [`Self::act`] draws in a state of an episode that begins; empty if it draws
-    /// none. [`Choice::uniforms`] says how many uniform ones follow.
+    /// The shape of the standard normal numbers that [`Self::act`] draws in a state of an episode that begins; empty if it
+    /// draws none. [`Choice::uniforms`] says how many uniform ones follow.
     fn noise(&self) -> Vec<usize> {
         Vec::new()
     }

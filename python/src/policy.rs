@@ -170,10 +170,9 @@ impl PyPolicy {
         rows.array(py, values, &[])
     }
 
-    /// The noise that `act` draws with these arguments in n states: the inputs of what `export_onnx` writes, beside the observations.
-    ///
-    /// A dictionary, empty if the policy draws nothing, of "noise", standard normal numbers [n, ...], and, where the rule draws too,
-    /// "uniform", numbers within [0, 1), [n, draws]; float32. Raises as `act`.
+    /// The noise that `act` draws with these arguments in n states: the inputs, beside the observations, of what `export_onnx`
+    /// writes. A dictionary, empty if the policy draws nothing, of "noise", standard normal numbers [n, ...], and, where the rule
+    /// draws too, "uniform", numbers within [0, 1), [n, draws]; float32. Raises as `act`.
     #[pyo3(signature = (n, *, candidates = None, rule = None, value = None, seed = None))]
     fn noise<'py>(
         &self,

@@ -10,6 +10,7 @@ import onnxruntime
 import pytest
 from conftest import OBSERVATION, train
 
+import quad_rl
 from quad_rl import Policy, export_onnx
 
 PRESETS = Path(__file__).parents[2] / "presets"
@@ -83,6 +84,14 @@ def test_plans_of_all_kinds(data, flags, tmp_path):
     given = [part for flag in flags for part in ("--agent", flag)]
     run = train(tmp_path / "run", data, *OWN, "--algorithm", "diffuser", "--scale", "states,actions", *given, layers=False)
     compare(Policy.load(run), tmp_path / "policy.onnx")
+
+
+def test_the_page_s_example_runs(snapshots, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    page = (PRESETS.parent / "docs" / "deploying.md").read_text()
+    exec(page.split("```python\n")[1].split("```")[0], {"quad_rl": quad_rl, "policy": Policy.load(snapshots["quad"])})
+    inputs = onnxruntime.InferenceSession("policy.onnx").get_inputs()
+    assert [given.shape[1:] for given in inputs] == [[OBSERVATION], [5, 10, 3]] and "{1, 11}, drawn[] = {1, 5, 10, 3}" in page
 
 
 def test_what_cannot_be_is_refused(snapshots, tmp_path):

@@ -23,19 +23,20 @@ def export_onnx(
     Inputs: `observations` [n, observation_size] and what `policy.noise(n, ...)` has: `noise`, standard normal numbers, and
     `uniform`, numbers within [0, 1). Fill them anew for each action.
 
-    Outputs: `actions` [n, action_size]; `values` [n, candidates], as of `Policy.sample`, if the policy draws; `plan`
-    [n, steps, action_size] if a planner follows a plan for several steps: its first action is in `actions`, and the model need
-    be asked again only after the last.
+    Outputs: `actions` [n, action_size]; `values` [n, candidates], as of `Policy.sample`, if the policy draws; and of a planner
+    that follows a plan for several steps `plan` [n, steps, action_size], whose first action is in `actions`: ask the model
+    again after the last.
 
-    Raises ImportError without the package onnx, ValueError for a choice that the policy cannot make, OSError if the file cannot be
-    written.
+    Raises ImportError without the package onnx, ValueError for a choice that the policy cannot make, OSError if the file
+    cannot be written.
     """
     try:
         from quad_rl.onnx.export import model
     except ImportError as error:
         if error.name != "onnx":
             raise
-        raise ImportError("export_onnx takes the package onnx\nhint: pip install 'quad-rl[onnx]', or onnx itself", name="onnx") from error
+        message = "export_onnx takes the package onnx\nhint: pip install onnx"
+        raise ImportError(message, name="onnx") from error
     if not isinstance(policy, Policy):
         policy = Policy.load(policy)
     written = model(policy, candidates=candidates, rule=rule, value=value).SerializeToString()

@@ -52,7 +52,8 @@ class Value:
 
 
 class Graph:
-    """`graph(operator, inputs…, attributes…)` adds a node. Numbers and arrays among the inputs become constants; all are float32, int64 or bool."""
+    """`graph(operator, inputs…, attributes…)` adds a node. Numbers and arrays among the inputs become constants. All is float32,
+    int64 or bool."""
 
     def __init__(self) -> None:
         self.nodes: list[Any] = []
