@@ -7,6 +7,7 @@ use crate::definition::{Definition, Metric};
 use crate::parts::Parts;
 use crate::pool::run_awake;
 use candle_core::Device;
+use quad_dataset::Names;
 use quad_policy::{Header, PolicyError, Scaling, read_header, read_tensors, write_tensors};
 use serde::{Deserialize, Serialize};
 
@@ -22,6 +23,8 @@ pub struct Agent {
     transitions: usize,
     /// The maps between the data's units and the algorithm's, unless they are the same.
     scaling: Option<Scaling>,
+    /// What the data calls the numbers of its rows.
+    names: Names,
     /// Updates done.
     step: u64,
 }
@@ -58,10 +61,11 @@ impl Agent {
     pub fn new(definition: Definition, table: &toml::Table, context: Context) -> Result<Self, AlgorithmError> {
         let (device, transitions) = (context.device.clone(), context.transitions.len());
         let scaling = Some(context.transitions.scaling().clone()).filter(|scaling| *scaling != Scaling::default());
+        let names = context.transitions.names().clone();
         let algorithm = (definition.start)(table, context)?;
         // Each thread has a queue of its own on a GPU; the next thread must find what this one has made.
         device.synchronize()?;
-        Ok(Self { definition, algorithm, device, transitions, scaling, step: 0 })
+        Ok(Self { definition, algorithm, device, transitions, scaling, names, step: 0 })
     }
 
     /// The algorithm's state.
@@ -116,7 +120,9 @@ impl Agent {
     /// A weight that is not finite.
     pub fn policy(&self, origin: impl Serialize) -> Result<Vec<u8>, AlgorithmError> {
         let (policy, tensors) = self.algorithm.policy()?;
-        Ok(Header { policy, scaling: self.scaling.clone(), origin }.to_safetensors(&tensors)?)
+        let Names { observations: observation_names, actions: action_names } = self.names.clone();
+        Ok(Header { policy, scaling: self.scaling.clone(), observation_names, action_names, origin }
+            .to_safetensors(&tensors)?)
     }
 
     /// Everything that decides the future of the run, as one safetensors file: the same bytes for the same state.

@@ -150,7 +150,7 @@ pub(super) fn check_definition(definition: &Definition, golden: &Golden, device:
 /// Checks that a policy that draws nothing acts as a golden folder expects.
 pub(super) fn check_actions(golden: &Golden, algorithm: &dyn Algorithm) {
     let (policy, tensors) = algorithm.policy().unwrap();
-    let file = Header { policy, scaling: None, origin: () }.to_safetensors(&tensors).unwrap();
+    let file = Header::new(policy, ()).to_safetensors(&tensors).unwrap();
     let policy = load_policy(&file, Precision::F32).unwrap();
     let observations = golden.input("select_observations", &Device::Cpu);
     let mut states: Vec<_> = (0..observations.dim(0).unwrap() as u64).map(|seed| policy.begin(seed)).collect();
@@ -174,7 +174,7 @@ pub(super) struct Drawn {
 /// Checks that the networks of a published policy draw and value candidates as a golden folder expects.
 pub(super) fn check_candidates(golden: &Golden, algorithm: &dyn Algorithm) -> Drawn {
     let (policy, tensors) = algorithm.policy().unwrap();
-    let file = Header { policy: policy.clone(), scaling: None, origin: () }.to_safetensors(&tensors).unwrap();
+    let file = Header::new(policy.clone(), ()).to_safetensors(&tensors).unwrap();
     load_policy(&file, Precision::F32).unwrap();
     let mut tensors = read_tensors(&file).unwrap();
     let mut weights = |layout: Layout, prefix: &str| Weights::take(layout, &mut tensors, prefix).unwrap();

@@ -7,9 +7,18 @@ use hdf5::types::VarLenUnicode;
 
 use crate::checks;
 use crate::error::{DatasetError, Problem};
-use crate::formats::OWN_LAYOUT;
+use crate::formats::{ACTION_NAMES, OBSERVATION_NAMES, OWN_LAYOUT};
 use crate::new_file::{Column, NewFile};
 use crate::recording::{Recording, RowKind};
+
+/// What a source calls the numbers of its rows. An empty list where they have no names.
+#[derive(Clone, Debug, Default, PartialEq, Eq)]
+pub struct Names {
+    /// Of an observation, o.
+    pub observations: Vec<String>,
+    /// Of an action, a.
+    pub actions: Vec<String>,
+}
 
 /// Transitions in memory, N of them, in the order of their episodes.
 #[derive(Clone, Debug, Default)]
@@ -69,16 +78,16 @@ impl Arrays {
 }
 
 /// Writes the custom layout (docs/data.md) in float32, compressed. The file appears under its name when it is
-/// whole; one that was there is replaced. The folder is made if need be.
+/// whole; one that was there is replaced. The folder is made if need be. `names` are kept beside the arrays.
 ///
 /// # Errors
 /// The disk, or what would be refused when the file is read: arrays that do not fit one another, numbers that are not finite,
 /// no transition, rows without any end of an episode. Actions may have any range: whether they are to be scaled is decided
 /// by who trains on them.
-pub fn write_own(path: impl AsRef<Path>, arrays: Arrays) -> Result<(), DatasetError> {
+pub fn write_own(path: impl AsRef<Path>, arrays: Arrays, names: Names) -> Result<(), DatasetError> {
     let path = path.as_ref();
     let error = |problem| DatasetError::new(path, problem);
-    let recording = arrays.into_recording().map_err(error)?;
+    let recording = Recording { names, ..arrays.into_recording().map_err(error)? };
     if let Some(problem) = checks::problems(&recording, None).into_iter().next() {
         return Err(error(problem));
     }
@@ -90,6 +99,14 @@ pub fn write_own(path: impl AsRef<Path>, arrays: Arrays) -> Result<(), DatasetEr
 fn write(file: &NewFile, recording: &Recording) -> hdf5::Result<()> {
     let layout = VarLenUnicode::from_str(OWN_LAYOUT).map_err(|error| error.to_string())?;
     file.hdf5.new_attr::<VarLenUnicode>().create("layout")?.write_scalar(&layout)?;
+    for (name, texts) in [(OBSERVATION_NAMES, &recording.names.observations), (ACTION_NAMES, &recording.names.actions)]
+    {
+        let texts = texts.iter().map(|text| VarLenUnicode::from_str(text)).collect::<Result<Vec<_>, _>>();
+        let texts = texts.map_err(|error| error.to_string())?;
+        if !texts.is_empty() {
+            file.hdf5.new_attr_builder().with_data(&texts).create(name)?;
+        }
+    }
     let (o, a) = (Some(recording.observation_dim), Some(recording.action_dim));
     let next_observations = recording.next_observations.as_deref().unwrap_or_default();
     for (name, width, values) in [

@@ -5,6 +5,7 @@ use std::io;
 use std::path::PathBuf;
 
 use crate::environment;
+use crate::foreign::CONVERT;
 
 /// A source that cannot be read or learnt from, or a file that cannot be written.
 #[derive(Debug, thiserror::Error)]
@@ -54,6 +55,8 @@ pub enum Problem {
     Metadata(#[source] serde_json::Error),
     #[error("the attribute `layout` is {found:?}, but the only value with a meaning is \"transitions\"")]
     UnknownLayout { found: String },
+    #[error("the attribute `{attribute}` has {found} texts, but a row has {expected} numbers")]
+    Names { attribute: String, found: usize, expected: usize },
     #[error("array `{array}` is missing")]
     Missing { array: String },
     #[error("array `{array}` holds {found}, but must hold {expected}")]
@@ -122,6 +125,11 @@ impl Problem {
     pub fn hint(&self) -> String {
         let hint = match self {
             Self::OtherEnvironment { claimed, expected } => return other_environment(claimed, expected),
+            Self::Foreign { load, .. } if load.starts_with(CONVERT) => {
+                return format!(
+                    "with quad_rl installed, `{load} --out my-robot.hdf5` makes a file that is read (docs/data.md)"
+                );
+            }
             Self::Foreign { load, .. } => {
                 return format!(
                     "{load}; then write its numbers to an HDF5 file of your own by the ten lines of h5py in docs/data.md"
@@ -155,10 +163,10 @@ impl Problem {
                  that there are"
             }
             Self::Metadata(_) => "fetch the Minari dataset again; metadata.json is what Minari writes beside the data",
-            Self::UnknownLayout { .. } => "see docs/data.md for what the attribute means",
+            Self::UnknownLayout { .. } | Self::Names { .. } => "see docs/data.md for what the attribute means",
             Self::Missing { array } if array == "rewards" => {
-                "learning needs a reward for each step; OGBench makes those of a single-task dataset on loading: \
-                 save what its make_env_and_datasets returns with numpy.savez"
+                "learning needs a reward for each step; with quad_rl installed, `quad-convert ogbench:NAME --out FILE` adds those of \
+                 OGBench, for a NAME such as antmaze-large-navigate-singletask-task1-v0"
             }
             Self::Missing { .. } => "docs/data.md says which arrays each kind of file must have",
             Self::Numbers { .. } => "all arrays need the same number of rows, which is that of `rewards`",
@@ -172,8 +180,8 @@ impl Problem {
                  policy's actions back"
             }
             Self::Group { .. } => {
-                "an observation may be an array or a Dict of arrays, but not a Dict of Dicts: write the numbers that you need \
-                 as one array into an HDF5 file of your own, as docs/data.md describes"
+                "an observation may be an array or a Dict of arrays, but not a Dict of Dicts: with quad_rl installed, `quad-convert \
+                 FOLDER --out my-robot.hdf5` makes one row of it"
             }
             Self::DiscreteActions { .. } => {
                 "store continuous actions as float32; where they leave [-1, 1], `learner train --scale actions` scales them"

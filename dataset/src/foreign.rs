@@ -1,4 +1,4 @@
-//! Formats that are not read here, named for what they are, and what loads them in Python.
+//! Formats that are not read here, named for what they are, and what reads them: `quad-convert`, or a call in Python.
 
 use std::fs;
 use std::path::Path;
@@ -10,11 +10,16 @@ use crate::error::Problem;
 /// How many bytes of a file tell what it is.
 pub(crate) const START: u64 = 256;
 
+/// How a hint begins that names all there is to do.
+pub(crate) const CONVERT: &str = "quad-convert";
+
+const TABLE: &str =
+    "quad-convert FILE --observations COLUMN … --actions COLUMN … --reward COLUMN --episode COLUMN --terminal COLUMN";
 const PICKLE: &str = "load it by pickle.load, if you trust who wrote it: a pickle can run any program";
 
 /// How files begin, what such a file is, and how to load it.
 const STARTS: [(&[u8], &str, &str); 8] = [
-    (b"PAR1", "a Parquet file", "load it by pandas.read_parquet"),
+    (b"PAR1", "a Parquet file", TABLE),
     (b"ARROW1", "an Arrow file", "load it by pandas.read_feather"),
     (b"\x80\x02", "a Python pickle", PICKLE),
     (b"\x80\x03", "a Python pickle", PICKLE),
@@ -44,7 +49,7 @@ pub(crate) fn of_start(start: &[u8]) -> Problem {
     match text {
         text if text.contains(|c: char| c.is_control() && !c.is_whitespace()) => Problem::UnknownFormat,
         text if text.starts_with(['{', '[']) => foreign("a JSON file", "load it by json.load or pandas.read_json"),
-        _ if first_line.contains([',', ';', '\t']) => foreign("a table as text (CSV)", "load it by pandas.read_csv"),
+        _ if first_line.contains([',', ';', '\t']) => foreign("a table as text (CSV)", TABLE),
         _ => Problem::UnknownFormat,
     }
 }
@@ -56,13 +61,12 @@ pub(crate) fn of_folder(folder: &Path) -> Problem {
         json[key].as_str().map(str::to_owned)
     };
     if let Some(version) = text("meta/info.json", "codebase_version") {
-        let load = "load each Parquet file in its folder data by pandas.read_parquet: an episode's rows share an \
-                    episode_index, and where no next.reward was recorded each step needs a reward of yours";
+        let load = "quad-convert FOLDER --observations observation.state --reward step-cost --success EPISODE …";
         return foreign(format!("a LeRobot dataset of version {version}"), load);
     }
     let format = text("data/metadata.json", "data_format").or_else(|| text("metadata.json", "data_format"));
     match format.filter(|format| format != "hdf5") {
-        Some(format) => foreign(format!("a Minari dataset stored as {format}"), "load it by minari.load_dataset"),
+        Some(format) => foreign(format!("a Minari dataset stored as {format}"), "quad-convert FOLDER"),
         None => Problem::UnknownFolder,
     }
 }
@@ -70,9 +74,7 @@ pub(crate) fn of_folder(folder: &Path) -> Problem {
 /// What an HDF5 file is that has another layout, by what its group `data` holds.
 pub(crate) fn of_group(members: &[String]) -> Option<Problem> {
     let demonstrations = members.iter().any(|name| name.starts_with("demo_"));
-    let load = "load each data/demo_N by h5py: actions, rewards, dones, and from its obs the arrays that the policy is to \
-                see, side by side";
-    demonstrations.then(|| foreign("a robomimic file", load))
+    demonstrations.then(|| foreign("a robomimic file", "quad-convert FILE --observations KEY …"))
 }
 
 /// What a zip archive of these files is, if none of them is a NumPy array.

@@ -86,6 +86,15 @@ impl Hdf5File {
         Some(text_in(&*self.file.attr(name).ok()?).unwrap_or_default())
     }
 
+    /// A list of `count` texts that the file's root has as an attribute; empty where it has none.
+    pub(crate) fn names(&self, attribute: &str, count: usize) -> Result<Vec<String>, Problem> {
+        let Ok(holder) = self.file.attr(attribute) else { return Ok(Vec::new()) };
+        match texts_in(&holder).unwrap_or_default() {
+            texts if texts.len() == count => Ok(texts),
+            texts => Err(Problem::Names { attribute: attribute.to_owned(), found: texts.len(), expected: count }),
+        }
+    }
+
     /// Rows of an array, and numbers in each.
     pub(crate) fn size(&self, array: &str) -> Result<(usize, usize), Problem> {
         let empty = Array::<f32>::new(array, &self.dataset(array)?.shape(), Vec::new())?;
@@ -223,11 +232,16 @@ fn filter_name(id: i32) -> String {
     name.to_owned()
 }
 
-/// The text that an attribute or an array holds, as HDF5's programs write one: of variable or fixed length, ASCII or UTF-8.
+/// The one text that an attribute or an array holds.
 fn text_in(holder: &Container) -> Option<String> {
-    fn as_type<T: H5Type + Display>(holder: &Container) -> Option<String> {
-        let texts = holder.read_raw::<T>().ok()?;
-        (texts.len() == 1).then(|| texts[0].to_string())
+    let mut texts = texts_in(holder)?;
+    if texts.len() == 1 { texts.pop() } else { None }
+}
+
+/// The texts that an attribute or an array holds, as HDF5's programs write them: of variable or fixed length, ASCII or UTF-8.
+fn texts_in(holder: &Container) -> Option<Vec<String>> {
+    fn as_type<T: H5Type + Display>(holder: &Container) -> Option<Vec<String>> {
+        Some(holder.read_raw::<T>().ok()?.iter().map(T::to_string).collect())
     }
     as_type::<VarLenUnicode>(holder)
         .or_else(|| as_type::<VarLenAscii>(holder))

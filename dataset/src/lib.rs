@@ -40,7 +40,7 @@ mod task;
 mod transitions;
 mod writer;
 
-pub use arrays::{Arrays, write_own};
+pub use arrays::{Arrays, Names, write_own};
 pub use catalogue::NamedDataset;
 pub use environment::{EnvironmentSpec, Goal, UnknownEnvironment};
 pub use error::{DatasetError, Problem};

@@ -1,5 +1,6 @@
 //! What every format is read into: rows as they were recorded, not judged yet.
 
+use crate::arrays::Names;
 use crate::statistics::{Episode, returns};
 
 /// Two rows whose observations differ by more than this do not follow one another.
@@ -43,6 +44,8 @@ pub(crate) struct Recording {
     pub ends: Vec<bool>,
     /// Whether the task is to reach a goal, after which the recording continues.
     pub goal: bool,
+    /// What the numbers of its rows are called.
+    pub names: Names,
     /// Where the file has several arrays of each kind: the first row of each, and the path of the group it is in.
     pub parts: Vec<(usize, String)>,
 }

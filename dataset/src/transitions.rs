@@ -5,7 +5,7 @@ use std::path::Path;
 
 use quad_kernels::scaling::Scaling;
 
-use crate::arrays::Arrays;
+use crate::arrays::{Arrays, Names};
 use crate::environment::EnvironmentSpec;
 use crate::error::{DatasetError, Problem};
 use crate::formats::Source;
@@ -85,6 +85,7 @@ pub struct Transitions {
     statistics: Statistics,
     doubts: Vec<String>,
     scaling: Scaling,
+    names: Names,
 }
 
 impl Transitions {
@@ -154,6 +155,7 @@ impl Transitions {
             statistics,
             doubts,
             scaling,
+            names: recording.names,
         }
     }
 
@@ -176,6 +178,11 @@ impl Transitions {
     /// How the observations and actions here, which are the networks', follow from those of the recording.
     pub fn scaling(&self) -> &Scaling {
         &self.scaling
+    }
+
+    /// What the source calls the numbers of its observations and actions.
+    pub fn names(&self) -> &Names {
+        &self.names
     }
 
     /// Units in which the observations and actions that are learnt from have mean 0 and standard deviation 1, number by number;

@@ -32,7 +32,7 @@ fn policy(precision: Precision) -> Box<dyn Policy> {
     let policy = PolicyConfig::Diffusion { shape, choice: Choice::best_of(CANDIDATES) };
     let initial = |layout: &Layout| Weights::initial(layout, &mut generator, &Device::Cpu);
     let tensors = policy.tensors(initial).expect("weights");
-    let file = Header { policy, scaling: None, origin: () }.to_safetensors(&tensors).expect("finite weights");
+    let file = Header::new(policy, ()).to_safetensors(&tensors).expect("finite weights");
     load_policy(&file, precision).expect("what was just written")
 }
 

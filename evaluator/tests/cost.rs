@@ -37,8 +37,7 @@ static ALLOCATOR: Counting = Counting;
 
 fn loaded(policy: PolicyConfig) -> Box<dyn Policy> {
     let tensors = policy.tensors(|layout| Tensor::zeros(layout.count(), DType::F32, &Device::Cpu)).unwrap();
-    load_policy(&Header { policy, scaling: None, origin: () }.to_safetensors(&tensors).unwrap(), Precision::F32)
-        .unwrap()
+    load_policy(&Header::new(policy, ()).to_safetensors(&tensors).unwrap(), Precision::F32).unwrap()
 }
 
 fn diffusion(hidden: usize, critics: usize, diffusion_steps: usize, choice: Choice) -> Box<dyn Policy> {

@@ -38,7 +38,7 @@ fn shape(golden: &Golden) -> DiffusionShape {
 
 fn file(shape: DiffusionShape, choice: Choice, tensors: &Tensors) -> Vec<u8> {
     let policy = PolicyConfig::Diffusion { shape, choice };
-    Header { policy, scaling: None, origin: () }.to_safetensors(tensors).unwrap()
+    Header::new(policy, ()).to_safetensors(tensors).unwrap()
 }
 
 #[test]
@@ -113,7 +113,7 @@ pub(crate) fn file_of(choice: Choice, critic: f32, v: Option<f32>, scaling: Opti
     let value = value.map(|(of, v)| Ensemble::new(of.clone(), weights(of.layout(), 0.0, v), Precision::F32));
     let tensors = DiffusionPolicy::tensors(&actor, &critics, value.as_ref()).unwrap();
     let policy = PolicyConfig::Diffusion { shape, choice };
-    Header { policy, scaling, origin: () }.to_safetensors(&tensors).unwrap()
+    Header { scaling, ..Header::new(policy, ()) }.to_safetensors(&tensors).unwrap()
 }
 
 /// What it does at the first step of an episode.

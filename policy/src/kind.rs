@@ -115,8 +115,21 @@ pub struct Header<O> {
     /// The maps between the units that its networks have learnt in and those that it is asked in, unless they are the same.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub scaling: Option<Scaling>,
+    /// What the data that it has learnt from calls the numbers of an observation; empty where they have no names.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    pub observation_names: Vec<String>,
+    /// The same of the numbers of an action.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    pub action_names: Vec<String>,
     /// Where it comes from.
     pub origin: O,
+}
+
+impl<O> Header<O> {
+    /// Of networks that have learnt in the user's own units, from numbers without names.
+    pub fn new(policy: PolicyConfig, origin: O) -> Self {
+        Self { policy, scaling: None, observation_names: Vec::new(), action_names: Vec::new(), origin }
+    }
 }
 
 impl<O: Serialize> Header<O> {
@@ -145,7 +158,7 @@ impl<O: DeserializeOwned> Header<O> {
 /// # Errors
 /// A file that is not what it should be, or a kind of policy that is not known here.
 pub fn load_policy(file: &[u8], precision: Precision) -> Result<Box<dyn Policy>, PolicyError> {
-    let Header { policy, scaling, origin: IgnoredAny } = Header::read(file)?;
+    let Header { policy, scaling, origin: IgnoredAny, .. } = Header::read(file)?;
     let mut tensors = read_tensors(file)?;
     let policy: Box<dyn Policy> = match policy {
         PolicyConfig::Diffusion { shape, choice } => {
@@ -252,7 +265,7 @@ mod tests {
         let shape = GaussianShape { observation_dim: 3, action_dim: 1, actor };
         let policy = PolicyConfig::Gaussian { shape };
         let tensors = policy.tensors(|layout| Tensor::zeros(layout.count(), DType::F32, &Device::Cpu)).unwrap();
-        Header { policy, scaling: None, origin }.to_safetensors(&tensors).unwrap()
+        Header::new(policy, origin).to_safetensors(&tensors).unwrap()
     }
 
     #[test]

@@ -144,7 +144,7 @@ mod tests {
         let critic = Ensemble::new(shape.critic(), critic, Precision::F32);
         let policy = PolicyConfig::Score { shape: shape.clone(), choice };
         let tensors = ScorePolicy::tensors(&actor, &critic).unwrap();
-        Header { policy, scaling: None, origin: () }.to_safetensors(&tensors).unwrap()
+        Header::new(policy, ()).to_safetensors(&tensors).unwrap()
     }
 
     /// The action is the mean of the best four candidates where the temperature leaves no doubt which these are.

@@ -160,7 +160,7 @@ mod tests {
         };
         let tensors = named("actor", actor).into_iter().chain(named("critic", critic)).collect();
         let policy = PolicyConfig::Squashed { shape, choice: CHOICE };
-        let file = Header { policy, scaling: None, origin: () }.to_safetensors(&tensors).unwrap();
+        let file = Header::new(policy, ()).to_safetensors(&tensors).unwrap();
         load_policy(&file, Precision::F32).unwrap()
     }
 

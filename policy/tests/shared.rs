@@ -17,7 +17,7 @@ fn file() -> Vec<u8> {
     let shape = DiffusionShape::quad((3, 1), &MlpConfig::mish(&[256, 256]), 64, 1);
     let policy = PolicyConfig::Diffusion { shape, choice: Choice::best_of(2) };
     let tensors = policy.tensors(|layout| Tensor::zeros(layout.count(), DType::F32, &Device::Cpu)).unwrap();
-    Header { policy, scaling: None, origin: () }.to_safetensors(&tensors).unwrap()
+    Header::new(policy, ()).to_safetensors(&tensors).unwrap()
 }
 
 /// A call shares out its work. A thread that waits for a part of it takes up another job meanwhile, which asks the same policy.

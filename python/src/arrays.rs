@@ -6,7 +6,21 @@ use pyo3::prelude::*;
 use std::borrow::Cow;
 
 /// What Python gives for an array: float32 as it is, anything else that NumPy takes, converted.
-pub type Like<'py> = PyArrayLikeDyn<'py, f32, AllowTypeChange>;
+pub struct Like<'py> {
+    array: PyArrayLikeDyn<'py, f32, AllowTypeChange>,
+    /// The names that a table, such as pandas's, has for its columns.
+    columns: Vec<String>,
+}
+
+impl<'a, 'py> FromPyObject<'a, 'py> for Like<'py> {
+    type Error = PyErr;
+
+    fn extract(given: Borrowed<'a, 'py, PyAny>) -> PyResult<Self> {
+        let columns = given.getattr("columns").and_then(|columns| columns.try_iter());
+        let columns = columns.and_then(|names| names.map(|name| name?.extract()).collect::<PyResult<_>>());
+        Ok(Self { array: given.extract()?, columns: columns.unwrap_or_default() })
+    }
+}
 
 /// Rows of an array, `rows × width`.
 pub struct Rows<'a> {
@@ -19,17 +33,25 @@ pub struct Rows<'a> {
 }
 
 impl<'a> Rows<'a> {
-    /// The rows of `array`, called `name` to the user, each of `width` numbers: `[n, width]` or `[width]`.
+    /// The rows of an array, called `name` to the user, each of `width` numbers: `[n, width]` or `[width]`. These have the names
+    /// `names`, or none.
     ///
     /// # Errors
-    /// ValueError for another shape, and for NaN or an infinite number.
-    pub fn of(name: &str, array: &'a Like<'_>, width: usize) -> PyResult<Self> {
+    /// ValueError for another shape, for a table whose columns are others, and for NaN or an infinite number.
+    pub fn of(name: &str, Like { array, columns }: &'a Like<'_>, width: usize, names: &[String]) -> PyResult<Self> {
+        let list = names.join(", ");
+        if !names.is_empty() && !columns.is_empty() && columns != names {
+            let columns = columns.join(", ");
+            let error = format!("{name} has the columns {columns}, but the policy takes, in this order, {list}");
+            return Err(PyValueError::new_err(error));
+        }
         let (count, single) = match *array.shape() {
             [columns] if columns == width => (1, true),
             [count, columns] if columns == width => (count, false),
             ref shape => {
                 let shape = shape.iter().map(usize::to_string).collect::<Vec<_>>().join(", ");
-                let error = format!("{name} has shape [{shape}], but must have [n, {width}] or [{width}]");
+                let list = if names.is_empty() { list } else { format!(": {list}") };
+                let error = format!("{name} has shape [{shape}], but must have [n, {width}] or [{width}]{list}");
                 return Err(PyValueError::new_err(error));
             }
         };

@@ -5,7 +5,7 @@ use std::path::PathBuf;
 use numpy::{PyReadonlyArray1, PyReadonlyArray2, PyUntypedArrayMethods};
 use pyo3::exceptions::PyRuntimeError;
 use pyo3::prelude::*;
-use quad_dataset::{Arrays, DatasetError, inspect, write_own};
+use quad_dataset::{Arrays, DatasetError, Names, inspect, write_own};
 
 use crate::error::with_hint;
 
@@ -13,7 +13,7 @@ fn refused(error: &DatasetError) -> PyErr {
     with_hint(error, &error.hint())
 }
 
-/// Writes the custom layout. All arrays are C-contiguous and have the same number of rows.
+/// Writes the custom layout. All arrays are C-contiguous and have the same number of rows; names may be empty lists.
 #[pyfunction]
 #[expect(clippy::too_many_arguments, reason = "they are the file's arrays")]
 pub fn write_dataset(
@@ -25,6 +25,8 @@ pub fn write_dataset(
     next_observations: PyReadonlyArray2<'_, f32>,
     terminals: PyReadonlyArray1<'_, bool>,
     timeouts: PyReadonlyArray1<'_, bool>,
+    observation_names: Vec<String>,
+    action_names: Vec<String>,
 ) -> PyResult<()> {
     let arrays = Arrays {
         observation_dim: observations.shape()[1],
@@ -36,7 +38,8 @@ pub fn write_dataset(
         terminals: terminals.as_slice()?.to_vec(),
         timeouts: timeouts.as_slice()?.to_vec(),
     };
-    py.detach(|| write_own(path, arrays)).map_err(|error| refused(&error))
+    let names = Names { observations: observation_names, actions: action_names };
+    py.detach(|| write_own(path, arrays, names)).map_err(|error| refused(&error))
 }
 
 /// What is in a dataset: as JSON, and as a page.

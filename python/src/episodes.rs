@@ -5,6 +5,7 @@ use std::sync::Arc;
 
 use pyo3::exceptions::PyValueError;
 use pyo3::prelude::*;
+use quad_dataset::Names;
 use quad_policy::{EpisodeState, Policy};
 
 use crate::acting::{Array, act, begin};
@@ -15,12 +16,13 @@ use crate::arrays::{Like, Rows};
 pub struct Episodes {
     policy: Arc<dyn Policy>,
     states: Vec<EpisodeState>,
+    names: Arc<Names>,
 }
 
 impl Episodes {
     /// Begins the episodes of these seeds.
-    pub fn new(policy: Arc<dyn Policy>, seeds: &[u64]) -> Self {
-        Self { states: begin(&*policy, seeds), policy }
+    pub fn new(policy: Arc<dyn Policy>, seeds: &[u64], names: Arc<Names>) -> Self {
+        Self { states: begin(&*policy, seeds), policy, names }
     }
 
     /// These rows, if they are ours and each is named once.
@@ -46,7 +48,7 @@ impl Episodes {
     /// Raises as `Policy.act`; ValueError also if there are more or fewer observations than episodes.
     #[pyo3(signature = (observations, *, rows = None))]
     fn act<'py>(&mut self, py: Python<'py>, observations: Like<'py>, rows: Option<Vec<i64>>) -> PyResult<Array<'py>> {
-        let given = Rows::of("observations", &observations, self.policy.observation_dim())?;
+        let given = Rows::of("observations", &observations, self.policy.observation_dim(), &self.names.observations)?;
         let rows = match rows {
             Some(rows) => self.check(rows)?,
             None => (0..self.states.len()).collect(),

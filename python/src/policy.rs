@@ -7,6 +7,7 @@ use std::sync::Arc;
 use pyo3::exceptions::{PyUserWarning, PyValueError};
 use pyo3::prelude::*;
 use pyo3::types::{PyBytes, PyDict, PyTuple};
+use quad_dataset::Names;
 use quad_policy::{Header, Policy, PolicyConfig, PolicyError, Precision, load_policy};
 use quad_protocol::Origin;
 
@@ -29,6 +30,7 @@ pub struct PyPolicy {
     policy: Arc<dyn Policy>,
     config: PolicyConfig,
     origin: Origin,
+    names: Arc<Names>,
     /// The file and the precision that was asked for, to make a copy of.
     file: Vec<u8>,
     asked: Precision,
@@ -67,7 +69,9 @@ impl PyPolicy {
         let (policy, header) = read.map_err(|error: PolicyError| {
             with_hint(&std::io::Error::other(format!("{name} is not a saved policy: {error}")), HINT)
         })?;
-        Ok(Self { policy: policy.into(), config: header.policy, origin: header.origin, file, asked })
+        let Header { policy: config, observation_names, action_names, origin, .. } = header;
+        let names = Arc::new(Names { observations: observation_names, actions: action_names });
+        Ok(Self { policy: policy.into(), config, origin, names, file, asked })
     }
 
     /// Acts in each of n states: observations [n, observation_size] -> actions [n, action_size], float32.
@@ -156,7 +160,7 @@ impl PyPolicy {
         value: Option<String>,
     ) -> PyResult<Array<'py>> {
         let rows = self.rows(&observations)?;
-        let taken = Rows::of("actions", &actions, self.policy.action_dim())?;
+        let taken = Rows::of("actions", &actions, self.policy.action_dim(), &self.names.actions)?;
         if (taken.count, taken.single) != (rows.count, rows.single) {
             let error =
                 format!("{} rows of observations, but {} of actions: one action for each", rows.count, taken.count);
@@ -205,7 +209,7 @@ impl PyPolicy {
             Ok(seed) => vec![seed],
             Err(_) => seeds.extract().map_err(|_| not_seeds("a sequence of them"))?,
         };
-        Ok(Episodes::new(policy, &seeds))
+        Ok(Episodes::new(policy, &seeds, self.names.clone()))
     }
 
     /// Numbers in an observation.
@@ -218,6 +222,19 @@ impl PyPolicy {
     #[getter]
     fn action_size(&self) -> usize {
         self.policy.action_dim()
+    }
+
+    /// What the data that it has learnt from calls the numbers of an observation; empty where they have no names. A table with
+    /// other columns is refused.
+    #[getter]
+    fn observation_names(&self) -> Vec<String> {
+        self.names.observations.clone()
+    }
+
+    /// What that data calls the numbers of an action.
+    #[getter]
+    fn action_names(&self) -> Vec<String> {
+        self.names.actions.clone()
     }
 
     /// The environment that it was trained for.
@@ -282,6 +299,6 @@ impl PyPolicy {
 
 impl PyPolicy {
     fn rows<'a>(&self, observations: &'a Like<'_>) -> PyResult<Rows<'a>> {
-        Rows::of("observations", observations, self.policy.observation_dim())
+        Rows::of("observations", observations, self.policy.observation_dim(), &self.names.observations)
     }
 }

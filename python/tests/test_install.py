@@ -20,6 +20,12 @@ def test_programs_are_on_the_path_and_of_this_version(program):
     assert said.split() == [program, importlib.metadata.version("quad_rl")]
 
 
+def test_quad_convert_is_on_the_path():
+    assert pathlib.Path(shutil.which("quad-convert")).parent == BIN
+    said = subprocess.run(["quad-convert", "--help"], check=True, capture_output=True, text=True, timeout=60).stdout
+    assert "--observations" in said
+
+
 def test_the_programs_need_no_library_but_the_systems_and_the_wheels():
     for file in [BIN / "learner", BIN / "evaluator", pathlib.Path(quad_rl.__file__).parent / "_quad_rl.abi3.so"]:
         for line in subprocess.run(["ldd", file], check=True, capture_output=True, text=True, timeout=60).stdout.splitlines():

@@ -51,7 +51,7 @@ fn start(golden: &Golden, device: &Device) -> Diffuser {
 /// What the published networks plan with a folder's states and noise.
 fn check_plans(golden: &Golden, diffuser: &Diffuser) {
     let (policy, tensors) = diffuser.policy().unwrap();
-    let file = quad_policy::Header { policy: policy.clone(), scaling: None, origin: () };
+    let file = quad_policy::Header::new(policy.clone(), ());
     let mut tensors = read_tensors(&file.to_safetensors(&tensors).unwrap()).unwrap();
     let PolicyConfig::Planner { shape, choice } = policy else { panic!("{policy:?}") };
     assert_eq!(choice, Choice::best_of(golden.count("/agent/candidates") as u32));

@@ -44,7 +44,7 @@ fn check(golden: &Golden, device: &Device) {
 /// What the published networks draw, and what they say of it; and how the policy chooses.
 fn check_candidates(golden: &Golden, sfbc: &Sfbc) {
     let (policy, tensors) = sfbc.policy().unwrap();
-    let file = Header { policy: policy.clone(), scaling: None, origin: () }.to_safetensors(&tensors).unwrap();
+    let file = Header::new(policy.clone(), ()).to_safetensors(&tensors).unwrap();
     load_policy(&file, Precision::F32).unwrap();
     let PolicyConfig::Score { choice, .. } = policy else { panic!("{policy:?}") };
     let rule = Rule::Average { temperature: 0.1, actions: 3 };

@@ -17,7 +17,7 @@ use crate::npz_file::{self, NpzFile};
 use crate::recording::Recording;
 
 pub use minari::minari_folder;
-pub(crate) use own::LAYOUT as OWN_LAYOUT;
+pub(crate) use own::{ACTION_NAMES, LAYOUT as OWN_LAYOUT, OBSERVATION_NAMES};
 
 /// The file with a source's data: for a folder of Minari's the one that is in it, else the path itself.
 pub fn data_file(path: impl AsRef<Path>) -> Result<PathBuf, DatasetError> {

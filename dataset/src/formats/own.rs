@@ -7,6 +7,10 @@ use crate::recording::{Recording, RowKind};
 /// The value of the root attribute `layout` that tells this layout from D4RL's.
 pub(crate) const LAYOUT: &str = "transitions";
 
+/// The root attributes that say what the numbers of a row are called.
+pub(crate) const OBSERVATION_NAMES: &str = "observation_names";
+pub(crate) const ACTION_NAMES: &str = "action_names";
+
 /// Reads `observations`, `actions`, `rewards`, `next_observations`, `terminals` and, if there, `timeouts`. Every row is a
 /// transition, with the next observation that the file stores. Terminals and timeouts end an episode; without timeouts,
 /// so does a row whose next observation is not the following row's observation.
@@ -33,6 +37,8 @@ pub(super) fn read(file: &Hdf5File) -> Result<Recording, Problem> {
         true => (0..rows).map(|row| recording.terminals[row] || recording.timeouts[row]).collect(),
         false => (0..rows).map(|row| recording.terminals[row] || recording.jumps(&next_observations, row)).collect(),
     };
+    recording.names.observations = file.names(OBSERVATION_NAMES, observation_dim)?;
+    recording.names.actions = file.names(ACTION_NAMES, recording.action_dim)?;
     recording.next_observations = Some(next_observations);
     Ok(recording)
 }

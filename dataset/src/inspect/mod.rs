@@ -52,6 +52,10 @@ pub struct Inspection {
     /// Smallest, mean and largest score by D4RL's reference returns, where the environment is known.
     #[serde(flatten)]
     pub scores: Option<Scores>,
+    /// What the source calls the numbers of an observation; empty where they have no names.
+    pub observation_names: Vec<String>,
+    /// The same of an action.
+    pub action_names: Vec<String>,
     /// Smallest and largest reward.
     pub reward_range: Range,
     /// Smallest and largest number in an action.
@@ -165,6 +169,8 @@ pub fn inspect(
             mean_score: spec.normalised_score(sum.mean),
             max_score: spec.normalised_score(sum.max),
         }),
+        observation_names: recording.names.observations,
+        action_names: recording.names.actions,
         reward_range: Range::over(&reward_ranges),
         action_range: Range::over(&action_ranges),
         action_ranges,

@@ -17,9 +17,10 @@ impl fmt::Display for Inspection {
         writeln!(f, "  observations  {} numbers", self.observation_dim)?;
         writeln!(f, "  actions       {} numbers", self.action_dim)?;
 
-        writeln!(f, "\n  {:<14}{:>12}{:>12}{:>12}", "", "min", "mean", "max")?;
+        let wide = self.action_names.iter().map(|name| name.chars().count() + 1).fold(14, usize::max);
+        writeln!(f, "\n  {:<wide$}{:>12}{:>12}{:>12}", "", "min", "mean", "max")?;
         let mut row = |name: &str, [min, mean, max]: [f64; 3], digits: usize| {
-            writeln!(f, "  {name:<14}{min:>12.digits$}{mean:>12.digits$}{max:>12.digits$}")
+            writeln!(f, "  {name:<wide$}{min:>12.digits$}{mean:>12.digits$}{max:>12.digits$}")
         };
         row("length", [self.min_length, self.mean_length, self.max_length], 1)?;
         row("return", [self.min_return, self.mean_return, self.max_return], 2)?;
@@ -27,12 +28,12 @@ impl fmt::Display for Inspection {
             row("score", [scores.min_score, scores.mean_score, scores.max_score], 2)?;
         }
         let mut row =
-            |name: &str, range: Range| writeln!(f, "  {name:<14}{:>12.4}{:>12}{:>12.4}", range.min, "", range.max);
+            |name: &str, range: Range| writeln!(f, "  {name:<wide$}{:>12.4}{:>12}{:>12.4}", range.min, "", range.max);
         row("reward", self.reward_range)?;
         row("observation", self.observation_range)?;
         row("action", self.action_range)?;
         for (i, range) in self.action_ranges.iter().enumerate() {
-            row(&format!("action {i}"), *range)?;
+            row(self.action_names.get(i).unwrap_or(&format!("action {i}")), *range)?;
         }
 
         write!(f, "\nreturns of the episodes\n{}", self.returns)?;

@@ -34,7 +34,7 @@ fn without_rewards_there_is_nothing_to_learn() {
     let Some((_folder, path)) = written("goals") else { return };
     let error = error(&path);
     assert!(error.to_string().ends_with("array `rewards` is missing"), "{error}");
-    assert!(error.hint().contains("make_env_and_datasets"), "{}", error.hint());
+    assert!(error.hint().contains("quad-convert ogbench:NAME"), "{}", error.hint());
 }
 
 #[test]

@@ -2,7 +2,7 @@
 
 use std::path::Path;
 
-use quad_dataset::{Arrays, DatasetError, RewardRule, Transitions, inspect, write_own};
+use quad_dataset::{Arrays, DatasetError, Names, RewardRule, Transitions, inspect, write_own};
 use tempfile::tempdir;
 
 use crate::{all, peers, peers_in, read, try_read};
@@ -107,8 +107,10 @@ fn arrays() -> Arrays {
 fn arrays_are_written_and_read_again() {
     let folder = tempdir().unwrap();
     let path = folder.path().join("new/own.hdf5");
-    write_own(&path, Arrays { rewards: vec![0.0; 6], ..arrays() }).unwrap();
-    write_own(&path, arrays()).unwrap();
+    let names = ["x", "y", "θ", "left", "right"].map(str::to_owned);
+    let names = Names { observations: names[..3].to_vec(), actions: names[3..].to_vec() };
+    write_own(&path, Arrays { rewards: vec![0.0; 6], ..arrays() }, Names::default()).unwrap();
+    write_own(&path, arrays(), names.clone()).unwrap();
     let files: Vec<_> = std::fs::read_dir(path.parent().unwrap()).unwrap().map(|file| file.unwrap().path()).collect();
     assert_eq!(files, std::slice::from_ref(&path), "nothing partial is left, and what was there is replaced");
 
@@ -121,17 +123,22 @@ fn arrays_are_written_and_read_again() {
     assert!(error.hint().contains("--scale actions"), "{}", error.hint());
 
     let small = Arrays { actions: vec![0.25; 12], ..arrays() };
-    write_own(&path, small.clone()).unwrap();
-    let (from_file, from_arrays) = (try_read(&path, None).unwrap(), Transitions::of(small).unwrap());
+    write_own(&path, small.clone(), names.clone()).unwrap();
+    let (from_file, from_arrays) = (try_read(&path, None).unwrap(), Transitions::of(small.clone()).unwrap());
     assert_eq!(all(&from_file), all(&from_arrays));
     assert_eq!(from_file.statistics(), from_arrays.statistics());
+    assert_eq!((from_file.names(), from_arrays.names()), (&names, &Names::default()));
+    let few = Names { actions: Vec::new(), observations: names.observations[1..].to_vec() };
+    write_own(&path, small, few).unwrap();
+    let error = try_read(&path, None).err().unwrap();
+    assert!(error.to_string().ends_with("the attribute `observation_names` has 2 texts, but a row has 3 numbers"));
 }
 
 #[test]
 fn arrays_that_would_be_refused_are_not_written() {
     let folder = tempdir().unwrap();
     let path = folder.path().join("own.hdf5");
-    let refused = |arrays: Arrays| write_own(&path, arrays).unwrap_err().problem.to_string();
+    let refused = |arrays: Arrays| write_own(&path, arrays, Names::default()).unwrap_err().problem.to_string();
     let broken = |spoil: fn(&mut Arrays)| {
         let mut arrays = arrays();
         spoil(&mut arrays);

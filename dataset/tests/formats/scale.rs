@@ -2,7 +2,7 @@
 
 use std::path::PathBuf;
 
-use quad_dataset::{Arrays, Batch, ReadOptions, RewardRule, Scale, Transitions, write_own};
+use quad_dataset::{Arrays, Batch, Names, ReadOptions, RewardRule, Scale, Transitions, write_own};
 use tempfile::{TempDir, tempdir};
 
 use crate::{all, assert_close};
@@ -26,7 +26,7 @@ fn arrays() -> Arrays {
 fn file() -> (TempDir, PathBuf) {
     let folder = tempdir().unwrap();
     let path = folder.path().join("own.hdf5");
-    write_own(&path, arrays()).unwrap();
+    write_own(&path, arrays(), Names::default()).unwrap();
     (folder, path)
 }
 

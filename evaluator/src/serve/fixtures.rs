@@ -34,5 +34,5 @@ pub fn file(environment: &str, shape: DiffusionShape, candidates: u32) -> Vec<u8
     let policy = PolicyConfig::Diffusion { shape, choice: Choice::best_of(candidates) };
     let tensors = policy.tensors(|layout| Tensor::zeros(layout.count(), DType::F32, &Device::Cpu)).unwrap();
     let origin = Origin { environment: environment.to_owned(), seed: 1, step: 1, episodes: 2 };
-    Header { policy, scaling: None, origin }.to_safetensors(&tensors).unwrap()
+    Header::new(policy, origin).to_safetensors(&tensors).unwrap()
 }

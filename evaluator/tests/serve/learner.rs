@@ -60,7 +60,7 @@ pub fn file(candidates: u32) -> Vec<u8> {
     let policy = PolicyConfig::Diffusion { shape, choice: Choice::best_of(candidates) };
     let tensors = policy.tensors(|layout| Weights::initial(layout, &mut generator, &Device::Cpu)).unwrap();
     let origin = Origin { environment: "hopper".to_owned(), seed: 1, step: 10, episodes: 3 };
-    Header { policy, scaling: None, origin }.to_safetensors(&tensors).unwrap()
+    Header::new(policy, origin).to_safetensors(&tensors).unwrap()
 }
 
 pub fn name(text: &str) -> Name {

@@ -23,7 +23,7 @@ fn write_seeds() {
     let file = |policy: PolicyConfig, scaling| {
         let halves = |layout: &Layout| Tensor::full(0.5f32, layout.count(), &Device::Cpu);
         let tensors = policy.tensors(halves).unwrap();
-        Header { policy, scaling, origin: () }.to_safetensors(&tensors).unwrap()
+        Header { scaling, ..Header::new(policy, ()) }.to_safetensors(&tensors).unwrap()
     };
     let layers = MlpConfig::mish(&[2; 3]);
     let diffusion = |rule: Rule| {

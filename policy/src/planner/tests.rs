@@ -26,7 +26,7 @@ fn file(shape: PlannerShape, plans: u32) -> Vec<u8> {
     let generator = &mut ChaCha8Rng::seed_from_u64(5);
     let policy = PolicyConfig::Planner { shape, choice: Choice::best_of(plans) };
     let tensors = policy.tensors(|layout| Weights::initial(layout, generator, &Device::Cpu)).unwrap();
-    Header { policy, scaling: None, origin: () }.to_safetensors(&tensors).unwrap()
+    Header::new(policy, ()).to_safetensors(&tensors).unwrap()
 }
 
 fn policy(replan_every: usize, plans: u32) -> Box<dyn Policy> {
@@ -105,7 +105,7 @@ fn a_shape_out_of_range_is_refused() {
         let mut shape = shape(2);
         change(&mut shape);
         let policy = PolicyConfig::Planner { shape, choice: Choice::best_of(1) };
-        let file = Header { policy, scaling: None, origin: () }.to_safetensors(&Tensors::new()).unwrap();
+        let file = Header::new(policy, ()).to_safetensors(&Tensors::new()).unwrap();
         matches!(load_policy(&file, Precision::F32), Err(PolicyError::Range { .. }))
     };
     assert!(refused(|shape| shape.replan_every = 5) && refused(|shape| shape.replan_every = 0));

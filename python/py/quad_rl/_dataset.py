@@ -1,42 +1,42 @@
-"""Data from arrays."""
+"""Data from arrays, and from other programs' files."""
 
 from __future__ import annotations
 
 import json
 import tempfile
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable
 from os import PathLike
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from quad_rl import _quad_rl
-
-_NAMES = {"terminations": "terminated", "truncations": "truncated"}
-
-
-class _Rows(NamedTuple):
-    """Transitions as the file has them."""
-
-    observations: NDArray[np.float32]
-    actions: NDArray[np.float32]
-    rewards: NDArray[np.float32]
-    next_observations: NDArray[np.float32]
-    terminals: NDArray[np.bool_]
-    timeouts: NDArray[np.bool_]
+from quad_rl._rows import Rows, episode_rows, followed, rows_of
+from quad_rl.readers import d3rlpy, frame, lerobot, minari, ogbench, robomimic
 
 
 class Dataset:
     """Recorded transitions, to be trained on with `learner train --task own-data --dataset FILE`.
 
-    Made by `from_arrays` or `from_episodes`; `save` writes the file. `len` is the number of transitions; `repr` is a line,
-    `print` shows what is in it and what looks wrong.
+    Made by one of the functions `from_…`; `save` writes the file. `len` is the number of transitions; `repr` is a line,
+    `print` shows what is in it, what looks wrong, and `notes`, what to know of how a source was read.
     """
 
-    def __init__(self, rows: _Rows) -> None:
+    from_d3rlpy = staticmethod(d3rlpy.from_d3rlpy)
+    from_frame = staticmethod(frame.from_frame)
+    from_lerobot = staticmethod(lerobot.from_lerobot)
+    from_minari = staticmethod(minari.from_minari)
+    from_ogbench = staticmethod(ogbench.from_ogbench)
+    from_robomimic = staticmethod(robomimic.from_robomimic)
+
+    def __init__(
+        self, rows: Rows, names: tuple[list[str], list[str]] = ([], []), notes: Iterable[str] = ()
+    ) -> None:
         self._rows = rows
+        self._names = names
+        self._notes = list(notes)
 
     @staticmethod
     def from_arrays(
@@ -60,8 +60,8 @@ class Dataset:
 
         Raises ValueError for shapes that do not fit one another, for whole numbers as actions, and for NaN, with the row.
         """
-        rows = _rows("", observations, actions, rewards, terminations, truncations, next_observations)
-        return Dataset(rows if next_observations is not None else _followed(rows))
+        rows = rows_of("", observations, actions, rewards, terminations, truncations, next_observations)
+        return Dataset(rows if next_observations is not None else followed(rows))
 
     @staticmethod
     def from_episodes(episodes: Iterable[Any]) -> Dataset:
@@ -76,11 +76,11 @@ class Dataset:
 
         Raises ValueError as `from_arrays`, with the episode, counted from 0.
         """
-        parts = [_episode(f"episode {i}: ", episode) for i, episode in enumerate(episodes)]
+        parts = [episode_rows(f"episode {i}: ", episode) for i, episode in enumerate(episodes)]
         if not parts:
             raise ValueError("there is no episode")
         try:
-            return Dataset(_Rows(*(np.concatenate(arrays) for arrays in zip(*parts))))
+            return Dataset(Rows(*(np.concatenate(arrays) for arrays in zip(*parts))))
         except ValueError as error:
             raise ValueError(f"all episodes must have observations and actions of the same size: {error}") from None
 
@@ -90,7 +90,7 @@ class Dataset:
         Raises ValueError with a hint for what training refuses, such as rows without the end of any episode, or a disk that
         does not take it.
         """
-        _quad_rl.write_dataset(path, *self._rows)
+        _quad_rl.write_dataset(path, *self._rows, *self._names)
 
     def inspect(self) -> dict[str, Any]:
         """What is in it, and what looks wrong: the dictionary of `learner datasets inspect --json`. Raises as `save`."""
@@ -104,6 +104,21 @@ class Dataset:
             json_text, page = _quad_rl.inspect_dataset(path)
         return json_text.replace(str(path), "from arrays"), page.replace(str(path), "from arrays")
 
+    @property
+    def notes(self) -> list[str]:
+        """What to know of how a source was read, a sentence each, such as what was left out."""
+        return list(self._notes)
+
+    @property
+    def observation_names(self) -> list[str]:
+        """What the source calls the numbers of an observation, as the file and the policy have it; empty without names."""
+        return list(self._names[0])
+
+    @property
+    def action_names(self) -> list[str]:
+        """What the source calls the numbers of an action."""
+        return list(self._names[1])
+
     def __len__(self) -> int:
         return len(self._rows.rewards)
 
@@ -112,88 +127,7 @@ class Dataset:
         return f"Dataset({len(self)} transitions, observations of {o} numbers, actions of {a})"
 
     def __str__(self) -> str:
-        return self._inspected()[1]
+        page = self._inspected()[1]
+        return page + "".join(["\n\nas it was read" if self._notes else "", *(f"\n  - {note}" for note in self._notes)])
 
 
-def _episode(where: str, episode: Any) -> _Rows:
-    def of(name: str) -> Any:
-        for name in (name, _NAMES.get(name, name)):
-            if isinstance(episode, Mapping) and name in episode:
-                return episode[name]
-            if hasattr(episode, name):
-                return getattr(episode, name)
-        raise ValueError(f"{where}there are no {name}")
-
-    steps = len(of("rewards"))
-    if not steps:
-        raise ValueError(f"{where}it has no step")
-    ends = []
-    for name in _NAMES:
-        flags = np.asarray(of(name))
-        ends.append(flags if flags.ndim else np.arange(steps) == (steps - 1 if flags else steps))
-    observations = np.asarray(of("observations"))
-    after = observations[1:] if len(observations) == steps + 1 else None
-    rows = _rows(where, observations[:steps], of("actions"), of("rewards"), ends[0], ends[1], after)
-    if after is None:
-        return _followed(rows)
-    rows.timeouts[-1] |= not rows.terminals[-1]
-    return rows
-
-
-def _rows(
-    where: str,
-    observations: ArrayLike,
-    actions: ArrayLike,
-    rewards: ArrayLike,
-    terminations: ArrayLike,
-    truncations: ArrayLike,
-    next_observations: ArrayLike | None,
-) -> _Rows:
-    if np.asarray(actions).dtype.kind in "iub":
-        raise ValueError(f"{where}actions are whole numbers, as if they were discrete; only continuous ones can be learnt")
-    r = _array(where, "rewards", rewards, None, 1)
-    n = len(r)
-    o = _array(where, "observations", observations, n, 2)
-    return _Rows(
-        o,
-        _array(where, "actions", actions, n, 2),
-        r,
-        o if next_observations is None else _array(where, "next_observations", next_observations, n, 2, o.shape[1]),
-        _array(where, "terminations", terminations, n, 1) != 0,
-        _array(where, "truncations", truncations, n, 1) != 0,
-    )
-
-
-def _array(
-    where: str, name: str, values: ArrayLike, rows: int | None, axes: int, width: int | None = None
-) -> NDArray[np.float32]:
-    """Finite numbers, N or N × width."""
-    with np.errstate(over="ignore"):
-        array = np.ascontiguousarray(values, dtype=np.float32)
-    shape, n = list(array.shape), "N" if rows is None else rows
-    if array.ndim == 1 and axes == 2 or shape[1:] == [1] and axes == 1:
-        array = array.reshape([-1, 1][:axes])
-    if array.ndim != axes or rows not in (None, len(array)) or width not in (None, array.shape[-1]):
-        expected = f"[{n}, {width or 'k'}]" if axes == 2 else f"[{n}]"
-        raise ValueError(f"{where}{name} has shape {shape}, but must have {expected}")
-    bad = np.argwhere(~np.isfinite(array))
-    if len(bad):
-        (row, *column), rows = bad[0], len(set(bad[:, 0]))
-        number = f"number {column[0]}" if column else "it"
-        value = array[tuple(bad[0])]
-        raise ValueError(f"{where}{name}, row {row}: {number} is {value}, but must be a finite float32 ({rows} such rows)")
-    return array
-
-
-def _followed(rows: _Rows) -> _Rows:
-    """The same steps with what follows them, without those of which that is not known."""
-    o, terminals, timeouts = rows.observations, rows.terminals, rows.timeouts
-    after = np.concatenate([o[1:], o[-1:]])
-    after[terminals] = o[terminals]  # Not learnt from.
-    dropped = timeouts & ~terminals
-    dropped[-1:] |= ~terminals[-1:]
-    # An episode of which the last step is dropped ends with the one before.
-    ends = timeouts & terminals
-    ends[:-1] |= dropped[1:] & ~terminals[:-1]
-    kept = ~dropped
-    return _Rows(o[kept], rows.actions[kept], rows.rewards[kept], after[kept], terminals[kept], ends[kept])

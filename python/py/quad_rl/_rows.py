@@ -1,0 +1,106 @@
+"""Transitions as arrays, each checked."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+_NAMES = {"terminations": "terminated", "truncations": "truncated"}
+
+
+class Rows(NamedTuple):
+    """Transitions as the file has them."""
+
+    observations: NDArray[np.float32]
+    actions: NDArray[np.float32]
+    rewards: NDArray[np.float32]
+    next_observations: NDArray[np.float32]
+    terminals: NDArray[np.bool_]
+    timeouts: NDArray[np.bool_]
+
+
+def episode_rows(where: str, episode: Any) -> Rows:
+    def of(name: str) -> Any:
+        for name in (name, _NAMES.get(name, name)):
+            if isinstance(episode, Mapping) and name in episode:
+                return episode[name]
+            if hasattr(episode, name):
+                return getattr(episode, name)
+        raise ValueError(f"{where}there are no {name}")
+
+    steps = len(of("rewards"))
+    if not steps:
+        raise ValueError(f"{where}it has no step")
+    ends = []
+    for name in _NAMES:
+        flags = np.asarray(of(name))
+        ends.append(flags if flags.ndim else np.arange(steps) == (steps - 1 if flags else steps))
+    observations = np.asarray(of("observations"))
+    after = observations[1:] if len(observations) == steps + 1 else None
+    rows = rows_of(where, observations[:steps], of("actions"), of("rewards"), ends[0], ends[1], after)
+    if after is None:
+        return followed(rows)
+    rows.timeouts[-1] |= not rows.terminals[-1]
+    return rows
+
+
+def rows_of(
+    where: str,
+    observations: ArrayLike,
+    actions: ArrayLike,
+    rewards: ArrayLike,
+    terminations: ArrayLike,
+    truncations: ArrayLike,
+    next_observations: ArrayLike | None,
+) -> Rows:
+    if np.asarray(actions).dtype.kind in "iub":
+        raise ValueError(f"{where}actions are whole numbers, as if they were discrete; only continuous ones can be learnt")
+    r = _array(where, "rewards", rewards, None, 1)
+    n = len(r)
+    o = _array(where, "observations", observations, n, 2)
+    return Rows(
+        o,
+        _array(where, "actions", actions, n, 2),
+        r,
+        o if next_observations is None else _array(where, "next_observations", next_observations, n, 2, o.shape[1]),
+        _array(where, "terminations", terminations, n, 1) != 0,
+        _array(where, "truncations", truncations, n, 1) != 0,
+    )
+
+
+def _array(
+    where: str, name: str, values: ArrayLike, rows: int | None, axes: int, width: int | None = None
+) -> NDArray[np.float32]:
+    """Finite numbers, N or N × width."""
+    with np.errstate(over="ignore"):
+        array = np.ascontiguousarray(values, dtype=np.float32)
+    shape, n = list(array.shape), "N" if rows is None else rows
+    if array.ndim == 1 and axes == 2 or shape[1:] == [1] and axes == 1:
+        array = array.reshape([-1, 1][:axes])
+    if array.ndim != axes or rows not in (None, len(array)) or width not in (None, array.shape[-1]):
+        expected = f"[{n}, {width or 'k'}]" if axes == 2 else f"[{n}]"
+        raise ValueError(f"{where}{name} has shape {shape}, but must have {expected}")
+    bad = np.argwhere(~np.isfinite(array))
+    if len(bad):
+        (row, *column), rows = bad[0], len(set(bad[:, 0]))
+        number = f"number {column[0]}" if column else "it"
+        value = array[tuple(bad[0])]
+        raise ValueError(f"{where}{name}, row {row}: {number} is {value}, but must be a finite float32 ({rows} such rows)")
+    return array
+
+
+def followed(rows: Rows) -> Rows:
+    """The same steps with what follows them, without those of which that is not known."""
+    o, terminals, timeouts = rows.observations, rows.terminals, rows.timeouts
+    after = np.concatenate([o[1:], o[-1:]])
+    after[terminals] = o[terminals]  # Not learnt from.
+    dropped = timeouts & ~terminals
+    dropped[-1:] |= ~terminals[-1:]
+    # An episode of which the last step is dropped ends with the one before.
+    ends = timeouts & terminals
+    ends[:-1] |= dropped[1:] & ~terminals[:-1]
+    kept = ~dropped
+    return Rows(o[kept], rows.actions[kept], rows.rewards[kept], after[kept], terminals[kept], ends[kept])

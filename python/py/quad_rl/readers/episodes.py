@@ -1,0 +1,202 @@
+"""From a source's episodes to a Dataset: which columns are seen, what is rewarded, what ends the task."""
+
+from __future__ import annotations
+
+import importlib
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, NamedTuple, Union
+
+import numpy as np
+from numpy.typing import NDArray
+
+from quad_rl import _dataset
+from quad_rl._rows import Rows, episode_rows
+
+# A word or the name of a column, or a function of an episode, which is a dictionary of its columns, T rows each, and `episode`,
+# its number or name.
+Rule = Union[str, Callable[[Mapping[str, Any]], Any], None]
+# Also the successful episodes' numbers or names, or a flag for each episode.
+Success = Union[Rule, Sequence[Any]]
+_OF_SUCCESS = {"success-at-end": (0.0, 1.0), "step-cost": (-1.0, 0.0)}
+
+
+class Episode(NamedTuple):
+    """T steps, T > 0."""
+
+    name: Any  # Its number or name in the source.
+    columns: dict[str, NDArray[Any]]  # A row each step.
+    last: dict[str, NDArray[Any]]  # A row each: what was observed after the last step. Empty if that is not stored.
+
+
+class Log(NamedTuple):
+    """What a source has."""
+
+    episodes: list[Episode]
+    notes: list[str]  # What to know of how it was read.
+    there: Sequence[str] = ()  # All columns, also those that were not read.
+    names: Mapping[str, Sequence[str]] = {}  # What columns call their numbers, where they do.
+    reward: str = ""  # The column with rewards, if there is one; `success` and `done`, which is set at any end, likewise.
+    success: str = ""
+    done: str = ""
+    end: str = "terminate"  # What the reader calls `terminate`.
+
+
+def library(module: str, extra: str) -> Any:
+    """An optional library."""
+    try:
+        return importlib.import_module(module)
+    except ImportError as error:
+        package = module.split(".")[0]
+        hint = f"hint: pip install {package}, which the extra {extra!r} of quad-rl names"
+        raise ImportError(f"reading this needs {package}: {error}\n{hint}") from None
+
+
+def columns_of(*rules: Any) -> set[str] | None:
+    """The columns that these rules name, words among them; None, all of them, where a function may look at any."""
+    rules = tuple([rule] if isinstance(rule, str) or callable(rule) else rule for rule in rules if rule is not None)
+    flat = [name for rule in rules for name in rule]
+    return None if any(map(callable, flat)) else {name for name in flat if isinstance(name, str)}
+
+
+def width(array: NDArray[Any]) -> int:
+    """Numbers in a row."""
+    return int(np.prod(array.shape[1:]))
+
+
+def dataset(
+    log: Log, observations: Sequence[str], actions: Sequence[str], reward: Rule, success: Success, terminate: Rule
+) -> _dataset.Dataset:
+    """The transitions of a source. Raises ValueError, with a hint, for what it does not have and nothing else says."""
+    if isinstance(observations, str) or isinstance(actions, str):
+        raise ValueError("observations and actions are lists of columns")
+    episodes, notes, count = log.episodes, log.notes, len(log.episodes)
+    if not episodes:
+        raise ValueError("\n".join(["there is no episode", *notes]))
+    for name in [*observations, *actions]:
+        _check(log, name)
+    won = _successes(log, success)
+    reward, terminate = _reward(log, reward, won), _terminate(log, terminate, won)
+    parts, lost, open_ended = [], 0, 0
+    for episode, has_won in zip(episodes, won or [False] * count):
+        steps = len(episode.columns[actions[0]])
+        ends = _flags(terminate, episode, has_won, steps)
+        rewards = _rewards(reward, episode, has_won, steps)
+        seen = [_beside(part, observations) for part in (episode.columns, episode.last) if part]
+        open_ended += not episode.last and not ends[-1]
+        lost += has_won and not episode.last and not ends[-1] and reward in _OF_SUCCESS
+        rows = {"observations": np.concatenate(seen), "actions": _beside(episode.columns, actions), "rewards": rewards}
+        parts.append(episode_rows(f"episode {episode.name}: ", {**rows, "terminated": ends, "truncated": False}))
+    if lost:
+        pays = f"reward={reward!r} pays at the last step, which is dropped where an episode does not terminate: {lost} of {count}"
+        raise ValueError(f'{pays}\nhint: {log.end}="success", or rewards of your own')
+    if open_ended:
+        notes.append(f"{open_ended} of {count} episodes: the last step is dropped, as what followed it is not stored and nothing "
+                     "terminates there")
+    empty = sum(not len(part.rewards) for part in parts)
+    if empty:
+        notes.append(f"{empty} of {count} episodes dropped: of a single step, without what followed it")
+    names = [[name for column in columns for name in _names(log, column)] for columns in (observations, actions)]
+    return _dataset.Dataset(Rows(*(np.concatenate(arrays) for arrays in zip(*parts))), (names[0], names[1]), notes)
+
+
+def _check(log: Log, name: str) -> None:
+    columns = log.episodes[0].columns
+    if name not in columns:
+        raise ValueError(f"there is no column {name!r}\nhint: there are {', '.join(map(repr, log.there or columns))}")
+    if columns[name].dtype.kind not in "fiub":
+        raise ValueError(f"column {name!r} holds {columns[name].dtype}, no numbers")
+
+
+def _names(log: Log, column: str) -> list[str]:
+    array, given = log.episodes[0].columns[column], log.names.get(column, ())
+    if len(given) == width(array):
+        return [f"{column}.{name}" for name in given]
+    return [column] if array.ndim == 1 else [f"{column}[{i}]" for i in range(width(array))]
+
+
+def _beside(columns: Mapping[str, NDArray[Any]], names: Sequence[str]) -> NDArray[Any]:
+    return np.concatenate([columns[name].reshape(len(columns[name]), -1) for name in names], axis=1)
+
+
+def _call(rule: Callable[[Mapping[str, Any]], Any], episode: Episode) -> Any:
+    return rule({"episode": episode.name, **episode.columns})
+
+
+def _successes(log: Log, rule: Success) -> list[bool] | None:
+    rule = log.success or None if rule is None else rule
+    if rule is None:
+        return None
+    if callable(rule):
+        return [bool(_call(rule, episode)) for episode in log.episodes]
+    if isinstance(rule, str):
+        if rule == "all":
+            return [True] * len(log.episodes)
+        _check(log, rule)
+        return [bool(np.any(episode.columns[rule] > 0)) for episode in log.episodes]
+    listed, names = list(rule), [episode.name for episode in log.episodes]
+    if listed and all(isinstance(flag, (bool, np.bool_)) for flag in listed):
+        if len(listed) != len(names):
+            raise ValueError(f"success has {len(listed)} flags, but there are {len(names)} episodes\nhint: list their numbers")
+        return [bool(flag) for flag in listed]
+    strangers = [name for name in listed if name not in names]
+    if strangers:
+        raise ValueError(f"success names episodes that are not there: {strangers[:5]} ({len(strangers)} such)")
+    return [name in listed for name in names]
+
+
+def _reward(log: Log, rule: Rule, won: list[bool] | None) -> Rule:
+    rule = rule or log.reward
+    ways = '"success-at-end" (1 there), "step-cost" (-1 a step, 0 there), a column, or a function of the episode'
+    if not rule:
+        raise ValueError(f"nothing says what is rewarded\nhint: reward={ways}")
+    if rule in _OF_SUCCESS:
+        if won is None:
+            ways = 'success= a column, "all", a list of episodes, or a function of the episode'
+            raise ValueError(f"reward={rule!r} needs to know which episodes are successes\nhint: {ways}")
+        log.notes.append(f"{sum(won)} of {len(won)} episodes are successes")
+    elif isinstance(rule, str):
+        _check(log, rule)
+    return rule
+
+
+def _terminate(log: Log, rule: Rule, won: list[bool] | None) -> Rule:
+    done = [bool(log.done and np.any(episode.columns[log.done] > 0)) for episode in log.episodes]
+    unsure = sum(ends and not success for ends, success in zip(done, won or [False] * len(done)))
+    at = f"{unsure} of {len(done)} episodes have {log.done} without a success, as at a time limit"
+    ways = f'{log.end}="success" (with success=…), "never", "{log.done or "a column"}", or a function of the episode'
+    if rule is None and won is None and unsure:
+        raise ValueError(f"{at}: nothing says whether the task was over there\nhint: {ways}")
+    if rule is None and won is None:
+        log.notes.append(f"no episode terminates, as nothing says where the task was over ({ways})")
+        return "never"
+    rule = rule or "success"
+    if rule == "success" and won is None:
+        raise ValueError(f'{log.end}="success" needs success= a column, "all", a list of episodes, or a function of the episode')
+    if isinstance(rule, str) and rule not in ("success", "never"):
+        _check(log, rule)
+    if won is not None and unsure and rule in ("success", log.done):
+        log.notes.append(f"{at}: they count as {'terminated' if rule == log.done else 'cut off'}")
+    return rule
+
+
+def _flags(rule: Rule, episode: Episode, has_won: bool, steps: int) -> NDArray[np.bool_]:
+    """Whether the task was over after each step."""
+    if callable(rule) or rule not in ("success", "never"):
+        given = np.asarray(_call(rule, episode) if callable(rule) else episode.columns[str(rule)])
+        if given.ndim:
+            return given.reshape(-1) > 0
+        has_won = bool(given)
+    ends = np.zeros(steps, bool)
+    ends[-1] = has_won and rule != "never"
+    return ends
+
+
+def _rewards(rule: Rule, episode: Episode, has_won: bool, steps: int) -> Any:
+    if callable(rule):
+        return _call(rule, episode)
+    if rule not in _OF_SUCCESS:
+        return episode.columns[str(rule)]
+    step, end = _OF_SUCCESS[str(rule)]
+    rewards = np.full(steps, step)
+    rewards[-1] = end if has_won else step
+    return rewards

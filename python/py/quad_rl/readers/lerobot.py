@@ -1,0 +1,178 @@
+"""LeRobot's folders of Parquet files, v3.0 (many episodes a file) and v2.x (one).
+
+What they hold: `src/lerobot/datasets` of huggingface/lerobot, 0.4 and 0.3.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from os import PathLike
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from quad_rl import _dataset
+from quad_rl.readers.arrow import array_of
+from quad_rl.readers.episodes import Episode, Log, Rule, Success, columns_of, dataset, library
+
+Columns = dict[str, NDArray[Any]]
+_REWARD, _SUCCESS, _DONE = "next.reward", "next.success", "next.done"
+_INDEX = ["episode_index", "frame_index"]
+_UNFINISHED = "unreadable, as files are of recordings that were not finalized: "
+
+
+def from_lerobot(
+    folder: str | PathLike[str],
+    *,
+    observations: Sequence[str],
+    action: str = "action",
+    reward: Rule = None,
+    success: Success = None,
+    terminate: Rule = None,
+    task: str | None = None,
+) -> _dataset.Dataset:
+    """A LeRobot dataset, v3.0 or v2.x: the folder with `meta/info.json`. Needs pyarrow.
+
+    observations: its features that are seen, in this order, such as ["observation.state"]; no images or videos. Their numbers
+        keep their units, and their names in the file and in the policy. action: the feature that is done.
+    reward, success: as in `from_frame`, columns being features and names `episode_index`. By default `next.reward` and
+        `next.success`, where these were recorded.
+    terminate: as `terminal` in `from_frame`. `next.done` is also set at time limits.
+    task: the only task to be read, in its words; "all" for all of them.
+
+    LeRobot stores no observation after the last step, which is dropped in episodes that do not terminate. Frames after a
+    `next.done` are no steps: the first of them is the observation that the episode ended with. `notes` of the result counts
+    what was left out. Raises ValueError for what has to be said and is not, ImportError without pyarrow.
+    """
+    root = Path(folder)
+    if not (root / "meta/info.json").is_file():
+        raise ValueError(f"{root} is no LeRobot dataset: there is no meta/info.json")
+    info = json.loads((root / "meta/info.json").read_text())
+    version, features = str(info.get("codebase_version")), info["features"]
+    if not version.startswith(("v2.", "v3.")):
+        raise ValueError(f"{root}: a LeRobot dataset of version {version}, but v2.x and v3.x are read\nhint: LeRobot converts it")
+    images = [name for name, feature in features.items() if feature["dtype"] in ("image", "video")]
+    for name in {*observations, action} & {*images}:
+        raise ValueError(f"{root}: {name} is {features[name]['dtype']}, but only rows of numbers are learnt from")
+    notes = [f"left out: {len(images)} streams of images ({', '.join(images)})"] if images else []
+    words = columns_of(observations, action, reward, success, terminate)
+    plain = [name for name in features if name not in images and features[name]["dtype"] not in ("string", "language")]
+    wanted = {_REWARD, _SUCCESS, _DONE, "task_index", *_INDEX, *(plain if words is None else words)}
+    columns, unreadable = _frames(root, [name for name in plain if name in wanted])
+    parts = _of_task(root, _whole(root, columns, info, unreadable, notes), task, notes)
+    of = {part: name if name in columns else "" for part, name in (("reward", _REWARD), ("success", _SUCCESS), ("done", _DONE))}
+    episodes = _cut(parts, of["done"], notes)
+    if of["reward"] and of["success"] and reward in (None, _REWARD):
+        _suspect_shift(episodes, notes)
+    names = {name: _names(feature.get("names")) for name, feature in features.items()}
+    return dataset(Log(episodes, notes, plain, names, **of), observations, [action], reward, success, terminate)
+
+
+def _frames(root: Path, wanted: list[str]) -> tuple[Columns, list[str]]:
+    """The columns of all files, and the files that cannot be read. Where episodes lie is not looked up: converters err."""
+    parts: list[Columns] = []
+    unreadable = []
+    for path in sorted((root / "data").glob("**/*.parquet")):
+        try:
+            table = library("pyarrow.parquet", "lerobot").ParquetFile(path).read(wanted)
+        except (library("pyarrow", "lerobot").ArrowInvalid, OSError):
+            unreadable.append(str(path.relative_to(root)))
+            continue
+        parts.append({name: array_of(table[name], name, str(path)) for name in table.column_names})
+    there = [name for name in wanted if parts and all(name in part for part in parts)]
+    if not {*_INDEX} <= {*there}:
+        why = f"; {_UNFINISHED}{', '.join(unreadable)}" if unreadable else ""
+        raise ValueError(f"{root}: no Parquet file in data has {' and '.join(_INDEX)}{why}")
+    return {name: np.concatenate([part[name] for part in parts]) for name in there}, unreadable
+
+
+def _meta(root: Path, name: str) -> list[dict[str, Any]]:
+    """Rows of meta/NAME: lines of JSON in v2, Parquet in v3."""
+    lines = root / f"meta/{name}.jsonl"
+    if lines.exists():
+        return [json.loads(line) for line in lines.read_text().splitlines()]
+    parquet, rows = library("pyarrow.parquet", "lerobot"), []
+    for file in sorted((root / "meta").glob(f"{name}*/**/*.parquet")) + sorted((root / "meta").glob(f"{name}.parquet")):
+        opened = parquet.ParquetFile(file)
+        rows += opened.read([column for column in opened.schema_arrow.names if "/" not in column]).to_pylist()
+    return rows
+
+
+def _whole(
+    root: Path, columns: Columns, info: Mapping[str, Any], unreadable: list[str], notes: list[str]
+) -> dict[int, Columns]:
+    """The episodes that have each frame once, in its order."""
+    try:
+        lengths = {row["episode_index"]: row["length"] for row in _meta(root, "episodes")}
+    except (library("pyarrow", "lerobot").ArrowInvalid, OSError):
+        lengths = {}
+    of, frame = (columns[name].reshape(-1) for name in _INDEX)
+    order = np.lexsort((frame, of))
+    numbers, first = np.unique(of[order], return_index=True)
+    parts = zip(*(np.split(array[order], first[1:]) for array in columns.values()))
+    there = {int(number): dict(zip(columns, part)) for number, part in zip(numbers, parts)}
+    kept, total = {}, max(int(info.get("total_episodes", 0)), len(there))
+    for number, part in there.items():
+        frames = part["frame_index"].reshape(-1)
+        if np.array_equal(frames, np.arange(lengths.get(number, len(frames)))):
+            kept[number] = part
+    broken = [str(number) for number in there if number not in kept]
+    if broken:
+        some = ", ".join(broken[:5]) + (", …" if len(broken) > 5 else "")
+        notes.append(f"{len(broken)} of {total} episodes dropped: frames are missing or there twice (episode {some})")
+    if unreadable or len(there) < total:
+        why = _UNFINISHED + ", ".join(unreadable) if unreadable else "their rows are in no file"
+        notes.append(f"{total - len(there)} of {total} episodes dropped: {why}")
+    return kept
+
+
+def _of_task(root: Path, parts: dict[int, Columns], task: str | None, notes: list[str]) -> dict[int, Columns]:
+    of = {number: int(part["task_index"].reshape(-1)[0]) if "task_index" in part else 0 for number, part in parts.items()}
+    counts = {index: list(of.values()).count(index) for index in sorted(set(of.values()))}
+    if task == "all" or (task is None and len(counts) < 2):
+        return parts
+    # The other column of v3's is pandas's index, under any name.
+    texts = {row["task_index"]: next(row[name] for name in row if name != "task_index") for row in _meta(root, "tasks")}
+    chosen = [index for index in counts if texts.get(index) == task]
+    if not chosen:
+        told = ", ".join(f"{texts.get(index, index)!r} ({count} episodes)" for index, count in counts.items())
+        hint = 'hint: task="…" reads one of them; task="all" all, which only an observation can tell apart'
+        raise ValueError(f"{root}: {f'no task {task!r}' if task else 'several tasks'}: {told}\n{hint}")
+    notes.append(f"{len(parts) - counts[chosen[0]]} of {len(parts)} episodes dropped: of another task than {task!r}")
+    return {number: part for number, part in parts.items() if of[number] == chosen[0]}
+
+
+def _names(names: Any) -> list[str]:
+    """LeRobot has a list, a list in a dictionary, the place of each name, or nothing."""
+    if isinstance(names, Mapping):
+        if all(isinstance(place, int) for place in names.values()):
+            return sorted(names, key=lambda name: int(names[name]))
+        return [name for part in names.values() for name in _names(part)]
+    return [str(name) for name in names or ()]
+
+
+def _cut(parts: dict[int, Columns], done: str, notes: list[str]) -> list[Episode]:
+    """Episodes up to their end, with the frame after it as what was observed last."""
+    episodes, cut, beyond = [], 0, 0
+    for number, part in parts.items():
+        steps = len(part["frame_index"])
+        ends = np.flatnonzero(part[done].reshape(-1) if done else ())
+        after = int(ends[0]) + 1 if len(ends) else steps
+        cut, beyond = cut + (after < steps), beyond + max(0, steps - after - 1)
+        last = {name: array[after : after + 1] for name, array in part.items()} if after < steps else {}
+        episodes.append(Episode(number, {name: array[:after] for name, array in part.items()}, last))
+    if cut:
+        notes.append(f"{cut} of {len(episodes)} episodes go on after {done}: the next frame is read as their last observation, "
+                     f"{beyond} frames after it are dropped")
+    return episodes
+
+
+def _suspect_shift(episodes: list[Episode], notes: list[str]) -> None:
+    """Says so where rewards come a step before the success that they are for."""
+    won = [e.columns for e in episodes if np.any(e.columns[_SUCCESS] > 0)]
+    early = sum(int(np.argmax(c[_REWARD])) + 1 == int(np.argmax(c[_SUCCESS] > 0)) for c in won)
+    if early and early == len(won):
+        notes.append(f"next.reward is largest a step before next.success in {early} of {len(won)} successes: is it shifted by one?")

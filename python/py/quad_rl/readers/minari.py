@@ -1,0 +1,59 @@
+"""Minari's datasets, in any of its storages."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from os import PathLike
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from quad_rl import _dataset
+from quad_rl.readers.episodes import Episode, Log, dataset, library
+
+_ACTIONS, _REWARDS, _TERMINATIONS = "actions", "rewards", "terminations"
+
+
+def from_minari(id_or_folder: str | PathLike[str]) -> _dataset.Dataset:
+    """A dataset of Minari, stored as HDF5, Arrow or Parquet. Needs minari, with what it needs for that storage.
+
+    id_or_folder: an id such as "mujoco/hopper/medium-v0", which Minari downloads if it is not on this machine; or the folder of
+        a dataset, or its folder `data`.
+
+    Dicts and Tuples become one row, in the order of Gymnasium's `flatten`, also those within others. Steps are terminal where
+    `terminations` are. Where an episode has no observation after its last step, as older ones have not, that step is
+    dropped unless it is terminal. Raises ValueError for images, texts and discrete actions, ImportError without minari.
+    """
+    minari = library("minari", "minari")
+    folders = [Path(id_or_folder, "data"), Path(id_or_folder)]
+    folder = next((folder for folder in folders if (folder / "metadata.json").is_file()), None)
+    data = minari.MinariDataset(folder) if folder else minari.load_dataset(str(id_or_folder), download=True)
+    episodes, seen, done = [], {}, {}
+    for episode in data.iterate_episodes():
+        steps = len(episode.rewards)
+        if not steps:
+            continue
+        seen = _parts("observations", data.observation_space, episode.observations)
+        done = _parts(_ACTIONS, data.action_space, episode.actions)
+        columns = {_REWARDS: np.asarray(episode.rewards), _TERMINATIONS: np.asarray(episode.terminations), **done}
+        columns |= {name: array[:steps] for name, array in seen.items()}
+        last = {name: array[steps:] for name, array in seen.items() if len(array) > steps}
+        episodes.append(Episode(int(episode.id), columns, last))
+    empty = data.total_episodes - len(episodes)
+    notes = [f"{empty} of {data.total_episodes} episodes dropped: without a step"] if empty else []
+    log = Log(episodes, notes)
+    return dataset(log, [*seen], [*done], _REWARDS, None, _TERMINATIONS)
+
+
+def _parts(name: str, space: Any, values: Any) -> dict[str, NDArray[Any]]:
+    """The arrays of a Dict or a Tuple in its order, which is that of Gymnasium's `flatten`, or the only one."""
+    inner = getattr(space, "spaces", ())
+    if inner:
+        parts = inner.items() if isinstance(inner, Mapping) else enumerate(inner)
+        return {full: array for key, part in parts for full, array in _parts(f"{name}.{key}", part, values[key]).items()}
+    array = np.asarray(values)
+    if array.ndim > 2 and array.dtype == np.uint8:
+        raise ValueError(f"{name} holds images, but only rows of numbers are learnt from")
+    return {name: array}
