@@ -88,7 +88,7 @@ pub struct Job {
 
 impl Job {
     /// Longest time that an evaluator may have a job, whatever its progress.
-    pub const LONGEST: Duration = Duration::from_secs(3600);
+    pub const LONGEST: Duration = Duration::from_secs(24 * 3600);
 }
 
 impl Message for JobRequest {

@@ -28,9 +28,9 @@ use crate::train::{Outbox, Training};
 
 /// Most episodes in one job, so that two evaluators share an evaluation of ten; and most when hundreds wait.
 const JOB_EPISODES: [usize; 2] = [5, 40];
-/// Lease of a job. An evaluator reports progress at least three times in it, and Zenoh notices a lost evaluator after about 5
-/// s.
-const LEASE: Duration = Duration::from_secs(15);
+/// Lease of a job, which every step of its environments extends. A step of Diffuser's, which plans for each episode, takes an
+/// evaluator up to a minute; Zenoh notices a lost evaluator after 5 s.
+const LEASE: Duration = Duration::from_secs(180);
 /// A thread that answers or writes is stuck if it has not reported for this long.
 pub(crate) const STUCK: Duration = Duration::from_secs(30);
 /// Training is stuck if it has not reported for this long; its slowest steps take seconds.
