@@ -47,7 +47,8 @@ def write(root, episodes, version="v3.0", per_file=2, row_group=7, shuffle=None,
                     "task_index": pa.array(np.full(steps, tasks.index(one["task"])))}
         tables.append(pa.table(columns))
         start += steps
-    rows = [{"episode_index": i, "tasks": [one["task"]], "length": (lengths or {}).get(i, len(one["action"]))}
+    rows = [{"episode_index": i, "tasks": [one["task"]], "length": (lengths or {}).get(i, len(one["action"])),
+             "is_success": i in (0, 3)}
             for i, one in enumerate(episodes)]
     if version == "v3.0":
         groups = [tables[i : i + per_file] for i in range(0, len(tables), per_file)]

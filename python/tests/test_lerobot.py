@@ -52,6 +52,7 @@ def test_teleoperation_gets_the_rewards_that_are_asked_for(tmp_path, version):
 
     paid = Dataset.from_lerobot(folder, **STATE, reward="success-at-end", success=np.arange(6) % 3 == 0)
     assert rows(paid)[2][ends].tolist() == [1, 1] and rows(paid)[2].sum() == 2
+    assert same(paid, Dataset.from_lerobot(folder, **STATE, reward="success-at-end", success="is_success"))
     by_function = Dataset.from_lerobot(folder, **STATE, success=lambda e: e["episode"] in (0, 3),
                                        reward=lambda e: np.where(e["frame_index"] + 1 == len(e["action"]), e["episode"] in (0, 3), 0))
     assert same(paid, by_function)
@@ -151,7 +152,7 @@ def test_what_cannot_be_is_refused(tmp_path):
         Dataset.from_lerobot(folder, **STATE, reward="step-cost", success="all")
     info = json.loads((folder / "meta/info.json").read_text())
     (folder / "meta/info.json").write_text(json.dumps({**info, "codebase_version": "v1.6"}))
-    with pytest.raises(ValueError, match="of version v1.6, but v2.x and v3.x are read"):
+    with pytest.raises(ValueError, match="of v1.6, but v2.x and v3.x are read"):
         Dataset.from_lerobot(folder, **STATE)
     with pytest.raises(ValueError, match="no LeRobot dataset"):
         Dataset.from_lerobot(tmp_path, **STATE)

@@ -1,5 +1,7 @@
 """Data of robomimic, Minari, OGBench and d3rlpy, each beside what its own library or its keys say."""
 
+import json
+import subprocess
 from types import SimpleNamespace
 
 import gymnasium
@@ -103,6 +105,19 @@ def test_minari(storage, tmp_path, monkeypatch):
         assert all(np.array_equal(array, np.asarray(right, array.dtype)) for array, right in zip(rows(dataset), by_hand))
     assert by_hand[4].sum() == 2 and by_hand[5].sum() == 2 and len(dataset) == 20 and not dataset.notes
     assert dataset.observation_names[:3] == ["observations.a.x[0]", "observations.a.x[1]", "observations.a.y.0[0]"]
+
+
+@pytest.mark.filterwarnings("ignore::UserWarning")
+def test_minari_is_read_as_the_learner_reads_it(tmp_path, monkeypatch):
+    monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path))
+    flat = gymnasium.spaces.Dict({"b": BOX, "a": BOX})
+    episodes_of_minari(flat, lambda rng, count: {key: list(rng.normal(size=(count, 2))) for key in ("b", "a")}, "hdf5", "one/flat-v0")
+    inspected = subprocess.run(["learner", "datasets", "inspect", "--json", "minari:one/flat-v0"], check=True, capture_output=True)
+    ours, theirs = Dataset.from_minari("one/flat-v0").inspect(), json.loads(inspected.stdout)
+    for figure in ("transitions", "episodes", "action_ranges", "reward_range", "returns", "terminals", "timeouts"):
+        assert ours[figure] == theirs[figure], figure
+    for column, with_last in zip(ours["observation_ranges"], theirs["observation_ranges"]):
+        assert with_last["min"] <= column["min"] and column["max"] <= with_last["max"]
 
 
 @pytest.mark.filterwarnings("ignore::UserWarning")

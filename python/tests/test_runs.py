@@ -45,6 +45,8 @@ episodes: quad_rl.Episodes = policy.begin(range(3))
 action = episodes.act(action, rows=[1])
 size: int = policy.observation_size + policy.step + len(episodes)
 dataset = quad_rl.Dataset.from_episodes([{"rewards": [1.0]}])
+dataset = quad_rl.Dataset.from_lerobot("x", observations=["observation.state"], reward=lambda episode: episode["r"], success=[1])
+dataset = quad_rl.Dataset.from_frame({"x": [1.0]}, observations=["x"], actions=["x"], reward="x", episode="x")
 dataset.save("y")
 problems = dataset.inspect()["problems"]
 rows: list[dict[str, object]] = [dict(row) for row in quad_rl.runs("z")]
@@ -60,6 +62,7 @@ quad_rl.Dataset.from_arrays(observations=[])
 quad_rl.runs(5)
 quad_rl.metrics(["z"])
 quad_rl.train("x")
+quad_rl.Dataset.from_lerobot("x", observations=3)
 """
 
 
@@ -72,7 +75,7 @@ def test_a_type_checker_accepts_right_calls_and_no_others(tmp_path):
         return [line for line in checked.stdout.splitlines() if ": error: " in line]
 
     assert errors(SAMPLE) == []
-    assert {line.split(":")[1] for line in errors(WRONG)} == {"3", "4", "5", "6", "7", "8"}
+    assert {line.split(":")[1] for line in errors(WRONG)} == {"3", "4", "5", "6", "7", "8", "9"}
 
 
 def test_everything_public_says_what_it_takes(tmp_path):

@@ -107,6 +107,7 @@ def test_quad_convert_reads_what_python_reads(tmp_path, capsys):
     log = [tmp_path / "log.csv", "--observations", "x", "v", "--actions", "torque", "--episode", "run"]
     assert convert(*log, "--reward", "gain", "--terminal", "fell")[0] == 0
     assert convert(*log, "--reward", "step-cost", "--success", "a", "b")[0] == 0
+    assert "1 of 3 episodes are successes" in convert(*log, "--reward", "step-cost", "--success", "a")[1]
     with h5py.File(tmp_path / "demo.hdf5", "w") as file:
         for name, width in {"actions": 2, "obs/object": 3, "next_obs/object": 3}.items():
             file[f"data/demo_0/{name}"] = np.random.default_rng(0).uniform(-1, 1, (9, width))

@@ -27,7 +27,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Runs the command, and gives its exit status."""
     parser = argparse.ArgumentParser(
         prog="quad-convert",
-        description="Writes data of LeRobot, robomimic, Minari, OGBench, CSV or Parquet as a file for `learner train --dataset`.",
+        description="Makes a file for `learner train --dataset` of LeRobot, robomimic, Minari, OGBench, CSV or Parquet.",
         epilog="help(quad_rl.Dataset.from_lerobot) and its siblings say what each word means. Python also takes functions.",
     )
     parser.add_argument("source", help="a folder of LeRobot or Minari, a file of robomimic, a table, minari:ID, ogbench:NAME")
@@ -58,7 +58,8 @@ def _read(source: str, given: dict[str, Any]) -> Dataset:
     if list(known)[0] == "file" and "actions" in given:
         given["actions"] = given["actions"][0]
     for name in given.keys() - known.keys():
-        raise ValueError(f"--{name} says nothing of this source; {', '.join('--' + name for name in [*known][1:]) or 'nothing'} does")
+        words = ", ".join(f"--{name}" for name in [*known][1:])
+        raise ValueError(f"--{name} says nothing of this source; {words or 'nothing'} does")
     missing = [name for name, parameter in known.items() if parameter.kind is parameter.KEYWORD_ONLY
                and parameter.default is parameter.empty and name not in given]
     if missing:

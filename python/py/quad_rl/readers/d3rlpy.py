@@ -10,8 +10,8 @@ from quad_rl import _dataset
 def from_d3rlpy(dataset: Any) -> _dataset.Dataset:
     """An MDPDataset, or another ReplayBuffer, of d3rlpy 2.
 
-    Steps are those that d3rlpy learns from: an episode is terminal at its last step if it is `terminated`; the last step of others
-    is dropped, as what followed it is not stored. Raises ValueError for tuples of observations and for discrete actions.
+    Steps are those that d3rlpy learns from: an episode is terminal at its last step if it is `terminated`; the last step of
+    others is dropped, as what followed it is not stored. Raises ValueError for tuples of observations and for discrete actions.
     """
     episodes = []
     for episode in dataset.episodes:

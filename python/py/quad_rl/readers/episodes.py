@@ -17,6 +17,7 @@ from quad_rl._rows import Rows, episode_rows
 Rule = Union[str, Callable[[Mapping[str, Any]], Any], None]
 # Also the successful episodes' numbers or names, or a flag for each episode.
 Success = Union[Rule, Sequence[Any]]
+_HOW = 'success= a column, "all", a list of episodes, or a function of the episode'
 _OF_SUCCESS = {"success-at-end": (0.0, 1.0), "step-cost": (-1.0, 0.0)}
 
 
@@ -87,11 +88,11 @@ def dataset(
         rows = {"observations": np.concatenate(seen), "actions": _beside(episode.columns, actions), "rewards": rewards}
         parts.append(episode_rows(f"episode {episode.name}: ", {**rows, "terminated": ends, "truncated": False}))
     if lost:
-        pays = f"reward={reward!r} pays at the last step, which is dropped where an episode does not terminate: {lost} of {count}"
+        pays = f"reward={reward!r} pays at the last step, which is dropped unless an episode terminates: {lost} of {count}"
         raise ValueError(f'{pays}\nhint: {log.end}="success", or rewards of your own')
     if open_ended:
-        notes.append(f"{open_ended} of {count} episodes: the last step is dropped, as what followed it is not stored and nothing "
-                     "terminates there")
+        notes.append(f"{open_ended} of {count} episodes: the last step is dropped, as what followed it is not stored and "
+                     "nothing terminates there")
     empty = sum(not len(part.rewards) for part in parts)
     if empty:
         notes.append(f"{empty} of {count} episodes dropped: of a single step, without what followed it")
@@ -123,9 +124,12 @@ def _call(rule: Callable[[Mapping[str, Any]], Any], episode: Episode) -> Any:
 
 
 def _successes(log: Log, rule: Success) -> list[bool] | None:
+    names = [episode.name for episode in log.episodes]
     rule = log.success or None if rule is None else rule
     if rule is None:
         return None
+    if isinstance(rule, str) and rule in names and rule not in log.episodes[0].columns:
+        rule = [rule]
     if callable(rule):
         return [bool(_call(rule, episode)) for episode in log.episodes]
     if isinstance(rule, str):
@@ -133,15 +137,16 @@ def _successes(log: Log, rule: Success) -> list[bool] | None:
             return [True] * len(log.episodes)
         _check(log, rule)
         return [bool(np.any(episode.columns[rule] > 0)) for episode in log.episodes]
-    listed, names = list(rule), [episode.name for episode in log.episodes]
+    listed = list(rule)
     if listed and all(isinstance(flag, (bool, np.bool_)) for flag in listed):
         if len(listed) != len(names):
             raise ValueError(f"success has {len(listed)} flags, but there are {len(names)} episodes\nhint: list their numbers")
         return [bool(flag) for flag in listed]
-    strangers = [name for name in listed if name not in names]
+    chosen = {*listed}
+    strangers = chosen - {*names}
     if strangers:
-        raise ValueError(f"success names episodes that are not there: {strangers[:5]} ({len(strangers)} such)")
-    return [name in listed for name in names]
+        raise ValueError(f"success names episodes that are not there: {[*strangers][:5]} ({len(strangers)} such)")
+    return [name in chosen for name in names]
 
 
 def _reward(log: Log, rule: Rule, won: list[bool] | None) -> Rule:
@@ -151,8 +156,7 @@ def _reward(log: Log, rule: Rule, won: list[bool] | None) -> Rule:
         raise ValueError(f"nothing says what is rewarded\nhint: reward={ways}")
     if rule in _OF_SUCCESS:
         if won is None:
-            ways = 'success= a column, "all", a list of episodes, or a function of the episode'
-            raise ValueError(f"reward={rule!r} needs to know which episodes are successes\nhint: {ways}")
+            raise ValueError(f"reward={rule!r} needs to know which episodes are successes\nhint: {_HOW}")
         log.notes.append(f"{sum(won)} of {len(won)} episodes are successes")
     elif isinstance(rule, str):
         _check(log, rule)
@@ -171,7 +175,7 @@ def _terminate(log: Log, rule: Rule, won: list[bool] | None) -> Rule:
         return "never"
     rule = rule or "success"
     if rule == "success" and won is None:
-        raise ValueError(f'{log.end}="success" needs success= a column, "all", a list of episodes, or a function of the episode')
+        raise ValueError(f'{log.end}="success" needs {_HOW}')
     if isinstance(rule, str) and rule not in ("success", "never"):
         _check(log, rule)
     if won is not None and unsure and rule in ("success", log.done):

@@ -38,8 +38,8 @@ def from_lerobot(
 
     observations: its features that are seen, in this order, such as ["observation.state"]; no images or videos. Their numbers
         keep their units, and their names in the file and in the policy. action: the feature that is done.
-    reward, success: as in `from_frame`, columns being features and names `episode_index`. By default `next.reward` and
-        `next.success`, where these were recorded.
+    reward, success: as in `from_frame`, columns being features, or numbers in `meta/episodes`, and names `episode_index`.
+        By default `next.reward` and `next.success`, where these were recorded.
     terminate: as `terminal` in `from_frame`. `next.done` is also set at time limits.
     task: the only task to be read, in its words; "all" for all of them.
 
@@ -53,7 +53,7 @@ def from_lerobot(
     info = json.loads((root / "meta/info.json").read_text())
     version, features = str(info.get("codebase_version")), info["features"]
     if not version.startswith(("v2.", "v3.")):
-        raise ValueError(f"{root}: a LeRobot dataset of version {version}, but v2.x and v3.x are read\nhint: LeRobot converts it")
+        raise ValueError(f"{root}: a LeRobot dataset of {version}, but v2.x and v3.x are read\nhint: LeRobot converts it")
     images = [name for name, feature in features.items() if feature["dtype"] in ("image", "video")]
     for name in {*observations, action} & {*images}:
         raise ValueError(f"{root}: {name} is {features[name]['dtype']}, but only rows of numbers are learnt from")
@@ -104,11 +104,11 @@ def _meta(root: Path, name: str) -> list[dict[str, Any]]:
 def _whole(
     root: Path, columns: Columns, info: Mapping[str, Any], unreadable: list[str], notes: list[str]
 ) -> dict[int, Columns]:
-    """The episodes that have each frame once, in its order."""
+    """The episodes that have each frame once, in its order, with what `meta/episodes` says of all their frames."""
     try:
-        lengths = {row["episode_index"]: row["length"] for row in _meta(root, "episodes")}
+        rows = {row["episode_index"]: row for row in _meta(root, "episodes")}
     except (library("pyarrow", "lerobot").ArrowInvalid, OSError):
-        lengths = {}
+        rows = {}
     of, frame = (columns[name].reshape(-1) for name in _INDEX)
     order = np.lexsort((frame, of))
     numbers, first = np.unique(of[order], return_index=True)
@@ -116,9 +116,10 @@ def _whole(
     there = {int(number): dict(zip(columns, part)) for number, part in zip(numbers, parts)}
     kept, total = {}, max(int(info.get("total_episodes", 0)), len(there))
     for number, part in there.items():
-        frames = part["frame_index"].reshape(-1)
-        if np.array_equal(frames, np.arange(lengths.get(number, len(frames)))):
-            kept[number] = part
+        frames, row = part["frame_index"].reshape(-1), rows.get(number, {})
+        of_all = {name: value for name, value in row.items() if name not in part and isinstance(value, (bool, int, float))}
+        if np.array_equal(frames, np.arange(row.get("length", len(frames)))):
+            kept[number] = part | {name: np.full(len(frames), value) for name, value in of_all.items()}
     broken = [str(number) for number in there if number not in kept]
     if broken:
         some = ", ".join(broken[:5]) + (", …" if len(broken) > 5 else "")
@@ -175,4 +176,4 @@ def _suspect_shift(episodes: list[Episode], notes: list[str]) -> None:
     won = [e.columns for e in episodes if np.any(e.columns[_SUCCESS] > 0)]
     early = sum(int(np.argmax(c[_REWARD])) + 1 == int(np.argmax(c[_SUCCESS] > 0)) for c in won)
     if early and early == len(won):
-        notes.append(f"next.reward is largest a step before next.success in {early} of {len(won)} successes: is it shifted by one?")
+        notes.append(f"next.reward is largest a step before next.success in {early} of {len(won)} successes: is it shifted?")

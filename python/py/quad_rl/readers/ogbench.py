@@ -28,9 +28,10 @@ def from_ogbench(name: str, *, folder: str | PathLike[str] = "~/.ogbench/data") 
 
     folder: where OGBench keeps its files. One that is missing is downloaded by the library ogbench.
 
-    Mazes of point, ant and humanoid need nothing but the file: their goals are known. The rewards of others come from the library,
-    which simulates the task's first state. Without a task, it is OGBench's default. A step is terminal where the state before it
-    has reached the task, as OGBench has it. Raises ValueError for another name, ImportError without ogbench where it is needed.
+    Mazes of point, ant and humanoid need nothing but the file: their goals are known. The rewards of others come from the
+    library, which simulates the task's first state. Without a task, it is OGBench's default. A step is terminal where the
+    state before it has reached the task, as OGBench has it. Raises ValueError for another name, ImportError without ogbench
+    where it is needed.
     """
     folder = Path(folder).expanduser()
     if "-singletask" not in name:

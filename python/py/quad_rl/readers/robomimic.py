@@ -28,8 +28,8 @@ def from_robomimic(
     observations: the keys below `obs` that are seen, in this order, such as ["object", "robot0_eef_pos"]; no images.
     actions: the array that is done.
     reward, success: as in `from_frame`, columns being arrays and names those of the groups, such as "demo_3".
-    terminate: as `terminal` in `from_frame`; by default `dones`, if they are set only where there is a reward: written with another
-        --done_mode they also stand at the end of each demonstration.
+    terminate: as `terminal` in `from_frame`; by default `dones`, if they are set only where there is a reward: written with
+        another --done_mode they also stand at the end of each demonstration.
     filter: the list of `mask` that says which demonstrations are read, such as "train"; None: all of them.
 
     Without `next_obs`, the last step of an episode that does not terminate is dropped. Raises ValueError for what has to be
