@@ -9,6 +9,7 @@ use crate::arrays::{Arrays, Names};
 use crate::environment::EnvironmentSpec;
 use crate::error::{DatasetError, Problem};
 use crate::formats::Source;
+use crate::hold_out::{HoldOut, Split};
 use crate::recording::Recording;
 use crate::reward::{RewardRule, RewardScaling};
 use crate::scale::{self, Scale};
@@ -94,6 +95,11 @@ impl Transitions {
     /// scaled, other sizes than the environment's or another environment, a file that is one endless episode or makes no
     /// transition.
     pub fn read(path: impl AsRef<Path>, options: &ReadOptions) -> Result<Self, DatasetError> {
+        Ok(Self::read_split(path, options, HoldOut { share: 0.0, seed: 0 })?.training)
+    }
+
+    /// As [`Self::read`], but keeps some episodes out.
+    pub fn read_split(path: impl AsRef<Path>, options: &ReadOptions, hold_out: HoldOut) -> Result<Split, DatasetError> {
         let (path, ReadOptions { environment, .. }) = (path.as_ref(), *options);
         let error = |problem| DatasetError::new(path, problem);
         let mut source = Source::open(path)?;
@@ -101,7 +107,7 @@ impl Transitions {
             source.check_environment(environment).map_err(error)?;
         }
         let recording = source.read(environment)?;
-        Self::of_recording(recording, options).map_err(error)
+        Self::split(recording, options, hold_out).map_err(error)
     }
 
     /// Transitions of arrays in memory, with their rewards as they are.
@@ -112,19 +118,29 @@ impl Transitions {
         let error = |problem| DatasetError::new("arrays in memory", problem);
         let recording = arrays.into_recording().map_err(error)?;
         let options = ReadOptions { environment: None, reward: RewardRule::AsIs, scale: Scale::default() };
-        Self::of_recording(recording, &options).map_err(error)
+        let split = Self::split(recording, &options, HoldOut { share: 0.0, seed: 0 }).map_err(error)?;
+        Ok(split.training)
     }
 
-    fn of_recording(recording: Recording, options: &ReadOptions) -> Result<Self, Problem> {
+    fn split(recording: Recording, options: &ReadOptions, hold_out: HoldOut) -> Result<Split, Problem> {
         let ReadOptions { environment, reward, scale } = *options;
         let problems = checks::problems(&recording, environment);
         let outside = if scale.actions { None } else { checks::actions_outside(&recording) };
         if let Some(problem) = problems.into_iter().chain(outside).next() {
             return Err(problem);
         }
+        let (recording, held_out, episodes) = match hold_out.share {
+            0.0 => (recording, None, Vec::new()),
+            _ => {
+                let (training, held_out, episodes) = recording.hold_out(hold_out);
+                (training, (!episodes.is_empty()).then_some(held_out), episodes)
+            }
+        };
         let rewards = reward.scaling(&recording.trajectory_returns()).ok_or(Problem::SameReturns)?;
         let scaling = scale.of(&recording);
-        Ok(Self::new(recording, environment, rewards, scaling))
+        let held_out = held_out.map(|held_out| Self::new(held_out, environment, rewards, scaling.clone()));
+        let training = Self::new(recording, environment, rewards, scaling);
+        Ok(Split { training, held_out: held_out.filter(|held_out| !held_out.rows.is_empty()), episodes })
     }
 
     fn new(

@@ -57,6 +57,10 @@ pub struct TrainArgs {
     /// still takes and gives the data's own units
     #[arg(long, value_name = "actions,states", value_delimiter = ',', value_parser = ["actions", "states"], hide_possible_values = true)]
     scale: Vec<String>,
+    /// Share of the episodes to keep out of training; losses and values on them are in the metrics, as held_out_… [default: the
+    /// task's, 0.1 for own-data, else 0]
+    #[arg(long, value_name = "SHARE")]
+    hold_out: Option<f64>,
     /// Folder of the run; its last part names the run. If it contains a run of the same configuration, that run continues
     /// [default: runs/TASK-VARIANT-seedSEED]
     #[arg(long, value_name = "DIR")]
@@ -149,6 +153,7 @@ impl TrainArgs {
             ("environment", self.env.clone().map(Value::from)),
             ("dataset", self.dataset.clone().map(Value::from)),
             ("scale", Some(&self.scale).filter(|scale| !scale.is_empty()).map(|scale| Value::from(scale.clone()))),
+            ("hold_out", self.hold_out.map(Value::from)),
             ("steps", number(flags.steps)),
             ("eval_interval", number(flags.eval_interval)),
             ("episodes", number(flags.episodes)),

@@ -6,7 +6,7 @@ use std::sync::Arc;
 use std::time::{Duration, SystemTime, UNIX_EPOCH};
 
 use anyhow::{Context, anyhow};
-use quad_dataset::{Task, Transitions, environment};
+use quad_dataset::{Split, Task, environment};
 use quad_policy::Precision;
 use quad_protocol::Name;
 use quad_run::config::{DatasetInfo, Experiment, Preset, RunConfig, RunInfo, hyperparameters};
@@ -23,7 +23,7 @@ use crate::data::{LocalDataset, Source, load};
 use crate::live::{Display, Ending, Incarnation, Live, MainLoop, Metrics, Run, STUCK, Threads};
 use crate::page;
 use crate::report::of_run;
-use crate::train::{begin, device};
+use crate::train::{HeldOut, begin, device};
 
 /// How long a run that is not complete may take to write its report.
 const REPORT_PATIENCE: Duration = Duration::from_secs(5);
@@ -47,8 +47,8 @@ pub fn train(args: &TrainArgs) -> anyhow::Result<()> {
     let dataset = source.obtain().hint(record_hint(&experiment))?;
 
     start_pool(args.threads)?;
-    let transitions = load(&dataset.path, &experiment)?;
-    let config = run_config(args, &name, preset.task_name(), experiment, dataset, &transitions)?;
+    let data = load(&dataset.path, &experiment)?;
+    let config = run_config(args, &name, preset.task_name(), experiment, dataset, &data)?;
     if let Some(begun) = &begun {
         begun.check_same(&config)?;
     }
@@ -70,13 +70,13 @@ pub fn train(args: &TrainArgs) -> anyhow::Result<()> {
     }
     debug!("{config:?}");
     if args.dry_run {
-        return dry_run::estimate(&path, &config, transitions);
+        return dry_run::estimate(&path, &config, data.training);
     }
 
     // Zenoh and training have threads of their own; this runtime serves the metrics and the main loop.
     let mut runtime = tokio::runtime::Builder::new_multi_thread();
     let runtime = runtime.worker_threads(2).on_thread_start(stay_in_background).enable_all().build()?;
-    let ended = runtime.block_on(run_to_its_end(args, outside, &path, begun, name, &config, transitions));
+    let ended = runtime.block_on(run_to_its_end(args, outside, &path, begun, name, &config, data));
     let concluded = ended.and_then(|(run_dir, ending)| conclude(&run_dir, &config, ending));
     // Does not wait for a thread that a broken disk blocks.
     runtime.shutdown_background();
@@ -110,10 +110,11 @@ async fn run_to_its_end(
     begun: Option<Begun>,
     name: Name,
     config: &RunConfig,
-    transitions: Transitions,
+    data: Split,
 ) -> anyhow::Result<(RunDir, Ending)> {
     let steps = config.experiment.steps;
-    let (metrics, registry) = Metrics::new(&name, steps, config.experiment.definition()?.metrics)?;
+    let (measured, has_held_out) = (config.experiment.definition()?.metrics, data.held_out.is_some());
+    let (metrics, registry) = Metrics::new(&name, steps, measured, has_held_out)?;
     let health = Health::default();
     let live = Live::new(name.clone(), steps, metrics.clone(), health.clone());
     let telling = live.clone();
@@ -121,8 +122,13 @@ async fn run_to_its_end(
     let server = quad_runtime::serve_metrics(args.http, registry, health.clone(), page).await?;
     info!("page: http://{}/", server.address);
     let Experiment { environment, .. } = &config.experiment;
-    let task = Task::new(environment, transitions.observation_dim(), transitions.action_dim());
-    let agent = begin(&config.experiment, config.run.device, transitions)?;
+    let Split { training, held_out, .. } = data;
+    let task = Task::new(environment, training.observation_dim(), training.action_dim());
+    let mut agent = begin(&config.experiment, config.run.device, training)?;
+    let held_out = held_out
+        .map(|held_out| HeldOut::new(&config.experiment, config.run.device, held_out, &mut agent))
+        .transpose()?
+        .flatten();
     let opening = outside.open().await?;
     // All checks are done, so a start that is refused leaves no folder behind.
     let (run_dir, scores, past) = take_up(path, begun, args.fresh, config)?;
@@ -131,7 +137,7 @@ async fn run_to_its_end(
     let incarnation = Incarnation { run: name, number: now()? << 16 | u64::from(rand::random::<u16>()) };
     let checkpoint_every = Duration::from_secs(args.checkpoint_seconds);
     let run = Run { incarnation: incarnation.clone(), config, dir: &run_dir, scores, past, checkpoint_every };
-    let threads = Threads::start(run, task, agent, &metrics, &health, &tell)?;
+    let threads = Threads::start(run, task, (agent, held_out), &metrics, &health, &tell)?;
     threads.show_on(&live);
     let main_loop = MainLoop {
         incarnation,
@@ -260,9 +266,9 @@ fn run_config(
     task: &str,
     experiment: Experiment,
     dataset: LocalDataset,
-    transitions: &Transitions,
+    data: &Split,
 ) -> anyhow::Result<RunConfig> {
-    let statistics = transitions.statistics();
+    let statistics = data.training.statistics();
     Ok(RunConfig {
         run: RunInfo {
             name: name.clone(),
@@ -277,6 +283,7 @@ fn run_config(
             sha256: Some(dataset.sha256),
             transitions: statistics.transitions as u64,
             episodes: statistics.episodes as u64,
+            held_out: data.episodes.clone(),
             min_return: statistics.return_min,
             mean_return: statistics.return_mean,
             max_return: statistics.return_max,

@@ -3,7 +3,7 @@
 use std::path::Path;
 
 use anyhow::{Context, anyhow};
-use quad_dataset::{DatasetError, ReadOptions, Transitions, environment};
+use quad_dataset::{DatasetError, HoldOut, ReadOptions, Split, Transitions, environment};
 use quad_run::config::Experiment;
 use quad_runtime::Hint;
 
@@ -12,22 +12,23 @@ use quad_runtime::Hint;
 /// # Errors
 /// It cannot be read or learnt from, or it has fewer transitions than a batch: a batch never holds one twice while there are
 /// others.
-pub fn load(path: &Path, experiment: &Experiment) -> anyhow::Result<Transitions> {
+pub fn load(path: &Path, experiment: &Experiment) -> anyhow::Result<Split> {
     let options = ReadOptions {
         environment: environment::find(&experiment.environment).ok(),
         reward: experiment.reward,
         scale: experiment.scale,
     };
-    let result = Transitions::read(path, &options);
+    let hold_out = HoldOut { share: experiment.hold_out, seed: experiment.seed };
+    let result = Transitions::read_split(path, &options, hold_out);
     let hint = result.as_ref().err().map(DatasetError::hint).unwrap_or_default();
-    let transitions = result.with_context(|| format!("cannot learn from {}", path.display())).hint(hint)?;
-    for doubt in transitions.doubts() {
+    let split = result.with_context(|| format!("cannot learn from {}", path.display())).hint(hint)?;
+    for doubt in split.training.doubts() {
         tracing::warn!("{}: {doubt}", path.display());
     }
-    let (there, batch) = (transitions.len(), experiment.batch_size);
+    let (there, batch) = (split.training.len(), experiment.batch_size);
     if there < batch as usize {
         return Err(anyhow!("{there} transitions are fewer than a batch of {batch}"))
             .hint("record more data, or ask for less with --set batch_size=N");
     }
-    Ok(transitions)
+    Ok(split)
 }

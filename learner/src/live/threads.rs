@@ -24,7 +24,7 @@ use super::snapshots::Snapshots;
 use super::spawn::spawn_alive;
 use super::weights::Weights;
 use crate::evaluation::Rules;
-use crate::train::{Outbox, Training};
+use crate::train::{HeldOut, Outbox, Training};
 
 /// Most episodes in one job, so that two evaluators share an evaluation of ten; and most when hundreds wait.
 const JOB_EPISODES: [usize; 2] = [5, 40];
@@ -65,7 +65,7 @@ impl Threads {
     pub fn start(
         run: Run<'_>,
         task: Task,
-        agent: Agent,
+        (agent, held_out): (Agent, Option<HeldOut>),
         metrics: &Metrics,
         health: &Health,
         events: &Events,
@@ -108,6 +108,7 @@ impl Threads {
         let training = Training {
             experiment: experiment.clone(),
             agent,
+            held_out,
             checkpoint,
             checkpoint_every,
             seconds_before,

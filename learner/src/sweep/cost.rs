@@ -42,7 +42,7 @@ impl Cost {
         for (run, _) in runs {
             let key = configuration(run);
             if prices.len() < MOST_MEASURED && !prices.contains_key(&key) {
-                let transitions = load(dataset(run), &run.experiment)?;
+                let transitions = load(dataset(run), &run.experiment)?.training;
                 let price = one_thread.install(|| Price::measure(&run.experiment, Device::Cpu, transitions));
                 prices.insert(key, price.with_context(|| format!("the run {} cannot begin", run.name))?);
             }

@@ -9,6 +9,8 @@ use prometheus::{
 };
 use quad_algorithms::Metric;
 
+use super::held_out;
+
 /// Shortest gradient step that the histogram tells apart, and how many doublings follow it: 1 ms to 2 s.
 const SHORTEST_STEP: f64 = 1e-3;
 const STEP_BUCKETS: usize = 12;
@@ -22,18 +24,29 @@ pub(crate) struct TrainingMetrics {
     pub diverged: IntGauge,
     /// What the algorithm measures, in its order.
     pub algorithm: Vec<(&'static Metric, Gauge)>,
+    /// The same on held-out episodes, where it says something of them.
+    held_out: Vec<Gauge>,
 }
 
 impl TrainingMetrics {
-    /// Makes them, for a run of so many steps whose algorithm measures that.
-    pub fn new(make: &Registrar, target_steps: u64, measured: &'static [Metric]) -> prometheus::Result<Self> {
+    /// Makes them, for a run of so many steps whose algorithm measures that, perhaps on held-out episodes, too.
+    pub fn new(
+        make: &Registrar,
+        target_steps: u64,
+        measured: &'static [Metric],
+        has_held_out: bool,
+    ) -> prometheus::Result<Self> {
         let target = make.count("gradient_steps_target", "Gradient steps that this run will do")?;
         target.set(i64::try_from(target_steps).unwrap_or(i64::MAX));
         let buckets = exponential_buckets(SHORTEST_STEP, 2.0, STEP_BUCKETS)?;
         let duration = HistogramOpts::new(full("step_duration_seconds"), "Wall time of one gradient step");
         let saving = "Time that the training thread spent on copying its state and its policy instead of training";
         let gauges = measured.iter().map(|metric| Ok((metric, make.gauge(metric.name, metric.help)?)));
+        let of_held_out = measured.iter().filter(|metric| has_held_out && held_out::is_measured(metric));
+        let held_out = of_held_out
+            .map(|metric| make.gauge(&held_out::name(metric), &format!("On held-out episodes: {}", metric.help)));
         Ok(Self {
+            held_out: held_out.collect::<prometheus::Result<_>>()?,
             gradient_steps: make.counter("gradient_steps_total", "Gradient steps done")?,
             step_duration: make.add(Histogram::with_opts(duration.buckets(buckets)))?,
             saving_seconds: make.add(Counter::new(full("saving_seconds_total"), saving))?,
@@ -49,6 +62,11 @@ impl TrainingMetrics {
         for ((_, gauge), value) in self.algorithm.iter().zip(values) {
             gauge.set(f64::from(*value));
         }
+    }
+
+    /// Takes in what was measured on held-out episodes.
+    pub fn observe_held_out(&self, values: &[f32]) {
+        self.held_out.iter().zip(values).for_each(|(gauge, value)| gauge.set(f64::from(*value)));
     }
 }
 

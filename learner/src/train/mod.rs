@@ -5,9 +5,11 @@
 //! thread `snapshots` takes it. The module `live` starts it.
 //!
 //! In reading order: `training` (the thread's work), `steps` (the loop), `device` (where it computes), `results`, `outbox`,
-//! `metrics`. Beside them, `price` estimates what a run costs, on its caller's thread.
+//! `metrics`. Beside them, `held_out` measures on episodes that are kept out, and `price` estimates what a
+//! run costs, on its caller's thread.
 
 pub(crate) mod device;
+mod held_out;
 mod metrics;
 mod outbox;
 mod price;
@@ -17,6 +19,7 @@ mod steps;
 mod tests;
 mod training;
 
+pub(crate) use held_out::HeldOut;
 pub(crate) use metrics::{Registrar, TrainingMetrics};
 pub(crate) use outbox::{Outbox, Work};
 pub(crate) use price::Price;

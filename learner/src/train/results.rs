@@ -26,15 +26,20 @@ pub(crate) struct Row {
     pub metrics: &'static [Metric],
     /// The means, in the order of `metrics`.
     pub values: Vec<f32>,
+    /// What was last measured on held-out episodes, by name.
+    pub held_out: Vec<(String, f32)>,
 }
 
 impl Serialize for Row {
     fn serialize<S: Serializer>(&self, serializer: S) -> Result<S::Ok, S::Error> {
-        let mut map = serializer.serialize_map(Some(2 + self.values.len()))?;
+        let mut map = serializer.serialize_map(Some(2 + self.values.len() + self.held_out.len()))?;
         map.serialize_entry("step", &self.step)?;
         map.serialize_entry("seconds", &self.seconds)?;
         for (metric, value) in self.metrics.iter().zip(&self.values) {
             map.serialize_entry(metric.name, value)?;
+        }
+        for (name, value) in &self.held_out {
+            map.serialize_entry(name, value)?;
         }
         map.end()
     }

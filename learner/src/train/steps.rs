@@ -12,6 +12,7 @@ use quad_run::run::Checkpoint;
 use quad_runtime::Beat;
 use tracing::debug;
 
+use super::held_out::{self, HeldOut};
 use super::metrics::TrainingMetrics;
 use super::outbox::Outbox;
 use super::results::{Outcome, Row, TrainedPolicy};
@@ -82,6 +83,7 @@ impl TrainError {
 pub(crate) fn train(
     agent: &mut Agent,
     sampler: &mut BatchSampler,
+    mut held_out: Option<&mut HeldOut>,
     plan: Plan,
     outlets: &Outlets<'_>,
 ) -> Result<Outcome, TrainError> {
@@ -102,7 +104,9 @@ pub(crate) fn train(
         let stopped = !last && outlets.stop.load(Ordering::Relaxed);
         if step.is_multiple_of(STEPS_PER_ROW) || last || stopped {
             let seconds = plan.seconds_before + start.elapsed().as_secs_f64();
-            outlets.outbox.row(mean.take(step, seconds));
+            let row = mean.take(step, seconds);
+            let held_out = held_out.as_mut().map(|held_out| measure(held_out, agent, outlets)).transpose()?;
+            outlets.outbox.row(Row { held_out: held_out.unwrap_or_default(), ..row });
         }
         hand_over_policy(agent, plan.schedule, outlets)?;
         if last || stopped || updated >= next_checkpoint {
@@ -114,6 +118,19 @@ pub(crate) fn train(
         }
     }
     Ok(Outcome::Completed)
+}
+
+/// What the algorithm measures on held-out episodes, by name.
+fn measure(held_out: &mut HeldOut, agent: &mut Agent, outlets: &Outlets<'_>) -> Result<Vec<(String, f32)>, TrainError> {
+    let (step, metrics) = (agent.step(), agent.metrics());
+    let values = held_out.values(step, || agent.save()).map_err(|source| TrainError::at(step, source))?;
+    outlets.metrics.observe_held_out(values);
+    let names = metrics.iter().filter(|metric| held_out::is_measured(metric)).map(held_out::name);
+    let named = Vec::from_iter(names.zip(values.iter().copied()));
+    match named.iter().find(|(_, value)| !value.is_finite()) {
+        Some((name, value)) => Err(TrainError::Diverged { step, what: format!("{name} is {value}") }),
+        None => Ok(named),
+    }
 }
 
 /// Hands over the policy if it is to be evaluated, or if it is the last.
@@ -168,6 +185,6 @@ impl RowMean {
         let metrics = self.metrics;
         let Self { sums, count, .. } = std::mem::replace(self, Self::new(metrics));
         let values = sums.iter().map(|sum| (sum / count.max(1) as f64) as f32).collect();
-        Row { step, seconds, metrics, values }
+        Row { step, seconds, metrics, values, held_out: Vec::new() }
     }
 }

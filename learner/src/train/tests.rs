@@ -14,6 +14,7 @@ use quad_run::config::{Schedule, resolve};
 use quad_run::run::Checkpoint;
 use quad_runtime::{Beat, Health};
 
+use super::held_out::HeldOut;
 use super::outbox::{Outbox, Work};
 use super::price::mean_step;
 use super::results::{self, Outcome};
@@ -99,13 +100,13 @@ fn run_of(
     }
     let mut sampler = BatchSampler::new(agent.items(), 4, 0, agent.step());
     let make = Registrar { registry: prometheus::Registry::new() };
-    let metrics = TrainingMetrics::new(&make, plan.schedule.steps, definition.metrics).unwrap();
+    let metrics = TrainingMetrics::new(&make, plan.schedule.steps, definition.metrics, false).unwrap();
     let outbox = Outbox::default();
     let origin = Origin { environment: "hopper".to_owned(), seed: 0, step: 0, episodes: 10 };
     let (stop, beat) = (&AtomicBool::new(stop), &beat());
     let outlets = Outlets { metrics: &metrics, outbox: &outbox, origin: &origin, stop, beat };
     // Nothing takes what it hands over, as with a disk that hangs: training must end all the same.
-    let outcome = train(&mut agent, &mut sampler, plan, &outlets);
+    let outcome = train(&mut agent, &mut sampler, None, plan, &outlets);
     let mut result = Result { outcome, snapshots: Vec::new(), checkpoint: None, rows: Vec::new(), metrics };
     outbox.close();
     while let Some(work) = outbox.next(beat) {
@@ -178,7 +179,7 @@ fn training_goes_on_from_a_checkpoint_bit_for_bit() {
 fn what_the_disk_does_not_take_comes_later_in_its_order() {
     let outbox = Outbox::default();
     let checkpoint = |step: u64| Checkpoint { step, state: vec![step as u8] };
-    let row = |step| results::Row { step, seconds: 0.0, metrics: &[], values: vec![] };
+    let row = |step| results::Row { step, seconds: 0.0, metrics: &[], values: vec![], held_out: vec![] };
     (1..=3).for_each(|step| outbox.checkpoint(checkpoint(step)));
     (1..=3).for_each(|step| outbox.row(row(step)));
     let Some(refused) = outbox.next(&beat()) else { panic!("something waits") };
@@ -244,4 +245,18 @@ fn the_estimate_of_a_step_is_the_mean_over_all_phases() {
     let mut agent = Agent::new(definition, &toml::Table::new(), context(100)).unwrap();
     let mut sampler = BatchSampler::new(agent.items(), 4, 0, 0);
     assert!(mean_step(&mut agent, &mut sampler, 100).unwrap() >= 0.01, "the second phase is not in it");
+}
+
+#[test]
+fn measuring_on_held_out_episodes_changes_nothing() {
+    let agent = || Agent::new(definition("quad").unwrap(), &small("quad"), context(20)).unwrap();
+    let ([mut alone, mut measured], mut held_out) = ([agent(), agent()], HeldOut::of(agent(), 4, 0, 20));
+    for step in 1..=5 {
+        let items = [0, 1, 2, 3];
+        assert_eq!(alone.update(&items).unwrap(), measured.update(&items).unwrap());
+        let values = held_out.values(step, || measured.save()).unwrap().to_vec();
+        assert!(values.iter().all(|value| value.is_finite() && *value != 0.0), "{values:?}");
+        assert_eq!(values, held_out.values(step, || panic!("it is not time again")).unwrap());
+    }
+    assert_eq!(alone.save().unwrap(), measured.save().unwrap());
 }

@@ -13,6 +13,7 @@ use quad_run::run::Checkpoint;
 use quad_runtime::{Beat, Hint, hinted};
 
 use super::device;
+use super::held_out::HeldOut;
 use super::metrics::TrainingMetrics;
 use super::outbox::Outbox;
 use super::steps::{Outlets, Plan, TrainError, train};
@@ -29,6 +30,8 @@ pub(crate) struct Training {
     pub experiment: Experiment,
     /// At step 0.
     pub agent: Agent,
+    /// What measures it on held-out episodes, if there are any.
+    pub held_out: Option<HeldOut>,
     /// Where an earlier incarnation of the run has left off.
     pub checkpoint: Option<Checkpoint>,
     /// Least time between two checkpoints.
@@ -46,19 +49,29 @@ pub(crate) struct Training {
 /// # Errors
 /// The algorithm cannot start with its hyper-parameters or these transitions, or evaluators cannot be sent its policy.
 pub(crate) fn begin(experiment: &Experiment, device: Device, transitions: Transitions) -> anyhow::Result<Agent> {
+    let agent = algorithm(experiment, device, transitions, experiment.batch_size as usize)?;
+    if experiment.eval_interval > 0 {
+        check_size(agent.policy(origin(experiment))?.len())?;
+    }
+    Ok(agent)
+}
+
+/// The algorithm of an experiment over these transitions, with batches of this size.
+pub(super) fn algorithm(
+    experiment: &Experiment,
+    device: Device,
+    transitions: Transitions,
+    batch_size: usize,
+) -> anyhow::Result<Agent> {
     let context = Learning {
         transitions: Arc::new(transitions),
-        batch_size: experiment.batch_size as usize,
+        batch_size,
         total_steps: experiment.steps,
         seed: experiment.seed,
         precision: experiment.precision,
         device: device::open(device)?,
     };
-    let agent = Agent::new(experiment.definition()?, &experiment.agent, context).hint_of(AlgorithmError::hint)?;
-    if experiment.eval_interval > 0 {
-        check_size(agent.policy(origin(experiment))?.len())?;
-    }
-    Ok(agent)
+    Agent::new(experiment.definition()?, &experiment.agent, context).hint_of(AlgorithmError::hint)
 }
 
 /// Where the snapshots of a run are from; the step is set for each.
@@ -70,7 +83,7 @@ pub(super) fn origin(experiment: &Experiment) -> Origin {
 impl Training {
     /// The thread's work. How training ended comes last in the outbox, unless it failed.
     pub fn run(self, beat: &Beat) -> anyhow::Result<()> {
-        let Self { experiment, mut agent, .. } = self;
+        let Self { experiment, mut agent, mut held_out, .. } = self;
         if let Some(Checkpoint { step, state }) = &self.checkpoint {
             let advice = "begin anew with --fresh, or continue with the version of the learner that wrote it";
             let loaded = agent.load(state).hint(advice);
@@ -84,7 +97,7 @@ impl Training {
             checkpoint_every: self.checkpoint_every,
             seconds_before: self.seconds_before,
         };
-        let outcome = train(&mut agent, &mut sampler, plan, &outlets).map_err(|error| {
+        let outcome = train(&mut agent, &mut sampler, held_out.as_mut(), plan, &outlets).map_err(|error| {
             let diverged = matches!(error, TrainError::Diverged { .. });
             self.metrics.diverged.set(diverged.into());
             if diverged { hinted(error, DIVERGED) } else { error.into() }

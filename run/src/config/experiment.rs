@@ -34,6 +34,9 @@ pub struct Experiment {
     /// What of the data is scaled for the networks; the snapshots have the maps, so that policies take and give the data's units.
     #[serde(default)]
     pub scale: Scale,
+    /// Share of the episodes that is kept out of training, to measure on; 0: none. Which they are follows from the seed.
+    #[serde(default, skip_serializing_if = "is_zero")]
+    pub hold_out: f64,
     /// Gradient steps.
     pub steps: u64,
     /// Gradient steps between two evaluations; 0: none at all.
@@ -51,6 +54,10 @@ pub struct Experiment {
     pub algorithm: String,
     /// Its hyper-parameters.
     pub agent: Table,
+}
+
+fn is_zero(share: &f64) -> bool {
+    *share == 0.0
 }
 
 /// For a key that is too few or too many, or of a wrong type. What serde says of it lists the keys that there are.
@@ -134,6 +141,8 @@ impl Experiment {
         ] {
             ensure!((least..=most).contains(&value), "{field} is {value}, but must be from {least} to {most}");
         }
+        let share = self.hold_out;
+        ensure!((0.0..1.0).contains(&share), "hold_out is {share}, but must be at least 0 and below 1");
         Ok(())
     }
 

@@ -57,6 +57,9 @@ pub struct DatasetInfo {
     pub transitions: u64,
     /// Trajectories in the file.
     pub episodes: u64,
+    /// Numbers of the episodes that are kept out of training, from 0 in the file's order; the other figures are not of them.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    pub held_out: Vec<usize>,
     /// Smallest return of a trajectory, unscaled.
     pub min_return: f64,
     /// The mean of their returns.
@@ -71,8 +74,10 @@ pub struct DatasetInfo {
 impl DatasetInfo {
     /// How much it holds and how good it is, in one line.
     pub fn summary(&self) -> String {
-        let Self { transitions, episodes, mean_return, mean_score, .. } = self;
+        let Self { transitions, episodes, held_out, mean_return, mean_score, .. } = self;
         let score = mean_score.map(|score| format!(", mean score {score:.2}")).unwrap_or_default();
-        format!("{transitions} transitions of {episodes} episodes, mean return {mean_return:.2}{score}")
+        let held_out =
+            if held_out.is_empty() { String::new() } else { format!("; {} more are held out", held_out.len()) };
+        format!("{transitions} transitions of {episodes} episodes, mean return {mean_return:.2}{score}{held_out}")
     }
 }

@@ -1,5 +1,6 @@
 //! A user's own log, of a robot that we do not simulate: it can be trained on.
 
+use std::collections::BTreeMap;
 use std::path::Path;
 use std::process::{Command, Output};
 
@@ -49,10 +50,16 @@ fn a_robot_that_we_do_not_know_is_learnt_from() {
     said(&train(&dataset, &run_dir, &[]), 0);
 
     let config = std::fs::read_to_string(run_dir.join("config.toml")).unwrap();
-    for line in ["environment = \"my-robot\"", "transitions = 1000", "episodes = 20", "mean_return = 1225.0"] {
+    for line in ["environment = \"my-robot\"", "transitions = 900", "episodes = 18", "mean_return = 1225.0"] {
         assert!(config.contains(line), "{line} is not in\n{config}");
     }
     assert!(!config.contains("mean_score"), "there are no reference returns:\n{config}");
+    let held_out = config.split_once("held_out = [").unwrap().1.split_once(']').unwrap().0;
+    assert_eq!(held_out.split(',').filter(|number| !number.trim().is_empty()).count(), 2, "of 20 episodes: {config}");
+    let metrics = std::fs::read_to_string(run_dir.join("metrics.jsonl")).unwrap();
+    let last: BTreeMap<String, f64> = serde_json::from_str(metrics.lines().last().unwrap()).unwrap();
+    let ratio = last["held_out_bc_loss"] / last["bc_loss"];
+    assert!((0.5..2.0).contains(&ratio), "alike episodes, hardly learnt: {last:?}");
     let snapshots = std::fs::read_dir(run_dir.join("snapshots")).unwrap().count();
     assert_eq!(snapshots, 1, "the last step's");
 }
