@@ -13,6 +13,17 @@ fn changes_override_the_values_of_the_task() {
 }
 
 #[test]
+fn demonstrations_are_short_whichever_algorithm_learns() {
+    for task in crate::config::tasks::all().iter().filter(|task| task.name.ends_with("-demo")) {
+        for algorithm in quad_algorithms::ALGORITHMS {
+            let changes = Table::from_iter([("algorithm".to_owned(), algorithm.name.into())]);
+            let steps = resolve(&task.name, &changes).unwrap().steps;
+            assert!(steps <= 40_000, "{}, {}: {steps}", task.name, algorithm.name);
+        }
+    }
+}
+
+#[test]
 fn what_cannot_be_used_is_named_with_what_can() {
     for (preset, changes, words) in [
         ("hopper-demo", toml! { tau = 3 }, "unknown field `tau`, expected one of `environment`"),
