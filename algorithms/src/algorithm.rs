@@ -125,9 +125,10 @@ pub(super) fn measured<const N: usize>(scalars: [(&'static str, &Tensor); N]) ->
 
 /// The numbers of some tensors, one tensor after the other; from a GPU in one copy, because each copy waits for the GPU.
 pub(super) fn numbers(x: &[&Tensor]) -> Result<Vec<f32>> {
-    let flat: Vec<_> = x.iter().map(|x| x.flatten_all()).collect::<Result<_>>()?;
-    match x.iter().all(|x| x.device().is_cpu()) {
-        true => flat.iter().map(Tensor::to_vec1).collect::<Result<Vec<_>>>().map(|numbers| numbers.concat()),
-        false => Tensor::cat(&flat, 0)?.to_vec1(),
-    }
+    joined(x)?.to_vec1()
+}
+
+/// The numbers of some tensors, one tensor after the other, `[n]`.
+pub(super) fn joined(x: &[&Tensor]) -> Result<Tensor> {
+    Tensor::cat(&x.iter().map(|x| x.flatten_all()).collect::<Result<Vec<_>>>()?, 0)
 }

@@ -8,7 +8,7 @@
 #[path = "golden/align_iql.rs"]
 mod golden;
 
-use super::algorithm::{Measured, measured, smaller};
+use super::algorithm::{Measured, smaller};
 use super::context::{Context, Minibatch};
 use super::definition::{Definition, Metric, Reporting, metrics, read, readable};
 use super::denoising::Denoising;
@@ -16,6 +16,7 @@ use super::diffusion::{Diffusion, Networks, Update};
 use super::hyperparameters::{Candidates, Count, NotNegative, Positive, Quantile, Rate, Share};
 use super::iql::expectile_loss;
 use super::parts::Parts;
+use super::replay::Computed;
 use super::trained::{Trained, ensemble};
 use candle_core::{Device, Result};
 use quad_policy::{
@@ -95,7 +96,7 @@ impl Config {
         let networks = Networks::new(shape, *self.weight_decay, context)?;
         let value = EnsembleShape { members: 1, action_dim: 0, layers: self.value.clone(), ..networks.shape.critics() };
         let value = ensemble(value, &networks.context, 2)?;
-        Ok(Diffusion { networks, update: AlignIql { config: self, value } })
+        Ok(Diffusion::new(networks, AlignIql { config: self, value }))
     }
 }
 
@@ -106,43 +107,52 @@ impl Update for AlignIql {
         networks.denoising(generator)
     }
 
-    fn step(&mut self, networks: &mut Networks, step: u64, batch: &Minibatch, noise: &Denoising) -> Result<Measured> {
-        let Self { config, value } = self;
+    fn begin(&mut self, networks: &mut Networks, step: u64) -> Result<()> {
+        let (config, decay) = (&self.config, cosine_decay(step, networks.context.total_steps));
         let adam = |rate: f32| AdamStep { rate, clip: None, count: step + 1 };
+        networks.actor.adam.set(adam(*config.actor_learning_rate * decay))?;
+        self.value.adam.set(adam(*config.value_learning_rate))?;
+        networks.critics.adam.set(adam(*config.critic_learning_rate))
+    }
+
+    fn work(&mut self, networks: &mut Networks, batch: &Minibatch, noise: &Denoising) -> Result<Computed> {
+        let Self { config, value } = self;
 
         // The policy: cloning, whatever the actions are worth.
         let (_, predicted) = networks.denoise(batch, noise)?;
-        let Networks { context, actor, target_actor, critics, target_critics, .. } = networks;
+        let Networks { actor, target_actor, critics, target_critics, .. } = networks;
         let bc_loss = (predicted - &noise.epsilon)?.sqr()?.sum(1)?.mean_all()?;
-        let rate = *config.actor_learning_rate * cosine_decay(step, context.total_steps);
-        actor.descend(&bc_loss, adam(rate))?;
+        actor.descend_as_set(&bc_loss)?;
         target_actor.follow(&actor.network, *config.actor_ema_rate)?;
 
         // V(s) towards an expectile of the smaller Q̂(s, a), IQL's Eq. 5.
         let q = smaller(&target_critics.values(&batch.observations, &batch.actions)?)?;
         let u = (&q - value.network.state_values(&batch.observations)?.squeeze(0)?)?;
         let value_loss = expectile_loss(&u, *config.expectile)?;
-        value.descend(&value_loss, adam(*config.value_learning_rate))?;
+        value.descend_as_set(&value_loss)?;
 
         // Q(s, a) towards r + γ·V(s'), IQL's Eq. 6.
         let value = value.network.detach();
         let next = value.state_values(&batch.next_observations)?.squeeze(0)?;
         let targets = batch.target(*config.gamma, &next)?;
         let critic_loss = critics.network.squared_error(&batch.observations, &batch.actions, &targets)?;
-        critics.descend(&critic_loss, adam(*config.critic_learning_rate))?;
+        critics.descend_as_set(&critic_loss)?;
         target_critics.follow(&critics.network, *config.ema_rate)?;
 
         let v = value.state_values(&batch.observations)?.squeeze(0)?;
-        let mut measured = measured([
+        let scalars = [
             ("q_mean", &targets.mean_all()?),
             ("v_mean", &v.mean_all()?),
             ("value_loss", &value_loss),
             ("critic_loss", &critic_loss),
             ("bc_loss", &bc_loss),
             ("advantage_mean", &(q - &v)?.mean_all()?),
-        ])?;
-        measured.push(("learning_rate", rate));
-        Ok(measured)
+        ];
+        Computed::new(&scalars, &[])
+    }
+
+    fn measure(&self, networks: &Networks, _: &Denoising, _: &[f32]) -> Result<Measured> {
+        Ok(vec![("learning_rate", networks.actor.adam.step().rate)])
     }
 
     /// Takes the EMA actor's sample with the largest −(Q − V)²: the constraint Q = V of the aligned policy, as a penalty.

@@ -6,6 +6,8 @@ use candle_core::{Device, Result, Tensor};
 use quad_dataset::{Batch, Transitions};
 use quad_policy::Precision;
 
+use super::replay::Inputs;
+
 /// What an algorithm has to know of a run.
 #[derive(Clone)]
 pub struct Context {
@@ -39,11 +41,15 @@ impl Context {
     /// # Errors
     /// Candle fails.
     pub fn batch(&self, items: &[u32]) -> Result<Minibatch> {
+        self.batch_on(items, &self.device)
+    }
+
+    /// [`Self::batch`] on another device.
+    pub(super) fn batch_on(&self, items: &[u32], device: &Device) -> Result<Minibatch> {
         let mut batch = Batch::default();
         self.transitions.gather(items, &mut batch);
-        let rows =
-            |numbers: &[f32]| Tensor::from_slice(numbers, (items.len(), numbers.len() / items.len()), &self.device);
-        let column = |numbers: &[f32]| Tensor::from_slice(numbers, items.len(), &self.device);
+        let rows = |numbers: &[f32]| Tensor::from_slice(numbers, (items.len(), numbers.len() / items.len()), device);
+        let column = |numbers: &[f32]| Tensor::from_slice(numbers, items.len(), device);
         Ok(Minibatch {
             observations: rows(&batch.observations)?,
             actions: rows(&batch.actions)?,
@@ -67,6 +73,13 @@ pub struct Minibatch {
     pub next_observations: Tensor,
     /// 0 where the episode terminated, else 1; `[B]`.
     pub masks: Tensor,
+}
+
+impl Inputs for Minibatch {
+    fn tensors(&mut self) -> Vec<&mut Tensor> {
+        let Self { observations, actions, rewards, next_observations, masks } = self;
+        vec![observations, actions, rewards, next_observations, masks]
+    }
 }
 
 impl Minibatch {

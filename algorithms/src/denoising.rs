@@ -1,7 +1,8 @@
 //! Noisy actions, from which a noise predictor learns to denoise.
 
+use super::replay::Inputs;
 use candle_core::{Device, Result, Shape, Tensor};
-use quad_policy::{NoiseShape, Schedule};
+use quad_policy::Schedule;
 use rand::Rng;
 use rand_distr::{Distribution, StandardNormal};
 
@@ -13,36 +14,33 @@ pub(super) fn normal(shape: impl Into<Shape>, generator: &mut impl Rng, device: 
 }
 
 /// How the actions of a batch are made noisy.
+#[derive(Clone)]
 pub(super) struct Denoising {
-    /// Denoising step of each, in 1..=T, `[B]`.
-    pub t: Vec<u32>,
+    /// Denoising step t of each, in 1..=T, `[B]`.
+    pub t: Tensor,
     /// The noise ε that is to be predicted, `[B, a]`.
     pub epsilon: Tensor,
+    /// √ᾱ_t, in all columns of a row, `[B, a]`.
+    signal: Tensor,
+    /// √(1 − ᾱ_t), likewise.
+    pub deviation: Tensor,
 }
 
-/// Noisy actions.
-pub(super) struct Noisy {
-    /// a^t = √ᾱ_t·a + √(1 − ᾱ_t)·ε, `[B, a]`.
-    pub actions: Tensor,
-    /// √(1 − ᾱ_t), in all columns of a row, `[B, a]`.
-    pub deviation: Tensor,
-    /// t, `[B]`.
-    pub t: Tensor,
+impl Inputs for Denoising {
+    fn tensors(&mut self) -> Vec<&mut Tensor> {
+        vec![&mut self.t, &mut self.epsilon, &mut self.signal, &mut self.deviation]
+    }
 }
 
 impl Denoising {
-    /// For a batch of so many actions; each t is as likely.
-    pub fn draw(shape: &NoiseShape, batch: usize, generator: &mut impl Rng, device: &Device) -> Result<Self> {
-        let epsilon = normal((batch, shape.action_dim), generator, device)?;
-        let t = (0..batch).map(|_| generator.random_range(1..=shape.diffusion_steps as u32)).collect();
-        Ok(Self { t, epsilon })
+    /// By this t and ε for each action.
+    pub fn new(t: &[u32], epsilon: Tensor, schedule: &Schedule) -> Result<Self> {
+        let (signal, deviation) = schedule.noising(t, epsilon.dim(1)?, epsilon.device())?;
+        Ok(Self { t: Tensor::new(t, epsilon.device())?, epsilon, signal, deviation })
     }
 
-    /// Actions `[B, a]`, made noisy.
-    pub fn noisy(&self, schedule: &Schedule, actions: &Tensor) -> Result<Noisy> {
-        let device = actions.device();
-        let (signal, deviation) = schedule.noising(&self.t, actions.dim(1)?, device)?;
-        let actions = ((actions * signal)? + (&self.epsilon * &deviation)?)?;
-        Ok(Noisy { actions, deviation, t: Tensor::from_slice(&self.t, self.t.len(), device)? })
+    /// √ᾱ_t·a + √(1 − ᾱ_t)·ε of actions a, all `[B, a]`.
+    pub fn noisy(&self, actions: &Tensor) -> Result<Tensor> {
+        (actions * &self.signal)? + (&self.epsilon * &self.deviation)?
     }
 }

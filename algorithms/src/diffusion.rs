@@ -3,12 +3,14 @@
 
 use super::algorithm::{Algorithm, Measured};
 use super::context::{Context, Minibatch};
-use super::denoising::{Denoising, Noisy, normal};
+use super::denoising::{Denoising, normal};
 use super::parts::Parts;
 use super::random::{Purpose, stream};
+use super::replay::{Computed, Inputs, Replay};
 use super::trained::{Trained, ensemble, initial};
 use candle_core::{Device, Result, Tensor};
 use quad_policy::{Choice, DiffusionShape, Ensemble, NoisePredictor, PolicyConfig, Tensors, Weighted};
+use rand::Rng;
 use rand_chacha::ChaCha8Rng;
 
 /// The networks of such an algorithm, and what they learn from.
@@ -47,18 +49,21 @@ impl Networks {
     /// down to 2.
     pub fn chain_noise(&self, samples: usize, generator: &mut ChaCha8Rng) -> Result<Tensor> {
         let DiffusionShape { diffusion_steps, action_dim, .. } = self.shape;
-        normal((diffusion_steps, self.context.batch_size * samples, action_dim), generator, &self.context.device)
+        normal((diffusion_steps, self.context.batch_size * samples, action_dim), generator, &Device::Cpu)
     }
 
-    /// t and ε for the actions of a batch.
+    /// t, each as likely, and ε for the actions of a batch.
     pub fn denoising(&self, generator: &mut ChaCha8Rng) -> Result<Denoising> {
-        Denoising::draw(self.actor.network.shape(), self.context.batch_size, generator, &self.context.device)
+        let DiffusionShape { diffusion_steps, action_dim, .. } = self.shape;
+        let epsilon = normal((self.context.batch_size, action_dim), generator, &Device::Cpu)?;
+        let t = (0..self.context.batch_size).map(|_| generator.random_range(1..=diffusion_steps as u32));
+        Denoising::new(&Vec::from_iter(t), epsilon, self.actor.network.schedule())
     }
 
     /// The batch's actions made noisy, and the noise that the actor predicts in them, `[B, a]`.
-    pub fn denoise(&self, batch: &Minibatch, noise: &Denoising) -> Result<(Noisy, Tensor)> {
-        let noisy = noise.noisy(self.actor.network.schedule(), &batch.actions)?;
-        let predicted = self.actor.network.predict(&batch.observations, &noisy.actions, &noisy.t)?;
+    pub fn denoise(&self, batch: &Minibatch, noise: &Denoising) -> Result<(Tensor, Tensor)> {
+        let noisy = noise.noisy(&batch.actions)?;
+        let predicted = self.actor.network.predict(&batch.observations, &noisy, &noise.t)?;
         Ok((noisy, predicted))
     }
 }
@@ -66,12 +71,26 @@ impl Networks {
 /// The equations of one algorithm: its hyper-parameters, with what its updates change beside the networks.
 pub(super) trait Update: Send {
     /// The random numbers of one update.
-    type Noise;
+    type Noise: Inputs + Send;
 
+    /// They are drawn on the CPU.
     fn noise(&self, networks: &Networks, generator: &mut ChaCha8Rng) -> Result<Self::Noise>;
 
-    /// Update number `step`, from 0.
-    fn step(&mut self, networks: &mut Networks, step: u64, batch: &Minibatch, noise: &Self::Noise) -> Result<Measured>;
+    /// Sets the optimisers for update number `step`, from 0.
+    fn begin(&mut self, networks: &mut Networks, step: u64) -> Result<()>;
+
+    /// The work of an update, as [`Replay::start`] wants it.
+    fn work(&mut self, networks: &mut Networks, batch: &Minibatch, noise: &Self::Noise) -> Result<Computed>;
+
+    /// What only some updates do, behind the work of all.
+    fn end(&mut self, _: &mut Networks, _step: u64) -> Result<()> {
+        Ok(())
+    }
+
+    /// Metrics that are computed on the CPU, of the noise and of what an update computed beside scalars.
+    fn measure(&self, _: &Networks, _: &Self::Noise, _others: &[f32]) -> Result<Measured> {
+        Ok(Measured::new())
+    }
 
     /// How the policy chooses among its samples, and its tensors.
     fn policy(&self, networks: &Networks) -> Result<(Choice, Tensors)>;
@@ -83,12 +102,34 @@ pub(super) trait Update: Send {
 }
 
 /// Such an algorithm in the middle of a run.
-pub(super) struct Diffusion<U> {
+pub(super) struct Diffusion<U: Update> {
     pub update: U,
     pub networks: Networks,
+    replay: Replay<(Minibatch, U::Noise)>,
+    /// The number of the next update, and its noise, if a GPU left the time to draw it.
+    next: Option<(u64, U::Noise)>,
 }
 
 impl<U: Update> Diffusion<U> {
+    pub fn new(networks: Networks, update: U) -> Self {
+        Self { update, networks, replay: Replay::default(), next: None }
+    }
+
+    /// Update number `step` on a batch, with noise.
+    pub fn step(&mut self, step: u64, inputs: &(Minibatch, U::Noise)) -> Result<Measured> {
+        let Self { update, networks, replay, .. } = self;
+        update.begin(networks, step)?;
+        let device = networks.context.device.clone();
+        replay.start(&device, inputs, |(batch, noise)| update.work(networks, batch, noise))?;
+        update.end(networks, step)?;
+        if device.is_cuda() {
+            self.next = Some((step + 1, self.noise(step + 1)?));
+        }
+        let (mut measured, others) = self.replay.computed()?;
+        measured.extend(self.update.measure(&self.networks, &inputs.1, &others)?);
+        Ok(measured)
+    }
+
     /// The random numbers of update number `step`.
     pub fn noise(&self, step: u64) -> Result<U::Noise> {
         self.update.noise(&self.networks, &mut stream(self.networks.context.seed, Purpose::Noise, step))
@@ -97,8 +138,11 @@ impl<U: Update> Diffusion<U> {
 
 impl<U: Update> Algorithm for Diffusion<U> {
     fn update(&mut self, step: u64, items: &[u32]) -> Result<Measured> {
-        let (batch, noise) = (self.networks.context.batch(items)?, self.noise(step)?);
-        self.update.step(&mut self.networks, step, &batch, &noise)
+        let noise = match self.next.take() {
+            Some((of, noise)) if of == step => noise,
+            _ => self.noise(step)?,
+        };
+        self.step(step, &(self.networks.context.batch_on(items, &Device::Cpu)?, noise))
     }
 
     fn policy(&self) -> Result<(PolicyConfig, Tensors)> {
@@ -107,6 +151,8 @@ impl<U: Update> Algorithm for Diffusion<U> {
     }
 
     fn parts(&mut self) -> Parts<'_> {
+        // Who has the parts may put other tensors in their places.
+        self.replay = Replay::default();
         let Networks { context, actor, target_actor, critics, target_critics, .. } = &mut self.networks;
         let parts = Parts::default()
             .trained("actor", actor)

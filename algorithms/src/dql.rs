@@ -7,13 +7,14 @@
 #[path = "golden/dql.rs"]
 mod golden;
 
-use super::algorithm::{Measured, largest, measured, smaller};
+use super::algorithm::{largest, smaller};
 use super::context::{Context, Minibatch};
 use super::definition::{Definition, Metric, Reporting, metrics, read, readable};
 use super::denoising::Denoising;
 use super::diffusion::{Diffusion, Networks, Update};
 use super::hyperparameters::{Candidates, Count, NotNegative, Positive, Rate, Share, Steps};
-use candle_core::{Result, Tensor};
+use super::replay::{Computed, Inputs};
+use candle_core::{Device, Result, Tensor};
 use candle_nn::loss::mse;
 use quad_policy::{
     AdamStep, Choice, DiffusionPolicy, DiffusionShape, MlpConfig, Reduce, Reverse, Rule, Tensors, Weighted,
@@ -78,6 +79,7 @@ struct Config {
 }
 
 /// The random numbers of one update.
+#[derive(Clone)]
 struct Noise {
     /// Noise of the sampled next actions, `[T, B·S, a]`.
     next: Tensor,
@@ -85,8 +87,16 @@ struct Noise {
     policy: Tensor,
     /// i and ε of Eq. 2.
     denoising: Denoising,
-    /// The critic whose value the actor raises.
-    raised: usize,
+    /// i and j of Eq. 3, `[2]`: the critic whose value the actor raises, and the other.
+    raised: Tensor,
+}
+
+impl Inputs for Noise {
+    fn tensors(&mut self) -> Vec<&mut Tensor> {
+        let mut tensors = self.denoising.tensors();
+        tensors.extend([&mut self.next, &mut self.policy, &mut self.raised]);
+        tensors
+    }
 }
 
 impl Config {
@@ -99,7 +109,7 @@ impl Config {
             reverse: Reverse::Posterior,
             ..DiffusionShape::default()
         };
-        Ok(Diffusion { networks: Networks::new(shape, 0.0, context)?, update: self })
+        Ok(Diffusion::new(Networks::new(shape, 0.0, context)?, self))
     }
 
     /// y of Eq. 4, `[B]`: of several next actions each critic takes its best, then the smaller of the critics counts.
@@ -116,7 +126,8 @@ impl Config {
 fn q_loss(networks: &Networks, batch: &Minibatch, noise: &Noise) -> Result<Tensor> {
     let actions = networks.actor.network.sample_with_gradient(&batch.observations, &noise.policy)?;
     let q = networks.critics.network.detach().values(&batch.observations, &actions)?;
-    let (raised, other) = (q.get(noise.raised)?, q.get(1 - noise.raised)?);
+    let q = q.index_select(&noise.raised, 0)?;
+    let (raised, other) = (q.get(0)?, q.get(1)?);
     raised.mean_all()?.neg()? / other.abs()?.mean_all()?.detach()
 }
 
@@ -124,39 +135,37 @@ impl Update for Config {
     type Noise = Noise;
 
     fn noise(&self, networks: &Networks, generator: &mut ChaCha8Rng) -> Result<Noise> {
-        Ok(Noise {
-            next: networks.chain_noise(*self.samples, generator)?,
-            policy: networks.chain_noise(1, generator)?,
-            denoising: networks.denoising(generator)?,
-            raised: generator.random_range(0..CRITICS),
-        })
+        let next = networks.chain_noise(*self.samples, generator)?;
+        let policy = networks.chain_noise(1, generator)?;
+        let denoising = networks.denoising(generator)?;
+        let raised = generator.random_range(0..CRITICS) as u32;
+        Ok(Noise { next, policy, denoising, raised: Tensor::new(&[raised, 1 - raised], &Device::Cpu)? })
     }
 
-    /// One pass through Algorithm 1's loop.
-    fn step(&mut self, networks: &mut Networks, step: u64, batch: &Minibatch, noise: &Noise) -> Result<Measured> {
+    fn begin(&mut self, networks: &mut Networks, step: u64) -> Result<()> {
         let adam = |rate: f32| AdamStep { rate, clip: Some(*self.gradient_clip), count: step + 1 };
+        networks.critics.adam.set(adam(*self.critic_learning_rate))?;
+        networks.actor.adam.set(adam(*self.actor_learning_rate))
+    }
 
+    /// One pass through Algorithm 1's loop, but for the target actor.
+    fn work(&mut self, networks: &mut Networks, batch: &Minibatch, noise: &Noise) -> Result<Computed> {
         // Q(s, a) towards r + γ·min_k Q̂_k(s', a'), Eq. 4.
         let targets = self.targets(networks, batch, &noise.next)?;
         let error = networks.critics.network.squared_error(&batch.observations, &batch.actions, &targets)?;
         let critic_loss = (error * CRITICS as f64)?;
-        let critic_gradient_norm = networks.critics.descend(&critic_loss, adam(*self.critic_learning_rate))?;
+        let critic_gradient_norm = networks.critics.descend_as_set(&critic_loss)?;
 
         // The policy: cloned, Eq. 2, and moved towards what the critics value, Eq. 3.
         let (_, predicted) = networks.denoise(batch, &noise.denoising)?;
         let bc_loss = mse(&predicted, &noise.denoising.epsilon)?;
         let q_loss = q_loss(networks, batch, noise)?;
         let actor_loss = (&bc_loss + (&q_loss * f64::from(*self.eta))?)?;
-        let actor_gradient_norm = networks.actor.descend(&actor_loss, adam(*self.actor_learning_rate))?;
+        let actor_gradient_norm = networks.actor.descend_as_set(&actor_loss)?;
 
-        // Targets.
-        let Networks { actor, target_actor, critics, target_critics, .. } = networks;
-        if step.is_multiple_of(*self.actor_ema_every) && step >= self.actor_ema_start {
-            target_actor.follow(&actor.network, *self.actor_ema_rate)?;
-        }
-        target_critics.follow(&critics.network, *self.ema_rate)?;
+        networks.target_critics.follow(&networks.critics.network, *self.ema_rate)?;
 
-        measured([
+        let scalars = [
             ("q_mean", &targets.mean_all()?),
             ("critic_loss", &critic_loss),
             ("bc_loss", &bc_loss),
@@ -164,7 +173,15 @@ impl Update for Config {
             ("actor_loss", &actor_loss),
             ("critic_gradient_norm", &critic_gradient_norm),
             ("actor_gradient_norm", &actor_gradient_norm),
-        ])
+        ];
+        Computed::new(&scalars, &[])
+    }
+
+    fn end(&mut self, networks: &mut Networks, step: u64) -> Result<()> {
+        if step.is_multiple_of(*self.actor_ema_every) && step >= self.actor_ema_start {
+            networks.target_actor.follow(&networks.actor.network, *self.actor_ema_rate)?;
+        }
+        Ok(())
     }
 
     /// The actor as it is, not its EMA; one of its candidates is drawn by what the target critics say of them.

@@ -13,8 +13,8 @@ use super::parts::Parts;
 use candle_core::{Device, Tensor};
 use quad_dataset::{Arrays, Transitions};
 use quad_policy::{
-    Choice, Ensemble, EnsembleShape, Header, Layout, NoisePredictor, PolicyConfig, Precision, SquashedActor, Tensors,
-    Weights, load_policy, open_gpu, read_tensors,
+    Choice, Ensemble, EnsembleShape, Header, Layout, NoisePredictor, PolicyConfig, Precision, Reverse, Schedule,
+    SquashedActor, Tensors, Weights, load_policy, open_gpu, read_tensors,
 };
 pub(super) use reader::{Golden, MAKE, goldens, run};
 
@@ -125,7 +125,9 @@ pub(super) fn chain_noise(golden: &Golden, name: &str, device: &Device) -> Tenso
 /// How a golden folder makes the actions of its batch noisy.
 pub(super) fn denoising(golden: &Golden, device: &Device) -> Denoising {
     let t: Vec<i64> = golden.inputs["t"].to_vec1().unwrap();
-    Denoising { t: t.into_iter().map(|t| t as u32).collect(), epsilon: golden.input("epsilon", device) }
+    let t: Vec<u32> = t.into_iter().map(|t| t as u32).collect();
+    let schedule = Schedule::variance_preserving(golden.count("/agent/diffusion_steps"), Reverse::ClipClean);
+    Denoising::new(&t, golden.input("epsilon", device), &schedule).unwrap()
 }
 
 /// The batch of a golden folder.

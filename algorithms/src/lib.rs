@@ -27,6 +27,7 @@ mod phases;
 mod pool;
 mod quad;
 mod random;
+mod replay;
 mod returns;
 mod sfbc;
 mod squashed;

@@ -5,6 +5,11 @@ use quad_policy::{Adam, Layout, PolicyError, Tensors, Weighted, Weights, take};
 
 use super::trained::Trained;
 
+/// Writes other numbers over those of a tensor `[]` or `[n]`.
+pub(super) fn write(tensor: &Tensor, numbers: &Tensor) -> Result<()> {
+    tensor.flatten_all()?.slice_set(&numbers.flatten_all()?, 0, 0)
+}
+
 /// Something that updates change.
 enum Part<'a> {
     Weights(&'a mut Weights),
@@ -82,10 +87,10 @@ impl<'a> Parts<'a> {
                 Part::Adam(adam, layout) => adam.load(&layout, tensors, &format!("{name}."))?,
                 Part::Number(number) => {
                     let saved = take(tensors, name.to_owned(), &[number.elem_count()])?;
-                    *number = saved.reshape(number.shape())?.to_device(number.device())?;
+                    write(number, &saved.to_device(number.device())?)?;
                 }
                 Part::Maybe(number, device) if tensors.contains_key(name) => {
-                    *number = Some(take(tensors, name.to_owned(), &[1])?.reshape(())?.to_device(device)?);
+                    *number = Some(take(tensors, name.to_owned(), &[1])?.reshape(())?.to_device(device)?.copy()?);
                 }
                 Part::Maybe(number, _) => *number = None,
             }

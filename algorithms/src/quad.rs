@@ -11,12 +11,13 @@ mod lambda;
 mod metrics;
 mod summary;
 
-use super::algorithm::{Measured, largest, numbers};
+use super::algorithm::{Measured, largest};
 use super::context::{Context, Minibatch};
 use super::definition::{Axis, Definition, Reporting, Variant};
 use super::denoising::Denoising;
 use super::diffusion::{Diffusion, Networks, Update};
-use super::parts::Parts;
+use super::parts::{Parts, write};
+use super::replay::{Computed, Inputs};
 use candle_core::{Device, Result, Tensor};
 use candle_nn::loss::mse;
 use config::{Eta, Guidance, Quad as Config, TargetReduce};
@@ -56,6 +57,7 @@ struct Quad {
 }
 
 /// The random numbers of one update.
+#[derive(Clone)]
 struct Noise {
     /// Noise of the sampled next actions, `[T, B·S, a]`.
     next: Tensor,
@@ -63,6 +65,15 @@ struct Noise {
     denoising: Denoising,
     /// With guidance `shuffled`: the sample whose λ each takes, one of its own t, `[B]`.
     permutation: Option<Tensor>,
+}
+
+impl Inputs for Noise {
+    fn tensors(&mut self) -> Vec<&mut Tensor> {
+        let mut tensors = self.denoising.tensors();
+        tensors.push(&mut self.next);
+        tensors.extend(&mut self.permutation);
+        tensors
+    }
 }
 
 impl Config {
@@ -82,7 +93,7 @@ impl Config {
             lambda_means: (self.guidance == Guidance::Mean).then(unset).transpose()?,
             config: self,
         };
-        Ok(Diffusion { networks: Networks::new(shape, 0.0, context)?, update })
+        Ok(Diffusion::new(Networks::new(shape, 0.0, context)?, update))
     }
 }
 
@@ -116,52 +127,58 @@ impl Update for Quad {
     fn noise(&self, networks: &Networks, generator: &mut ChaCha8Rng) -> Result<Noise> {
         let next = networks.chain_noise(*self.config.samples, generator)?;
         let denoising = networks.denoising(generator)?;
-        let permutation = (self.config.guidance == Guidance::Shuffled).then(|| shuffled(&denoising.t, generator));
-        let permutation = permutation.map(|rows| Tensor::new(rows, &networks.context.device)).transpose()?;
+        let permutation = match self.config.guidance {
+            Guidance::Shuffled => Some(Tensor::new(shuffled(&denoising.t.to_vec1()?, generator), &Device::Cpu)?),
+            _ => None,
+        };
         Ok(Noise { next, denoising, permutation })
     }
 
-    /// One pass through Algorithm 1's loop.
-    fn step(&mut self, networks: &mut Networks, step: u64, batch: &Minibatch, noise: &Noise) -> Result<Measured> {
-        let decay = cosine_decay(step, networks.context.total_steps);
-        let (clip, count, ema_rate) = (Some(*self.config.gradient_clip), step + 1, *self.config.ema_rate);
+    fn begin(&mut self, networks: &mut Networks, step: u64) -> Result<()> {
+        let (decay, clip) = (cosine_decay(step, networks.context.total_steps), Some(*self.config.gradient_clip));
+        let adam = |rate: f32| AdamStep { rate: rate * decay, clip, count: step + 1 };
+        networks.critics.adam.set(adam(*self.config.critic_learning_rate))?;
+        networks.actor.adam.set(adam(*self.config.actor_learning_rate))
+    }
 
+    /// One pass through Algorithm 1's loop, but for the target actor.
+    fn work(&mut self, networks: &mut Networks, batch: &Minibatch, noise: &Noise) -> Result<Computed> {
         // Lines 4–7: every critic towards the lower confidence bound (Eq. 20).
         let targets = self.targets(networks, batch, &noise.next)?;
         let Networks { critics, target_critics, .. } = networks;
         let critic_loss = critics.network.squared_error(&batch.observations, &batch.actions, &targets)?;
-        let rate = *self.config.critic_learning_rate * decay;
-        let critic_gradient_norm = critics.descend(&critic_loss, AdamStep { rate, clip, count })?;
-        target_critics.follow(&critics.network, ema_rate)?;
+        let critic_gradient_norm = critics.descend_as_set(&critic_loss)?;
+        target_critics.follow(&critics.network, *self.config.ema_rate)?;
 
         // Lines 8–11: behaviour cloning, pulled along the gradients that the critics agree on (Eq. 5 and 19).
-        let epsilon = &noise.denoising.epsilon;
+        let Denoising { t, epsilon, deviation, .. } = &noise.denoising;
         let (noisy, predicted) = networks.denoise(batch, &noise.denoising)?;
         let error = (&predicted - epsilon)?;
         let bc_loss = error.sqr()?.mean_all()?;
         let mut actor_loss = (&bc_loss * &self.eta)?;
         let guide = (self.config.guidance != Guidance::None)
-            .then(|| self.guide(networks, batch, &noisy, &predicted.detach(), noise.permutation.as_ref()))
+            .then(|| self.guide(networks, batch, &noisy, &predicted.detach(), noise))
             .transpose()?;
         if let Some(guide) = &guide {
-            let pull = (&guide.gradient * &noisy.deviation)?.broadcast_mul(&guide.lambda.unsqueeze(1)?)?;
+            let pull = (&guide.gradient * deviation)?.broadcast_mul(&guide.lambda.unsqueeze(1)?)?;
             actor_loss = (actor_loss + (&predicted * pull)?.mean_all()?)?;
-            self.nu_squared = Some(guide.nu_squared.clone());
-            self.lambda_means.clone_from(&guide.lambda_means);
+            match &self.nu_squared {
+                Some(nu_squared) => write(nu_squared, &guide.nu_squared)?,
+                None => self.nu_squared = Some(guide.nu_squared.copy()?),
+            }
+            if let (Some(means), Some(after)) = (&self.lambda_means, &guide.lambda_means) {
+                write(means, after)?;
+            }
         }
-        let Networks { actor, target_actor, .. } = networks;
-        let rate = *self.config.actor_learning_rate * decay;
-        let actor_gradient_norm = actor.descend(&actor_loss, AdamStep { rate, clip, count })?;
+        let actor = &mut networks.actor;
+        let actor_gradient_norm = actor.descend_as_set(&actor_loss)?;
 
         // Line 12: dual ascent on η, with the actor as it is now.
         if let Some(threshold) = self.config.eta.threshold
             && self.config.guidance != Guidance::None
         {
-            let predicted = actor.network.detach().predict(&batch.observations, &noisy.actions, &noisy.t)?;
-            self.eta = self.ascended_eta((mse(&predicted, epsilon)? - f64::from(*threshold))?)?;
-        }
-        if step.is_multiple_of(*self.config.actor_ema_every) && step > self.config.actor_ema_start {
-            target_actor.follow(&actor.network, ema_rate)?;
+            let predicted = actor.network.detach().predict(&batch.observations, &noisy, t)?;
+            write(&self.eta, &self.ascended_eta((mse(&predicted, epsilon)? - f64::from(*threshold))?)?)?;
         }
 
         let q_mean = targets.mean_all()?;
@@ -175,13 +192,22 @@ impl Update for Quad {
             ("actor_gradient_norm", &actor_gradient_norm),
         ];
         named.extend(self.nu_squared.as_ref().map(|nu_squared| ("nu_squared", nu_squared)));
-        let of_guidance = guide.iter().flat_map(|guide| lambda::needed(guide, &error));
-        let mut values = numbers(&Vec::from_iter(named.iter().map(|(_, scalar)| *scalar).chain(of_guidance)))?;
-        let of_guidance = values.split_off(named.len());
-        let mut measured: Measured = named.iter().map(|(name, _)| *name).zip(values).collect();
-        measured.push(("learning_rate", rate));
-        let steps = networks.shape.diffusion_steps;
-        measured.extend(lambda::measure(&of_guidance, &noise.denoising.t, steps, *self.config.delta));
+        let of_guidance: Vec<_> = guide.iter().flat_map(|guide| lambda::needed(guide, &error)).collect();
+        Computed::new(&named, &of_guidance)
+    }
+
+    /// Line 12, too: the actor's EMA.
+    fn end(&mut self, networks: &mut Networks, step: u64) -> Result<()> {
+        if step.is_multiple_of(*self.config.actor_ema_every) && step > self.config.actor_ema_start {
+            networks.target_actor.follow(&networks.actor.network, *self.config.ema_rate)?;
+        }
+        Ok(())
+    }
+
+    fn measure(&self, networks: &Networks, noise: &Noise, of_guidance: &[f32]) -> Result<Measured> {
+        let (t, steps) = (noise.denoising.t.to_vec1()?, networks.shape.diffusion_steps);
+        let mut measured = lambda::measure(of_guidance, &t, steps, *self.config.delta);
+        measured.push(("learning_rate", networks.actor.adam.step().rate));
         Ok(measured)
     }
 

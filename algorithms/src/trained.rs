@@ -25,6 +25,12 @@ impl<N: Weighted> Trained<N> {
         self.descend_along(&Gradients::of(loss)?, step)
     }
 
+    /// As [`Self::descend`], by the step that [`Adam::set`] was given.
+    pub fn descend_as_set(&mut self, loss: &Tensor) -> Result<Tensor> {
+        let gradient = Gradients::of(loss)?.with_respect_to(self.network.weights())?;
+        self.adam.descend_as_set(self.network.weights_mut(), &gradient)
+    }
+
     /// As [`Self::descend`], down the loss that `gradients` are of.
     pub fn descend_along(&mut self, gradients: &Gradients, step: AdamStep) -> Result<Tensor> {
         let gradient = gradients.with_respect_to(self.network.weights())?;

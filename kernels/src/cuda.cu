@@ -61,9 +61,9 @@ extern "C" __global__ void squares(const float *x, float *partial, unsigned coun
 }
 
 // Adam's step, along a gradient that is first scaled down to the norm `clip` if it is longer. partial is what `squares` gave;
-// norm becomes the gradient's norm.
+// norm becomes the gradient's norm; rates are the step's rate, weight decay and correction of the second moment.
 extern "C" __global__ void adam(float *p, float *m, float *v, const float *gradient, const float *partial, float *norm,
-                                unsigned count, float clip, float rate, float decay, float correction) {
+                                unsigned count, float clip, const float *rates) {
   float length = sqrtf(block_sum(partial[threadIdx.x]));
   float scale = length > clip ? clip / length : 1.0f;
   unsigned i = blockIdx.x * 256 + threadIdx.x;
@@ -73,7 +73,7 @@ extern "C" __global__ void adam(float *p, float *m, float *v, const float *gradi
   float first = 0.9f * m[i] + 0.1f * g, second = 0.999f * v[i] + 0.001f * g * g;
   m[i] = first;
   v[i] = second;
-  p[i] -= rate * first / (sqrtf(second) * correction + 1e-8f) + decay * p[i];
+  p[i] -= rates[0] * first / (sqrtf(second) * rates[2] + 1e-8f) + rates[1] * p[i];
 }
 
 // target += rate·(online - target).

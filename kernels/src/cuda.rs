@@ -5,7 +5,6 @@
 //! Every function queues its work on a stream and returns before the GPU has done it.
 
 use crate::activation::Activation;
-use crate::optimiser::AdamRates;
 use cudarc::driver::result::{device, mem_pool};
 use cudarc::driver::sys::CUmemPool_attribute;
 use cudarc::driver::{
@@ -163,17 +162,19 @@ pub fn reverse(
 }
 
 /// Adam's step, as [`crate::optimiser::adam`]; the gradient is scaled down to the norm `clip` if it is longer. Gives its norm
-/// before that.
+/// before that. `rates` are those of [`crate::optimiser::AdamRates`], in its order: as numbers of the GPU they can differ each
+/// time that recorded work is replayed.
 pub fn adam(
     stream: &Arc<CudaStream>,
     parameters: &mut CudaViewMut<'_, f32>,
     moments: &mut CudaViewMut<'_, f32>,
     gradient: &CudaView<'_, f32>,
     clip: f32,
-    rates: AdamRates,
+    rates: &CudaView<'_, f32>,
 ) -> Result<CudaSlice<f32>> {
     let count = gradient.len();
     assert!(parameters.len() == count && moments.len() == 2 * count, "two moments of each number");
+    assert!(rates.len() == 3, "three rates");
     let kernels = kernels(stream)?;
     // SAFETY: the kernels write every number.
     let (mut partial, mut norm) = unsafe { (stream.alloc::<f32>(SUMS)?, stream.alloc::<f32>(1)?) };
@@ -185,7 +186,7 @@ pub fn adam(
     let (mut first, mut second) = moments.split_at_mut(count);
     let mut launch = stream.launch_builder(&kernels.adam);
     launch.arg(parameters).arg(&mut first).arg(&mut second).arg(gradient).arg(&partial).arg(&mut norm);
-    launch.arg(&all).arg(&clip).arg(&rates.rate).arg(&rates.decay).arg(&rates.correction);
+    launch.arg(&all).arg(&clip).arg(rates);
     // SAFETY: the arguments are those of the kernel, and the lengths were checked above.
     unsafe { launch.launch(threads(count))? };
     Ok(norm)

@@ -8,7 +8,7 @@
 //! - [`activation`]: Mish and its derivative; [`narrow`]: the first and last layer of a network, fused with it.
 //! - [`norm`]: layer norm, forward and backward.
 //! - [`optimiser`]: Adam and EMA over whole parameter vectors.
-//! - `cuda`: what of this a GPU does in one launch, with the feature `cuda`.
+//! - `cuda`: what of this a GPU does in one launch, and `recording`: many launches as one; both with the feature `cuda`.
 //! - [`scaling`]: between a user's units and those of networks.
 //! - [`Level`] (`level`): which of the CPU's instructions are used.
 //! - [`Buffer`] (`buffer`): memory that is used again and again, aligned to cache lines.
@@ -32,6 +32,8 @@ pub mod optimiser;
 #[cfg(target_arch = "x86_64")]
 mod packed;
 pub mod product;
+#[cfg(feature = "cuda")]
+pub mod recording;
 pub mod scaling;
 mod vectorised;
 

@@ -1,9 +1,13 @@
 //! Candle's tensors on a GPU as the kernels of `quad_kernels::cuda` take them.
 
-use candle_core::cuda_backend::cudarc::driver::{CudaSlice, CudaStream, CudaView, CudaViewMut};
-use candle_core::{CpuStorage, CudaStorage, Device, Error, InplaceOp1, Layout, Result, Shape, Storage, Tensor, bail};
+use candle_core::cuda_backend::CudaDType;
+use candle_core::cuda_backend::cudarc::driver::{CudaSlice, CudaStream, CudaView, CudaViewMut, DeviceRepr};
+use candle_core::{
+    CpuStorage, CudaStorage, Device, Error, InplaceOp1, Layout, Result, Shape, Storage, Tensor, WithDType, bail,
+};
 use quad_kernels::cuda::CudaError;
 use std::cell::Cell;
+use std::marker::PhantomData;
 use std::sync::Arc;
 
 /// Makes candle's calls of the driver fewer.
@@ -47,13 +51,13 @@ pub(crate) fn read<R>(tensor: &Tensor, work: impl FnOnce(&CudaView<'_, f32>) -> 
 }
 
 /// Has `work` change the numbers of a contiguous tensor in place, on its stream.
-pub(crate) fn modify<R>(
+pub(crate) fn modify<T: CudaDType, R>(
     tensor: &Tensor,
-    work: impl FnOnce(&Arc<CudaStream>, &mut CudaViewMut<'_, f32>) -> Result<R>,
+    work: impl FnOnce(&Arc<CudaStream>, &mut CudaViewMut<'_, T>) -> Result<R>,
 ) -> Result<R> {
     /// Candle asks for an operation that could be applied many times; this one is applied once.
-    struct Once<F, R>(Cell<Option<F>>, Cell<Option<R>>);
-    impl<R, F: FnOnce(&Arc<CudaStream>, &mut CudaViewMut<'_, f32>) -> Result<R>> InplaceOp1 for Once<F, R> {
+    struct Once<T, F, R>(Cell<Option<F>>, Cell<Option<R>>, PhantomData<T>);
+    impl<T: CudaDType, R, F: FnOnce(&Arc<CudaStream>, &mut CudaViewMut<'_, T>) -> Result<R>> InplaceOp1 for Once<T, F, R> {
         fn name(&self) -> &'static str {
             "modify"
         }
@@ -64,16 +68,25 @@ pub(crate) fn modify<R>(
 
         fn cuda_fwd(&self, storage: &mut CudaStorage, layout: &Layout) -> Result<()> {
             let stream = storage.device.cuda_stream();
-            let mut numbers = storage.as_cuda_slice_mut::<f32>()?.slice_mut(range(layout)?);
+            let mut numbers = storage.as_cuda_slice_mut::<T>()?.slice_mut(range(layout)?);
             if let Some(work) = self.0.take() {
                 self.1.set(Some(work(&stream, &mut numbers)?));
             }
             Ok(())
         }
     }
-    let once = Once(Cell::new(Some(work)), Cell::new(None));
+    let once = Once(Cell::new(Some(work)), Cell::new(None), PhantomData);
     tensor.inplace_op1(&once)?;
     once.1.take().ok_or_else(|| Error::Msg("a tensor is not on the GPU".into()))
+}
+
+/// Writes the numbers of a tensor on the CPU over those of a contiguous one on the GPU.
+pub(crate) fn overwrite<T: CudaDType + DeviceRepr + WithDType>(tensor: &Tensor, with: &Tensor) -> Result<()> {
+    if tensor.elem_count() != with.elem_count() {
+        bail!("{:?} cannot be written over {:?}", with.shape(), tensor.shape());
+    }
+    let copy = |with: &[T]| modify(tensor, |stream, numbers| stream.memcpy_htod(with, numbers).map_err(Error::wrap));
+    crate::slices::read(with, copy)?
 }
 
 /// Numbers of the GPU as a tensor.

@@ -24,7 +24,7 @@
 //! - Below: `layers` (where each layer lies in the vector), `network` (one network on one tile of rows, over the crate
 //!   `kernels`), `saved` and `kept_gradient` (what forward and backward passes leave), `operation` (candle's custom
 //!   operations), `packed` (kernels packed once), `slices` (candle's tensors as slices), `gpu` (the same on a GPU), `device`
-//!   (a GPU to compute on), `statistics` (mean and variance over an ensemble).
+//!   (a GPU to compute on), [`Recording`] (`recording`: its work, recorded), `statistics` (mean and variance over an ensemble).
 //!
 //! Everything that draws random numbers takes them as an argument or from a seeded generator.
 
@@ -73,6 +73,7 @@ mod planner;
 mod planning;
 mod policy;
 mod precision;
+mod recording;
 mod sampler;
 mod saved;
 mod scaled;
@@ -109,6 +110,7 @@ pub use policy::{Policy, Sampled};
 pub use precision::Precision;
 pub use quad_kernels::activation::Activation;
 pub use quad_kernels::scaling::{Affine, Scaling};
+pub use recording::{Recording, overwrite};
 pub use schedule::{Reverse, Schedule};
 pub use score::{ScorePolicy, ScorePolicyShape};
 pub use score_network::{ScoreNetwork, ScoreShape};

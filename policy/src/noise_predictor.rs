@@ -11,7 +11,7 @@ use crate::shape::{NoiseShape, TIME_FEATURES};
 use crate::weighted::weighted;
 use crate::weights::Weights;
 use candle_core::{DType, Result, Tensor, bail};
-use std::sync::Arc;
+use std::sync::{Arc, OnceLock};
 
 /// A noise predictor and its weights.
 pub struct NoisePredictor {
@@ -42,6 +42,7 @@ impl NoisePredictor {
             trunk: Mlp::new(shape.trunk_layers(), "trunk."),
             schedule: Schedule::variance_preserving(shape.diffusion_steps, shape.reverse),
             features: time_features(shape.diffusion_steps),
+            features_tensor: OnceLock::new(),
             shape,
         };
         Self { parts: Arc::new(parts), weights, packing: Packing::new(precision) }
@@ -57,12 +58,22 @@ impl NoisePredictor {
         &self.parts.schedule
     }
 
+    /// The sinusoids of all t, `[T, 16]`, where the weights are.
+    fn features(&self) -> Result<Tensor> {
+        let Parts { features, shape, features_tensor, .. } = &*self.parts;
+        if let Some(tensor) = features_tensor.get() {
+            return Ok(tensor.clone());
+        }
+        let device = self.weights.values().device();
+        let tensor = Tensor::from_slice(features, (shape.diffusion_steps, TIME_FEATURES), device)?;
+        Ok(features_tensor.get_or_init(|| tensor).clone())
+    }
+
     /// ε_θ(a^t, s, t): `observations [B, o]`, `actions [B, a]`, `t [B]` (u32, in 1..=T) → `[B, a]`. Differentiable in weights,
     /// observations and actions.
     pub fn predict(&self, observations: &Tensor, actions: &Tensor, t: &Tensor) -> Result<Tensor> {
-        let Parts { time, trunk, features, shape, .. } = &*self.parts;
-        let features = Tensor::from_slice(features, (shape.diffusion_steps, TIME_FEATURES), actions.device())?;
-        let embedding = time.forward(&self.weights, &[&features])?.squeeze(0)?;
+        let Parts { time, trunk, .. } = &*self.parts;
+        let embedding = time.forward(&self.weights, &[&self.features()?])?.squeeze(0)?;
         let embedding = embedding.index_select(&(t.to_dtype(DType::F32)? - 1.0)?.to_dtype(DType::U32)?, 0)?;
         trunk.forward(&self.weights, &[observations, actions, &embedding])?.squeeze(0)
     }
@@ -92,10 +103,9 @@ impl NoisePredictor {
     /// [`Self::sample`] with the embeddings of all t computed once, and one operation for a reverse step on a GPU.
     fn composed_sample(&self, observations: &Tensor, noise: &Tensor) -> Result<Tensor> {
         self.check_noise(observations, noise)?;
-        let Parts { time, trunk, features, shape, .. } = &*self.parts;
+        let Parts { time, trunk, .. } = &*self.parts;
         let (steps, rows, _) = noise.dims3()?;
-        let features = Tensor::from_slice(features, (shape.diffusion_steps, TIME_FEATURES), noise.device())?;
-        let embeddings = time.forward(&self.weights, &[&features])?.squeeze(0)?;
+        let embeddings = time.forward(&self.weights, &[&self.features()?])?.squeeze(0)?;
         let observations = plain::repeat_rows(observations, rows / observations.dim(0)?)?;
         let mut actions = noise.get(0)?;
         for t in (1..=steps).rev() {

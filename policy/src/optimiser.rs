@@ -1,9 +1,10 @@
 //! Adam over the weights of a network, with an implementation for the CPU and one of plain candle operations.
 
 use crate::error::PolicyError;
+use crate::recording::overwrite;
 use crate::slices::{has_fast_implementation, modify, read};
 use crate::weights::{Layout, Tensors, Weights};
-use candle_core::{DType, Result, Tensor};
+use candle_core::{DType, Device, Result, Tensor};
 use quad_kernels::optimiser::{AdamRates, BETA1, BETA2, EPSILON, adam, norm};
 
 /// Adam (Kingma and Ba 2015), with β = (0.9, 0.999) and ε = 1e-8, for the weights of one network; with a weight decay it is
@@ -13,6 +14,9 @@ pub struct Adam {
     pub(crate) moments: Tensor,
     /// What each step takes off the weights, relative to them and to its rate.
     decay: f32,
+    step: AdamStep,
+    /// The numbers of [`AdamRates`], `[3]`, from where a GPU reads them.
+    rates: Tensor,
 }
 
 /// One step's numbers.
@@ -30,18 +34,41 @@ impl Adam {
     /// For weights that have not moved yet, with a weight decay, if it is not 0.
     pub fn new(weights: &Weights, decay: f32) -> Result<Self> {
         let values = weights.values();
-        Ok(Self { moments: Tensor::zeros((2, values.elem_count()), DType::F32, values.device())?, decay })
+        let zeros = |shape: &[usize]| Tensor::zeros(shape, DType::F32, values.device());
+        let (moments, rates) = (zeros(&[2, values.elem_count()])?, zeros(&[3])?);
+        Ok(Self { moments, decay, step: AdamStep { rate: 0.0, clip: None, count: 1 }, rates })
     }
 
     /// Moves the weights down a gradient. Gives its norm before clipping, `[]`.
     pub fn descend(&mut self, weights: &mut Weights, gradient: &Tensor, step: AdamStep) -> Result<Tensor> {
+        self.set(step)?;
+        self.descend_as_set(weights, gradient)
+    }
+
+    /// Sets the numbers of the next step, beforehand: they are not part of a recorded step.
+    pub fn set(&mut self, step: AdamStep) -> Result<()> {
+        self.step = step;
+        if self.rates.device().is_cuda() {
+            let AdamRates { rate, decay, correction } = AdamRates::new(step.rate, self.decay, step.count);
+            overwrite(&self.rates, &Tensor::new(&[rate, decay, correction], &Device::Cpu)?)?;
+        }
+        Ok(())
+    }
+
+    /// What was set.
+    pub fn step(&self) -> AdamStep {
+        self.step
+    }
+
+    /// [`Self::descend`] by what was set.
+    pub fn descend_as_set(&mut self, weights: &mut Weights, gradient: &Tensor) -> Result<Tensor> {
         #[cfg(feature = "cuda")]
         if gradient.device().is_cuda() {
-            return self.gpu_step(weights, gradient, step);
+            return self.gpu_step(weights, gradient);
         }
         match has_fast_implementation(gradient.device()) {
-            true => self.fused_step(weights, gradient, step),
-            false => self.plain_step(weights, gradient, step),
+            true => self.fused_step(weights, gradient, self.step),
+            false => self.plain_step(weights, gradient, self.step),
         }
     }
 
@@ -60,24 +87,26 @@ impl Adam {
     }
 
     #[cfg(feature = "cuda")]
-    fn gpu_step(&mut self, weights: &mut Weights, gradient: &Tensor, step: AdamStep) -> Result<Tensor> {
+    fn gpu_step(&mut self, weights: &mut Weights, gradient: &Tensor) -> Result<Tensor> {
         use crate::gpu::{modify, read, tensor};
-        let rates = AdamRates::new(step.rate, self.decay, step.count);
-        let clip = step.clip.unwrap_or(f32::INFINITY);
+        let clip = self.step.clip.unwrap_or(f32::INFINITY);
         let mut size = None;
-        read(&gradient.contiguous()?, |gradient| {
-            modify(&self.moments, |_, moments| {
-                weights.change(|weights| {
-                    size = Some(modify(weights, |stream, weights| {
-                        quad_kernels::cuda::adam(stream, weights, moments, gradient, clip, rates)
-                            .map_err(candle_core::Error::wrap)
-                    })?);
-                    Ok(())
+        let (gradient, moments) = (gradient.contiguous()?, &self.moments);
+        read(&gradient, |gradient| {
+            read(&self.rates, |rates| {
+                modify(moments, |_, moments| {
+                    weights.change(|weights| {
+                        size = Some(modify(weights, |stream, weights| {
+                            quad_kernels::cuda::adam(stream, weights, moments, gradient, clip, rates)
+                                .map_err(candle_core::Error::wrap)
+                        })?);
+                        Ok(())
+                    })
                 })
             })
         })?;
         let size = size.ok_or_else(|| candle_core::Error::Msg("Adam made no step".into()))?;
-        tensor(size, (), gradient)
+        tensor(size, (), &gradient)
     }
 
     fn plain_step(&mut self, weights: &mut Weights, gradient: &Tensor, step: AdamStep) -> Result<Tensor> {

@@ -8,10 +8,10 @@ use crate::operation::{Arguments, Operation};
 
 use crate::schedule::Schedule;
 use crate::shape::{NoiseShape, TIME_EMBEDDING};
-use candle_core::{Result, Shape};
+use candle_core::{Result, Shape, Tensor};
 use quad_kernels::product::product;
 use rayon::prelude::*;
-use std::sync::Arc;
+use std::sync::{Arc, OnceLock};
 
 /// What does not change in training.
 pub(crate) struct Parts {
@@ -23,6 +23,8 @@ pub(crate) struct Parts {
     pub schedule: Schedule,
     /// Sinusoids of t = 1..T, `T × 16`.
     pub features: Vec<f32>,
+    /// The same as a tensor, once it was needed.
+    pub features_tensor: OnceLock<Tensor>,
 }
 
 /// The custom operation of (weights, observations, noise) that draws actions.

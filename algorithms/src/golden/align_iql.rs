@@ -13,10 +13,10 @@ fn check(golden: &Golden, device: &Device) {
     let mut align_iql = start(golden, device);
     load(golden, align_iql.parts());
     check_choice(golden, &align_iql);
-    let Diffusion { update, networks } = &mut align_iql;
+    let networks = &align_iql.networks;
     let (batch, noise) = (batch(golden, &networks.context), denoising(golden, device));
-    golden.close("noisy_actions", &networks.denoise(&batch, &noise).unwrap().0.actions);
-    let measured = update.step(networks, golden.count("/step") as u64, &batch, &noise).unwrap();
+    golden.close("noisy_actions", &networks.denoise(&batch, &noise).unwrap().0);
+    let measured = align_iql.step(golden.count("/step") as u64, &(batch, noise)).unwrap();
     check_update(golden, METRICS, &measured, align_iql.parts().save().unwrap());
 }
 

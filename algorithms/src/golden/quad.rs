@@ -25,10 +25,9 @@ fn noise(golden: &Golden, device: &Device) -> Noise {
 
 fn check(golden: &Golden, device: &Device) {
     let mut quad = start(golden, device);
-    let Diffusion { update, networks } = &mut quad;
-    let (batch, noise) = (batch(golden, &networks.context), noise(golden, device));
-    let eta: f32 = update.eta.to_scalar().unwrap();
-    let measured = update.step(networks, golden.count("/step") as u64, &batch, &noise).unwrap();
+    let inputs = (batch(golden, &quad.networks.context), noise(golden, device));
+    let eta: f32 = quad.update.eta.to_scalar().unwrap();
+    let measured = quad.step(golden.count("/step") as u64, &inputs).unwrap();
     check_update(golden, METRICS, &measured, quad.parts().save().unwrap());
     let value = |name| value(&measured, name);
     let guidance_loss = value("actor_loss") - eta * value("bc_loss");
@@ -63,17 +62,17 @@ fn eta_moves_by_at_most_its_rate_and_stays_within_its_bounds() {
     let moved = |threshold: f32, minimum: f32, maximum: f32| {
         let (batch, mut noise) = (batch(&golden, &context(&golden, &Device::Cpu)), noise(&golden, &Device::Cpu));
         noise.denoising.epsilon = (noise.denoising.epsilon * 10.0).unwrap();
-        let Diffusion { mut update, mut networks } = start(&golden, &Device::Cpu);
-        update.config.eta = Eta {
+        let mut quad = start(&golden, &Device::Cpu);
+        quad.update.config.eta = Eta {
             initial: NotNegative(1.0),
             threshold: Some(Positive(threshold)),
             rate: NotNegative(0.25),
             minimum: NotNegative(minimum),
             maximum: NotNegative(maximum),
         };
-        update.eta = Tensor::new(1f32, &Device::Cpu).unwrap();
-        update.step(&mut networks, 0, &batch, &noise).unwrap();
-        update.eta.to_scalar::<f32>().unwrap()
+        quad.update.eta = Tensor::new(1f32, &Device::Cpu).unwrap();
+        quad.step(0, &(batch, noise)).unwrap();
+        quad.update.eta.to_scalar::<f32>().unwrap()
     };
     assert_eq!((moved(0.1, 0.0, 9.0), moved(1e4, 0.0, 9.0)), (1.25, 0.75));
     assert_eq!((moved(0.1, 0.0, 1.125), moved(1e4, 0.875, 9.0)), (1.125, 0.875));
@@ -84,9 +83,9 @@ fn the_noise_of_a_step_is_repeatable_and_no_other_steps() {
     let golden = goldens("quad").remove(0);
     let quad = start(&golden, &Device::Cpu);
     let numbers = |step: u64| {
-        let Noise { next, denoising: Denoising { t, epsilon }, .. } = quad.noise(step).unwrap();
+        let Noise { next, denoising: Denoising { t, epsilon, .. }, .. } = quad.noise(step).unwrap();
         let [next, epsilon] = [next, epsilon].map(|x| x.flatten_all().unwrap().to_vec1::<f32>().unwrap());
-        (next, t, epsilon)
+        (next, t.to_vec1::<u32>().unwrap(), epsilon)
     };
     assert_eq!(numbers(0), numbers(0));
     let (next, t, epsilon) = numbers(0);
@@ -99,7 +98,8 @@ fn every_denoising_step_is_drawn_equally_often() {
     let golden = goldens("quad").remove(0);
     let quad = start(&golden, &Device::Cpu);
     let mut counts = vec![0; quad.networks.shape.diffusion_steps];
-    (0..1000).for_each(|step| quad.noise(step).unwrap().denoising.t.iter().for_each(|t| counts[*t as usize - 1] += 1));
+    let drawn = (0..1000).flat_map(|step| quad.noise(step).unwrap().denoising.t.to_vec1::<u32>().unwrap());
+    drawn.for_each(|t| counts[t as usize - 1] += 1);
     let expected = 1000 * quad.networks.context.batch_size / counts.len();
     // Six standard deviations of a binomial count.
     let room = 6.0 * (expected as f64).sqrt();
@@ -110,7 +110,7 @@ fn every_denoising_step_is_drawn_equally_often() {
 fn golden_parts() {
     for golden in goldens("quad") {
         let device = Device::Cpu;
-        let Diffusion { update, mut networks } = start(&golden, &device);
+        let Diffusion { update, mut networks, .. } = start(&golden, &device);
         let (batch, noise) = (batch(&golden, &networks.context), noise(&golden, &device));
         let next = networks.target_actor.sample(&batch.next_observations, &noise.next).unwrap();
         golden.close("next_actions", &next);
@@ -121,11 +121,11 @@ fn golden_parts() {
         // Guidance comes from the target critics as the update has just moved them.
         networks.target_critics.weights_mut().load(&mut golden.expected.clone(), "target_critic.").unwrap();
         let (noisy, predicted) = networks.denoise(&batch, &noise.denoising).unwrap();
-        golden.close("noisy_actions", &noisy.actions);
-        let gradients = networks.target_critics.action_gradients(&batch.observations, &noisy.actions).unwrap();
+        golden.close("noisy_actions", &noisy);
+        let gradients = networks.target_critics.action_gradients(&batch.observations, &noisy).unwrap();
         golden.close("critic_action_gradients", &gradients);
         let predicted = predicted.detach();
-        let guide = update.guide(&networks, &batch, &noisy, &predicted, noise.permutation.as_ref()).unwrap();
+        let guide = update.guide(&networks, &batch, &noisy, &predicted, &noise).unwrap();
         let mean = gradients.mean(0).unwrap().broadcast_div(&golden.expected["q_scale"]).unwrap();
         let difference =
             (&guide.gradient - &mean).unwrap().abs().unwrap().max_all().unwrap().to_scalar::<f32>().unwrap();
@@ -142,6 +142,7 @@ fn a_shuffle_moves_samples_among_those_of_their_denoising_step() {
     let mut quad = start(&golden, &Device::Cpu);
     quad.networks.context.batch_size = 500;
     let Noise { denoising: Denoising { t, .. }, permutation, .. } = quad.noise(0).unwrap();
+    let t: Vec<u32> = t.to_vec1().unwrap();
     let mut rows: Vec<u32> = permutation.unwrap().to_vec1().unwrap();
     assert!(rows.iter().zip(&t).all(|(row, step)| t[*row as usize] == *step));
     // Of n things in random order one stays on average; of three t's three do.
@@ -154,10 +155,11 @@ fn a_shuffle_moves_samples_among_those_of_their_denoising_step() {
 fn an_infinite_temperature_is_dac() {
     let golden = goldens("quad").into_iter().find(|golden| golden.config["agent"]["guidance"] == "quad").unwrap();
     let [quad, dac] = [Guidance::Quad, Guidance::Dac].map(|guidance| {
-        let Diffusion { mut update, mut networks } = start(&golden, &Device::Cpu);
-        (update.config.guidance, update.config.tau, update.config.delta) = (guidance, f32::INFINITY, Positive(1e-30));
+        let mut quad = start(&golden, &Device::Cpu);
+        let config = &mut quad.update.config;
+        (config.guidance, config.tau, config.delta) = (guidance, f32::INFINITY, Positive(1e-30));
         let (batch, noise) = (batch(&golden, &context(&golden, &Device::Cpu)), noise(&golden, &Device::Cpu));
-        update.step(&mut networks, 0, &batch, &noise).unwrap()
+        quad.step(0, &(batch, noise)).unwrap()
     });
     assert_eq!(quad, dac);
 }

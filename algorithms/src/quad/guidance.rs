@@ -1,9 +1,8 @@
 //! The critics' gradients at noisy actions, and how far each is trusted: by λ of Eq. 24, or by what a control has in its place.
 
-use super::Quad;
 use super::config::Guidance;
+use super::{Noise, Quad};
 use crate::context::Minibatch;
-use crate::denoising::Noisy;
 use crate::diffusion::Networks;
 use candle_core::{DType, Result, Tensor};
 use quad_policy::mean_and_variance;
@@ -25,19 +24,18 @@ pub(super) struct Guide {
 }
 
 impl Quad {
-    /// The target critics' gradients at noisy actions, and the weight of each (Eq. 10 and 21–24). `permutation` is that of
-    /// guidance `shuffled`, `[B]`.
+    /// The target critics' gradients at noisy actions, and the weight of each (Eq. 10 and 21–24).
     pub(super) fn guide(
         &self,
         networks: &Networks,
         batch: &Minibatch,
-        noisy: &Noisy,
+        noisy: &Tensor,
         predicted: &Tensor,
-        permutation: Option<&Tensor>,
+        noise: &Noise,
     ) -> Result<Guide> {
         let critics = &networks.target_critics;
         let scale = (critics.values(&batch.observations, &batch.actions)?.abs()?.mean_all()? + 1e-6)?;
-        let gradients = critics.action_gradients(&batch.observations, &noisy.actions)?.broadcast_div(&scale)?;
+        let gradients = critics.action_gradients(&batch.observations, noisy)?.broadcast_div(&scale)?;
 
         let size = (predicted.sqr()?.sum_keepdim(1)?.sqrt()? + 1e-8)?;
         let direction = predicted.broadcast_div(&size)?; // u, Eq. 21
@@ -56,12 +54,13 @@ impl Quad {
                 (sigma_squared.ones_like()?.affine(lambda, 0.0)?, nu_squared.zeros_like()?)
             }
         };
-        let lambda_means = self.lambda_means.as_ref().map(|before| self.followed(before, &lambda, &noisy.t));
+        let t = &noise.denoising.t;
+        let lambda_means = self.lambda_means.as_ref().map(|before| self.followed(before, &lambda, t));
         let lambda_means = lambda_means.transpose()?;
         if let Some(means) = &lambda_means {
-            lambda = means.index_select(&(&noisy.t - noisy.t.ones_like()?)?, 0)?;
+            lambda = means.index_select(&(t - t.ones_like()?)?, 0)?;
         }
-        if let Some(permutation) = permutation {
+        if let Some(permutation) = &noise.permutation {
             lambda = lambda.index_select(permutation, 0)?;
         }
         let gradient = mean_and_variance(&gradients)?.0;
