@@ -1,18 +1,24 @@
-"""The notebook in examples/ runs from its first cell to its last."""
+"""The notebooks in examples/ run from their first cell to their last."""
 
 from pathlib import Path
 
 import nbformat
+import pytest
 from nbclient import NotebookClient
 
-NOTEBOOK = Path(__file__).parents[2] / "examples" / "from_python.ipynb"
+EXAMPLES = Path(__file__).parents[2] / "examples"
+# What each shows. Commands of a shell do not fail a cell.
+SHOWN = {
+    "from_python": ("20027 transitions", "transitions   20026", "run folder: runs/iql", "returns: [", "10 candidates"),
+    "robot": ("episodes      300", "page: http://", "training is done", "4 -> 2 numbers", "of the policy's"),
+}
 
 
-def test_the_notebook_runs(tmp_path):
-    notebook = nbformat.read(NOTEBOOK, as_version=4)
+@pytest.mark.parametrize("name", SHOWN)
+def test_the_notebook_runs(name, tmp_path):
+    notebook = nbformat.read(EXAMPLES / f"{name}.ipynb", as_version=4)
     assert not any(cell.get("outputs") for cell in notebook.cells), "outputs are kept out of the repository"
     NotebookClient(notebook, timeout=900, resources={"metadata": {"path": str(tmp_path)}}).execute()
     text = "".join(str(cell.get("outputs")) for cell in notebook.cells)
-    # Commands of a shell do not fail a cell.
-    for shown in ("20027 transitions", "transitions   20026", "run folder: runs/iql", "returns: [", "10 candidates"):
+    for shown in SHOWN[name]:
         assert shown in text, shown

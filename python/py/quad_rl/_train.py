@@ -125,7 +125,7 @@ class _Display:
     """Shows what a learner says. In a notebook or on a terminal, its line of progress is a bar that stays in its place."""
 
     def __init__(self) -> None:
-        notebook = "ipykernel" in sys.modules
+        notebook = type(sys.stdout).__module__ == "ipykernel.iostream"
         self._out = sys.stdout if notebook else sys.stderr
         self._draws = notebook or self._out.isatty()
         self._bar = ""
