@@ -80,7 +80,8 @@ impl PyPolicy {
     /// anything else that NumPy takes is converted.
     ///
     /// candidates: how many actions are drawn in each state. rule: which of them is taken, "best", "softmax:TEMPERATURE",
-    ///     "average:TEMPERATURE:ACTIONS" (the mean of so many) or "nearest". value: what the critics' values of an action count as, "mean" or "min". None: what the file says (`choice`).
+    ///     "average:TEMPERATURE:ACTIONS" (the mean of so many) or "nearest". value: what the critics' values of an action count
+    ///     as, "mean" or "min". None: what the file says (`choice`).
     /// seed: an int: row i draws from seed + i, so that one observation gives what an evaluator does in the first step of the
     ///     episode of that seed. A sequence of n ints: a seed for each row. None: fresh random numbers.
     ///
@@ -162,8 +163,7 @@ impl PyPolicy {
         let rows = self.rows(&observations)?;
         let taken = Rows::of("actions", &actions, self.policy.action_dim(), &self.names.actions)?;
         if (taken.count, taken.single) != (rows.count, rows.single) {
-            let error =
-                format!("{} rows of observations, but {} of actions: one action for each", rows.count, taken.count);
+            let error = format!("{} observations, but {} actions: one action for each", rows.count, taken.count);
             return Err(PyValueError::new_err(error));
         }
         let policy = choosing(&self.policy, Changes { value, ..Changes::default() })?;
@@ -224,8 +224,7 @@ impl PyPolicy {
         self.policy.action_dim()
     }
 
-    /// What the data that it has learnt from calls the numbers of an observation; empty where they have no names. A table with
-    /// other columns is refused.
+    /// What its data calls the numbers of an observation; empty where they have no names. Other columns are refused.
     #[getter]
     fn observation_names(&self) -> Vec<String> {
         self.names.observations.clone()
@@ -249,8 +248,8 @@ impl PyPolicy {
         self.origin.step
     }
 
-    /// "diffusion" or "squashed" (a Gaussian through a tanh), which draw actions and choose one; "planner", which draws plans and
-    /// chooses one; or "gaussian", which acts by its mean.
+    /// "diffusion", "squashed" (a Gaussian through a tanh) or "score" (SfBC's), which draw actions and choose; "planner", which
+    /// draws plans and chooses one; or "gaussian", which acts by its mean.
     #[getter]
     fn kind(&self) -> &'static str {
         match self.config {
@@ -283,11 +282,8 @@ impl PyPolicy {
         let choice = self.policy.choice().map_or(String::new(), |choice| format!(", {choice}"));
         let (o, a) = (self.policy.observation_dim(), self.policy.action_dim());
         let Origin { environment, step, .. } = &self.origin;
-        format!(
-            "Policy({environment}, {} after step {step}, {o} -> {a} numbers{choice}, {})",
-            self.kind(),
-            self.precision()
-        )
+        let (kind, precision) = (self.kind(), self.precision());
+        format!("Policy({environment}, {kind} after step {step}, {o} -> {a} numbers{choice}, {precision})")
     }
 
     fn __reduce__<'py>(slf: &Bound<'py, Self>) -> PyResult<Bound<'py, PyTuple>> {

@@ -157,7 +157,7 @@ def test_what_cannot_be_is_refused(snapshots, tmp_path):
         "observations, row 1: number 4 is NaN": lambda: policy.act(bad),
         "number 0 is inf": lambda: policy.act(states.astype(np.float64) * 1e300),
         "actions, row 0": lambda: policy.value(states, np.full((3, ACTION), np.nan)),
-        "3 rows of observations, but 2 of actions": lambda: policy.value(states, np.zeros((2, ACTION))),
+        "3 observations, but 2 actions": lambda: policy.value(states, np.zeros((2, ACTION))),
         "could not convert string": lambda: policy.act(["a"]),
         "seed must be an int .* sequence of 3": lambda: policy.act(states, seed=-1),
         "sequence of 3 of them, or None": lambda: policy.act(states, seed=[1, 2]),
