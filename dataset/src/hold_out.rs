@@ -74,9 +74,9 @@ impl Recording {
 
     /// No rows, of the same sizes.
     fn like(&self) -> Recording {
-        let (observation_dim, action_dim, goal) = (self.observation_dim, self.action_dim, self.goal);
-        let next_observations = self.next_observations.as_ref().map(|_| Vec::new());
-        Recording { observation_dim, action_dim, goal, next_observations, ..Recording::default() }
+        let Recording { observation_dim, action_dim, goal, .. } = *self;
+        let (names, next_observations) = (self.names.clone(), self.next_observations.as_ref().map(|_| Vec::new()));
+        Recording { observation_dim, action_dim, goal, names, next_observations, ..Recording::default() }
     }
 
     fn extend(&mut self, from: &Recording, rows: Range<usize>) {

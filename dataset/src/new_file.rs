@@ -4,7 +4,9 @@ use std::fs;
 use std::io;
 use std::path::{Path, PathBuf};
 
+use hdf5::plist::DatasetCreate;
 use hdf5::{H5Type, Hyperslab, SliceOrIndex};
+use hdf5_sys::h5p::H5Pset_obj_track_times;
 use ndarray::ArrayViewD;
 
 use crate::error::{DatasetError, Problem};
@@ -64,6 +66,17 @@ impl NewFile {
     }
 }
 
+/// Properties of an array that does not say when it was made: equal rows make equal files, by whose hash a run knows its data.
+#[allow(unsafe_code)]
+fn timeless() -> hdf5::Result<DatasetCreate> {
+    let properties = DatasetCreate::try_new()?;
+    // SAFETY: the number is that of these properties, and no other thread is in the library meanwhile.
+    match hdf5::sync::sync(|| unsafe { H5Pset_obj_track_times(properties.id(), 0) }) {
+        0.. => Ok(properties),
+        _ => Err("the HDF5 library keeps the time of arrays".into()),
+    }
+}
+
 /// An array that grows by rows: N, or N × width.
 pub(crate) struct Column {
     pub(crate) name: &'static str,
@@ -75,7 +88,7 @@ pub(crate) struct Column {
 impl Column {
     /// An array without rows, of numbers of type `T`.
     pub(crate) fn create<T: H5Type>(file: &NewFile, name: &'static str, width: Option<usize>) -> hdf5::Result<Self> {
-        let builder = file.hdf5.new_dataset::<T>().deflate(GZIP_LEVEL);
+        let builder = file.hdf5.new_dataset::<T>().set_create_plist(&timeless()?).deflate(GZIP_LEVEL);
         let dataset = match width {
             None => builder.chunk((CHUNK_ROWS,)).shape((0..,)).create(name)?,
             Some(width) => {
