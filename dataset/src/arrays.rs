@@ -14,9 +14,9 @@ use crate::recording::{Recording, RowKind};
 /// What a source calls the numbers of its rows. An empty list where they have no names.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
 pub struct Names {
-    /// Of an observation, o.
+    /// Names of the numbers of an observation, o.
     pub observations: Vec<String>,
-    /// Of an action, a.
+    /// Names of the numbers of an action, a.
     pub actions: Vec<String>,
 }
 

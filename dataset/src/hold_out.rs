@@ -31,6 +31,11 @@ pub struct Split {
     pub episodes: Vec<usize>,
 }
 
+impl HoldOut {
+    /// Keeps none out.
+    pub(crate) const NONE: Self = Self { share: 0.0, seed: 0 };
+}
+
 /// Numbers of the episodes that are kept out, from 0 in the order of the recording, in ascending order. Where the share is not
 /// 0 there is at least one, and one is left to learn from.
 pub(crate) fn chosen(HoldOut { share, seed }: HoldOut, episodes: usize) -> Vec<usize> {

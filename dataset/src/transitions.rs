@@ -95,7 +95,7 @@ impl Transitions {
     /// scaled, other sizes than the environment's or another environment, a file that is one endless episode or makes no
     /// transition.
     pub fn read(path: impl AsRef<Path>, options: &ReadOptions) -> Result<Self, DatasetError> {
-        Ok(Self::read_split(path, options, HoldOut { share: 0.0, seed: 0 })?.training)
+        Ok(Self::read_split(path, options, HoldOut::NONE)?.training)
     }
 
     /// As [`Self::read`], but keeps some episodes out.
@@ -118,7 +118,7 @@ impl Transitions {
         let error = |problem| DatasetError::new("arrays in memory", problem);
         let recording = arrays.into_recording().map_err(error)?;
         let options = ReadOptions { environment: None, reward: RewardRule::AsIs, scale: Scale::default() };
-        let split = Self::split(recording, &options, HoldOut { share: 0.0, seed: 0 }).map_err(error)?;
+        let split = Self::split(recording, &options, HoldOut::NONE).map_err(error)?;
         Ok(split.training)
     }
 

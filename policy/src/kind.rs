@@ -118,7 +118,7 @@ pub struct Header<O> {
     /// What the data that it has learnt from calls the numbers of an observation; empty where they have no names.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     pub observation_names: Vec<String>,
-    /// The same of the numbers of an action.
+    /// Names of the numbers of an action.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     pub action_names: Vec<String>,
     /// Where it comes from.
@@ -126,7 +126,7 @@ pub struct Header<O> {
 }
 
 impl<O> Header<O> {
-    /// Of networks that have learnt in the user's own units, from numbers without names.
+    /// The header of networks that have learnt in the user's own units, from numbers without names.
     pub fn new(policy: PolicyConfig, origin: O) -> Self {
         Self { policy, scaling: None, observation_names: Vec::new(), action_names: Vec::new(), origin }
     }

@@ -23,7 +23,7 @@ pub(crate) struct Parts {
     pub schedule: Schedule,
     /// Sinusoids of t = 1..T, `T × 16`.
     pub features: Vec<f32>,
-    /// The same as a tensor, once it was needed.
+    /// A tensor of them, once it was needed.
     pub features_tensor: OnceLock<Tensor>,
 }
 

@@ -54,7 +54,7 @@ pub struct Inspection {
     pub scores: Option<Scores>,
     /// What the source calls the numbers of an observation; empty where they have no names.
     pub observation_names: Vec<String>,
-    /// The same of an action.
+    /// Names of the numbers of an action.
     pub action_names: Vec<String>,
     /// Smallest and largest reward.
     pub reward_range: Range,

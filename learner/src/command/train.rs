@@ -125,10 +125,8 @@ async fn run_to_its_end(
     let Split { training, held_out, .. } = data;
     let task = Task::new(environment, training.observation_dim(), training.action_dim());
     let mut agent = begin(&config.experiment, config.run.device, training)?;
-    let held_out = held_out
-        .map(|held_out| HeldOut::new(&config.experiment, config.run.device, held_out, &mut agent))
-        .transpose()?
-        .flatten();
+    let held_out =
+        held_out.and_then(|held_out| HeldOut::new(&config.experiment, config.run.device, held_out, &mut agent));
     let opening = outside.open().await?;
     // All checks are done, so a start that is refused leaves no folder behind.
     let (run_dir, scores, past) = take_up(path, begun, args.fresh, config)?;

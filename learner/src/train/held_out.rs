@@ -37,15 +37,7 @@ pub(crate) struct HeldOut {
 impl HeldOut {
     /// For the algorithm at its beginning; none where it cannot be measured on these transitions: they hold nothing that it
     /// learns from, or its state has numbers for each transition that it trains on.
-    ///
-    /// # Errors
-    /// The algorithm's state is not finite.
-    pub fn new(
-        experiment: &Experiment,
-        device: Device,
-        held_out: Transitions,
-        training: &mut Agent,
-    ) -> anyhow::Result<Option<Self>> {
+    pub fn new(experiment: &Experiment, device: Device, held_out: Transitions, training: &mut Agent) -> Option<Self> {
         let size = (experiment.batch_size as usize).min(held_out.len());
         let loaded = algorithm(experiment, device, held_out, size).and_then(|mut agent| {
             agent.load(&training.save()?)?;
@@ -55,10 +47,10 @@ impl HeldOut {
             Ok(agent) => agent,
             Err(error) => {
                 info!("nothing is measured on held-out episodes: {error:#}");
-                return Ok(None);
+                return None;
             }
         };
-        Ok(Some(Self::of(agent, size, experiment.seed, experiment.steps)))
+        Some(Self::of(agent, size, experiment.seed, experiment.steps))
     }
 
     /// By batches of this size, which the seed draws, in a run of so many steps.

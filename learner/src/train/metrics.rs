@@ -24,7 +24,7 @@ pub(crate) struct TrainingMetrics {
     pub diverged: IntGauge,
     /// What the algorithm measures, in its order.
     pub algorithm: Vec<(&'static Metric, Gauge)>,
-    /// The same on held-out episodes, where it says something of them.
+    /// Gauges of what is measured on held-out episodes.
     held_out: Vec<Gauge>,
 }
 

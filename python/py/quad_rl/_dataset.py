@@ -129,5 +129,3 @@ class Dataset:
     def __str__(self) -> str:
         page = self._inspected()[1]
         return page + "".join(["\n\nas it was read" if self._notes else "", *(f"\n  - {note}" for note in self._notes)])
-
-
