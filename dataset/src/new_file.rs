@@ -41,7 +41,8 @@ impl NewFile {
         if path.is_dir() {
             return Err(DatasetError::new(path, Problem::Io(io::ErrorKind::IsADirectory.into())));
         }
-        let hdf5 = hdf5::File::create(&partial);
+        // The oldest format is read by every version of the library, and its groups do not say when they were made.
+        let hdf5 = hdf5::File::with_options().with_fapl(|access| access.libver_earliest()).create(&partial);
         let hdf5 = hdf5.map_err(|source| DatasetError::new(path, Problem::Write(source)))?;
         Ok(Self { path: path.to_owned(), partial, hdf5 })
     }
