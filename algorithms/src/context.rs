@@ -58,6 +58,25 @@ impl Context {
             masks: column(&batch.masks)?,
         })
     }
+
+    /// The transitions that have a next action, or need none because the episode terminates.
+    pub(super) fn items_with_next_action(&self) -> Vec<u32> {
+        let (transitions, mut one) = (&self.transitions, Batch::default());
+        let usable = |row: &u32| {
+            transitions.gather(&[*row], &mut one);
+            transitions.next_action(*row).is_some() || one.masks == [0.0]
+        };
+        (0..transitions.len() as u32).filter(usable).collect()
+    }
+
+    /// The actions that the data takes after these transitions, `[B, a]`; 0 at the end of an episode, where none counts.
+    pub(super) fn next_actions(&self, rows: &[u32]) -> Result<Tensor> {
+        let a = self.action_dim();
+        let none = vec![0.0; a];
+        let next = |row: &u32| self.transitions.next_action(*row).unwrap_or(&none).to_vec();
+        let actions: Vec<f32> = rows.iter().flat_map(next).collect();
+        Tensor::from_vec(actions, (rows.len(), a), &self.device)
+    }
 }
 
 /// A batch of B transitions as tensors.

@@ -16,6 +16,7 @@ mod diffuser;
 mod diffusion;
 mod dql;
 mod dtql;
+mod fqe;
 mod gaussian;
 mod hyperparameters;
 mod in_sample;
@@ -39,6 +40,7 @@ pub use agent::{Agent, StateError};
 pub use algorithm::{AgentError, Algorithm, AlgorithmError, Measured};
 pub use context::{Context, Minibatch};
 pub use definition::{Axis, Definition, Metric, MetricsLine, Reporting, Summary, Variant};
+pub use fqe::{Fqe, FqeConfig, Units};
 pub use parts::Parts;
 pub use values::{Values, fits, merge};
 

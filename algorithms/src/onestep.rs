@@ -17,7 +17,6 @@ use super::phases;
 use super::random::{Purpose, stream};
 use super::trained::{Trained, ensemble};
 use candle_core::{DType, Result, Tensor};
-use quad_dataset::Batch;
 use quad_policy::{AdamStep, Ensemble, EnsembleShape, MlpConfig, PolicyConfig, Tensors, Weighted};
 use rand_distr::{Distribution, StandardNormal};
 use serde::Deserialize;
@@ -100,7 +99,7 @@ struct Onestep {
 
 impl Onestep {
     fn new(config: Config, context: Context) -> std::result::Result<Self, AlgorithmError> {
-        let items = items(&context);
+        let items = context.items_with_next_action();
         if items.is_empty() {
             return Err(AlgorithmError::NoNextAction);
         }
@@ -194,25 +193,6 @@ impl Onestep {
         let numbers = (0..shape.0 * shape.1 * shape.2).map(|_| StandardNormal.sample(&mut generator));
         Tensor::from_vec(numbers.collect::<Vec<f32>>(), shape, &self.context.device)
     }
-
-    /// The actions that the data takes after these transitions, `[B, a]`; 0 at the end of an episode, where none counts.
-    fn next_actions(&self, rows: &[u32]) -> Result<Tensor> {
-        let a = self.context.action_dim();
-        let none = vec![0.0; a];
-        let next = |row: &u32| self.context.transitions.next_action(*row).unwrap_or(&none).to_vec();
-        let actions: Vec<f32> = rows.iter().flat_map(next).collect();
-        Tensor::from_vec(actions, (rows.len(), a), &self.context.device)
-    }
-}
-
-/// The transitions that have a next action, or need none because the episode terminates.
-fn items(context: &Context) -> Vec<u32> {
-    let (transitions, mut one) = (&context.transitions, Batch::default());
-    let usable = |row: &u32| {
-        transitions.gather(&[*row], &mut one);
-        transitions.next_action(*row).is_some() || one.masks == [0.0]
-    };
-    (0..transitions.len() as u32).filter(usable).collect()
 }
 
 /// Mean and log σ of a policy's actions, `[n, a]` each: its network gives both, log σ through a tanh that keeps it in bounds.
@@ -236,7 +216,7 @@ impl Algorithm for Onestep {
         let batch = self.context.batch(&rows)?;
         match self.phase(step) {
             Phase::Behavior(steps) => self.clone_behavior(&batch, steps),
-            Phase::Critic(steps) => self.evaluate_behavior(&batch, &self.next_actions(&rows)?, steps),
+            Phase::Critic(steps) => self.evaluate_behavior(&batch, &self.context.next_actions(&rows)?, steps),
             Phase::Policy(steps) => self.improve(&batch, &self.noise(step)?, steps),
         }
     }

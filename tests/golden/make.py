@@ -20,6 +20,7 @@ import cql
 import diffuser
 import dql
 import dtql
+import fqe
 import iql
 import ivr
 import onestep
@@ -62,8 +63,9 @@ FOLDERS = {
     "sfbc-planning": (42, "sfbc-planning", "small"),
     "diffuser": (40, "diffuser", "small"),
     "diffuser-attention": (41, "diffuser-attention", "small"),
+    "fqe": (50, "fqe", "small"),
 }
-MODULES = quad, iql, ivr, xql, dql, align_iql, onestep, cql, dtql, sfbc, diffuser
+MODULES = quad, iql, ivr, xql, dql, align_iql, onestep, cql, dtql, sfbc, diffuser, fqe
 ALGORITHMS = {variant: algorithm for algorithm in MODULES for variant in algorithm.VARIANTS}
 
 

@@ -50,7 +50,7 @@ fn it_learns_from_transitions_with_a_next_action_and_from_terminals() {
     let golden = goldens("onestep").remove(0);
     let onestep = Onestep::new(read(&table(&golden)).unwrap(), small_context(&golden)).unwrap();
     assert_eq!((onestep.items(6), &onestep.items[..]), (4, &[0, 1, 2, 4][..]));
-    let next: Vec<Vec<f32>> = onestep.next_actions(&onestep.items).unwrap().to_vec2().unwrap();
+    let next: Vec<Vec<f32>> = onestep.context.next_actions(&onestep.items).unwrap().to_vec2().unwrap();
     assert_eq!(next, [[0.1], [0.0], [0.3], [0.5]]);
 }
 
