@@ -12,13 +12,18 @@ use crate::transitions::Transitions;
 /// Keeps these draws apart from other uses of the run's seed.
 const PURPOSE: u64 = u64::from_be_bytes(*b"hold out");
 
-/// Which episodes are kept out: so large a share, drawn by a seed.
+/// Which episodes are kept out.
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub struct HoldOut {
-    /// Between 0, which keeps none out, and 1.
-    pub share: f64,
-    /// A function of it and of the number of episodes.
-    pub seed: u64,
+pub enum HoldOut<'a> {
+    /// A share of them, between 0, which keeps none out, and 1.
+    Share {
+        /// How large it is.
+        share: f64,
+        /// Decides, with the number of episodes, which they are.
+        seed: u64,
+    },
+    /// Those of these numbers, from 0 in the order of the file.
+    Episodes(&'a [usize]),
 }
 
 /// Transitions to learn from, and episodes that are kept out of training.
@@ -31,14 +36,22 @@ pub struct Split {
     pub episodes: Vec<usize>,
 }
 
-impl HoldOut {
+impl HoldOut<'_> {
     /// Keeps none out.
-    pub(crate) const NONE: Self = Self { share: 0.0, seed: 0 };
+    pub(crate) const NONE: Self = Self::Episodes(&[]);
+
+    pub(crate) fn is_none(self) -> bool {
+        matches!(self, Self::Share { share: 0.0, .. } | Self::Episodes([]))
+    }
 }
 
 /// Numbers of the episodes that are kept out, from 0 in the order of the recording, in ascending order. Where the share is not
 /// 0 there is at least one, and one is left to learn from.
-pub(crate) fn chosen(HoldOut { share, seed }: HoldOut, episodes: usize) -> Vec<usize> {
+pub(crate) fn chosen(hold_out: HoldOut<'_>, episodes: usize) -> Vec<usize> {
+    let (share, seed) = match hold_out {
+        HoldOut::Share { share, seed } => (share, seed),
+        HoldOut::Episodes(numbers) => return numbers.to_vec(),
+    };
     let mut numbers = Vec::from_iter(0..episodes);
     numbers.shuffle(&mut ChaCha8Rng::seed_from_u64(seed ^ PURPOSE));
     let count = if share > 0.0 { ((share * episodes as f64).round() as usize).max(1) } else { 0 };
@@ -63,7 +76,7 @@ impl Recording {
     }
 
     /// The episodes to learn from, those that are kept out, and the numbers of these.
-    pub(crate) fn hold_out(&self, hold_out: HoldOut) -> (Recording, Recording, Vec<usize>) {
+    pub(crate) fn hold_out(&self, hold_out: HoldOut<'_>) -> (Recording, Recording, Vec<usize>) {
         let episodes = self.rows_of_episodes();
         let out = chosen(hold_out, episodes.len());
         let (mut training, mut held_out) = (self.like(), self.like());
@@ -126,13 +139,15 @@ mod tests {
         let mut whole = recording(&[Transition, Transition, Transition, Dropped, Transition, LastState, Transition]);
         (whole.ends[1], whole.terminals[1], whole.ends[3]) = (true, true, true);
         assert_eq!(whole.rows_of_episodes(), [0..2, 2..4, 4..6, 6..7]);
-        let (mut seen, hold_out) = (Vec::new(), |seed| HoldOut { share: 0.25, seed });
+        let (mut seen, hold_out) = (Vec::new(), |seed| HoldOut::Share { share: 0.25, seed });
         for seed in 0..20 {
             let (training, held_out, out) = whole.hold_out(hold_out(seed));
             assert_eq!(out.len(), 1);
             let rows = whole.rows_of_episodes()[out[0]].clone();
             // The rewards of these rows are their numbers; one more row may follow, which is no step.
             assert_eq!(&held_out.rewards[..rows.len()], Vec::from_iter(rows.clone().map(|row| row as f32)));
+            let again = whole.hold_out(HoldOut::Episodes(&out));
+            assert_eq!((again.0.rewards, again.1.rewards), (training.rewards.clone(), held_out.rewards.clone()));
             let others = (0..7).filter(|row| !rows.contains(row)).map(|row| row as f32);
             assert_eq!(&training.rewards[..7 - rows.len()], Vec::from_iter(others));
             for part in [training, held_out] {
@@ -147,7 +162,7 @@ mod tests {
 
     #[test]
     fn one_episode_is_left_to_learn_from() {
-        let count = |share, episodes| chosen(HoldOut { share, seed: 0 }, episodes).len();
+        let count = |share, episodes| chosen(HoldOut::Share { share, seed: 0 }, episodes).len();
         assert_eq!([count(0.0, 10), count(0.1, 10), count(0.01, 10), count(0.9, 2), count(0.5, 1)], [0, 1, 1, 1, 0]);
     }
 }

@@ -99,7 +99,11 @@ impl Transitions {
     }
 
     /// As [`Self::read`], but keeps some episodes out.
-    pub fn read_split(path: impl AsRef<Path>, options: &ReadOptions, hold_out: HoldOut) -> Result<Split, DatasetError> {
+    pub fn read_split(
+        path: impl AsRef<Path>,
+        options: &ReadOptions,
+        hold_out: HoldOut<'_>,
+    ) -> Result<Split, DatasetError> {
         let (path, ReadOptions { environment, .. }) = (path.as_ref(), *options);
         let error = |problem| DatasetError::new(path, problem);
         let mut source = Source::open(path)?;
@@ -122,16 +126,16 @@ impl Transitions {
         Ok(split.training)
     }
 
-    fn split(recording: Recording, options: &ReadOptions, hold_out: HoldOut) -> Result<Split, Problem> {
+    fn split(recording: Recording, options: &ReadOptions, hold_out: HoldOut<'_>) -> Result<Split, Problem> {
         let ReadOptions { environment, reward, scale } = *options;
         let problems = checks::problems(&recording, environment);
         let outside = if scale.actions { None } else { checks::actions_outside(&recording) };
         if let Some(problem) = problems.into_iter().chain(outside).next() {
             return Err(problem);
         }
-        let (recording, held_out, episodes) = match hold_out.share {
-            0.0 => (recording, None, Vec::new()),
-            _ => {
+        let (recording, held_out, episodes) = match hold_out.is_none() {
+            true => (recording, None, Vec::new()),
+            false => {
                 let (training, held_out, episodes) = recording.hold_out(hold_out);
                 (training, (!episodes.is_empty()).then_some(held_out), episodes)
             }

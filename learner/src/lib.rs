@@ -9,6 +9,7 @@
 //! - `local_evaluators` are evaluators that a learner or a sweep starts itself.
 //! - `page` shows runs in a browser.
 //! - `report` summarises scores as tables and figures.
+//! - `judge` ranks policies without a simulator.
 //! - `train` makes gradient steps.
 //! - `evaluation` tracks which episodes wait for a score, and which evaluator has which. It does no input or output.
 //! - `data` finds or fetches the data that a run learns from.
@@ -24,6 +25,7 @@ mod evaluation;
 #[cfg(test)]
 #[path = "../../run/src/fixtures.rs"]
 mod fixtures;
+mod judge;
 mod live;
 mod local_evaluators;
 mod page;

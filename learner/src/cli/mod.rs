@@ -1,5 +1,6 @@
 //! The command line: what the user typed, with every word that scripts rely on.
 
+mod judge;
 mod sweep;
 mod train;
 
@@ -15,6 +16,7 @@ use quad_run::config::{presets, tasks};
 use quad_run::results::Select;
 use quad_runtime::parse_endpoint;
 
+pub use judge::JudgeArgs;
 pub use sweep::{Shard, SweepArgs};
 pub use train::TrainArgs;
 
@@ -56,6 +58,9 @@ pub enum Command {
     Page(PageArgs),
     /// Print scores of runs, statistics over seeds and tasks, and the paper's tables with your runs in them
     Report(ReportArgs),
+    /// Rank policies without a simulator, by what the data alone says of them
+    #[command(after_help = judge::EXAMPLES)]
+    Judge(JudgeArgs),
     /// Check in a run's folder that each episode is scored once, with the weights in that folder
     Verify(VerifyArgs),
     /// Check this machine before a run, and say how to fix what is wrong

@@ -2,6 +2,7 @@
 
 mod doctor;
 mod dry_run;
+mod judge;
 mod outside;
 mod page;
 mod sweep;
@@ -39,6 +40,7 @@ pub fn run(cli: &Cli) -> anyhow::Result<()> {
         Command::Presets(args) => list_presets(args),
         Command::Datasets(command) => datasets(command),
         Command::Report(args) => report(args),
+        Command::Judge(args) => judge::run(args),
         Command::Verify(args) => check_runs(args),
         Command::List(args) => list_runs(args),
         Command::Page(args) => page::show(args),

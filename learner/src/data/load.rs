@@ -18,7 +18,7 @@ pub fn load(path: &Path, experiment: &Experiment) -> anyhow::Result<Split> {
         reward: experiment.reward,
         scale: experiment.scale,
     };
-    let hold_out = HoldOut { share: experiment.hold_out, seed: experiment.seed };
+    let hold_out = HoldOut::Share { share: experiment.hold_out, seed: experiment.seed };
     let result = Transitions::read_split(path, &options, hold_out);
     let hint = result.as_ref().err().map(DatasetError::hint).unwrap_or_default();
     let split = result.with_context(|| format!("cannot learn from {}", path.display())).hint(hint)?;

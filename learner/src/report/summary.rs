@@ -5,7 +5,7 @@ use std::fmt::Alignment::{Left, Right};
 use std::io;
 use std::path::{Path, PathBuf};
 
-use quad_run::results::{RunReport, Select, Spread};
+use quad_run::results::{Ranking, RunReport, Select, Spread};
 use quad_run::run::walk;
 use quad_run::table::{Part, Style, Table};
 use serde::Serialize;
@@ -91,6 +91,8 @@ impl Report {
         }
         let unreadable = self.unreadable.iter().map(|error| format!("Not in this report: {error}.\n"));
         parts.extend((!self.unreadable.is_empty()).then(|| Part::Words(unreadable.collect())));
+        let judgements = self.runs.iter().flat_map(|run| run.judgements.iter().cloned());
+        parts.extend(Ranking::of(judgements).iter().flat_map(Ranking::parts));
         parts.extend([1, 2].into_iter().flat_map(|number| paper::table(number, &self.groups, self.select)));
         parts
     }

@@ -1,16 +1,18 @@
 //! The results of a run: its scores, summarised; the statistics of many runs; and the paper's own figures.
 //!
 //! In reading order: `run` reads a run, `evaluation` summarises one of its evaluations; `statistics` has the definitions; `published` has the paper's figures, `departures` the
-//! differences between a run and the paper's. `selection` and `spread` are small parts of these.
+//! differences between a run and the paper's; `judgement` what is known of policies without a simulator. `selection` and `spread` are small parts of these.
 
 pub mod departures;
 pub mod evaluation;
+pub mod judgement;
 pub mod published;
 pub mod run;
 pub mod selection;
 pub mod spread;
 pub mod statistics;
 
+pub use judgement::{Conditions, Estimate, Judgement, Ranking};
 pub use run::RunReport;
 pub use selection::Select;
 pub use spread::Spread;

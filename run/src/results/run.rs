@@ -12,6 +12,7 @@ use quad_dataset::environment;
 use serde::Serialize;
 
 use super::evaluation::EvaluationReport;
+use super::judgement::Judgement;
 use super::spread::Spread;
 use crate::config::RunConfig;
 use crate::run::{RunDir, ScoreLine, open_file};
@@ -67,6 +68,9 @@ pub struct RunReport {
     /// Each precision that its policies were scored in.
     #[serde(skip)]
     pub precisions: BTreeSet<String>,
+    /// What `learner judge` found out about its snapshots.
+    #[serde(skip_serializing_if = "Vec::is_empty")]
+    pub judgements: Vec<Judgement>,
     /// Its configuration.
     #[serde(skip)]
     pub config: RunConfig,
@@ -103,8 +107,8 @@ impl RunReport {
         let agent = config.experiment.method();
         let agent = agent.with_context(|| format!("config.toml in {} cannot be used", path.display()))?;
         let names = [agent, config.experiment.variant()?.to_owned(), config.experiment.called()?];
-        let scores = dir.read_scores()?;
-        Ok((Self::new(path, config, names, &scores), scores))
+        let (scores, judgements) = (dir.read_scores()?, Judgement::read_all(&dir)?);
+        Ok((Self { judgements, ..Self::new(path, config, names, &scores) }, scores))
     }
 
     fn new(path: &Path, config: RunConfig, names: [String; 3], lines: &[ScoreLine]) -> Self {
@@ -153,6 +157,7 @@ impl RunReport {
             evaluations,
             episodes_missing,
             summary: None,
+            judgements: Vec::new(),
             called,
             precisions,
             config,

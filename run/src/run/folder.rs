@@ -8,12 +8,14 @@
 //! snapshots/step_000003000.safetensors   target actor and target critics; written before the evaluation of it begins
 //! checkpoints/step_000003000_….safetensors   the newest three states of the training, to continue from
 //! report.json, learning_curve.svg    written at the end
+//! judgements.json                    what `learner judge` found out about its snapshots
 //! ```
 
 use std::fs;
 use std::io;
 use std::path::{Path, PathBuf};
 
+use serde::de::DeserializeOwned;
 use serde::{Deserialize, Serialize};
 
 use super::checkpoints::{Checkpoint, Checkpoints};
@@ -138,15 +140,23 @@ impl RunDir {
 
     /// Where the learner can be reached that wrote so last, at work or not.
     pub fn read_endpoints(&self) -> Result<RunEndpoints, RunDirError> {
-        let path = self.path.join("endpoints.json");
-        let text = open_file(&path).and_then(io::read_to_string).map_err(io_error("read", &path))?;
-        serde_json::from_str(&text).map_err(|error| content(&path, None, &error))
+        self.read_json("endpoints.json")
     }
 
     /// Forgets where an earlier learner could be reached.
     pub fn remove_endpoints(&self) -> Result<(), RunDirError> {
         let path = self.path.join("endpoints.json");
         remove_if_there(&path).map_err(io_error("remove", &path))
+    }
+
+    /// Reads a JSON file of the folder.
+    ///
+    /// # Errors
+    /// It cannot be read, or is something else.
+    pub fn read_json<T: DeserializeOwned>(&self, name: &str) -> Result<T, RunDirError> {
+        let path = self.path.join(name);
+        let text = open_file(&path).and_then(io::read_to_string).map_err(io_error("read", &path))?;
+        serde_json::from_str(&text).map_err(|error| content(&path, None, &error))
     }
 
     /// Writes a value as indented JSON; a reader sees the old file or the new one, never half of it.

@@ -1,0 +1,236 @@
+//! What `learner judge` found out about policies, without a simulator: estimates of their values, and whether these can rank them.
+
+use std::fmt::Alignment::{Left, Right};
+
+use serde::{Deserialize, Serialize};
+
+use super::spread::Spread;
+use crate::run::{RunDir, RunDirError};
+use crate::table::{Part, Table};
+
+const FILE: &str = "judgements.json";
+
+/// How judgements were made: those that were made alike can be compared.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct Conditions {
+    /// SHA-256 of the data.
+    pub dataset: String,
+    /// Numbers of the episodes in whose first states policies are judged, from 0 in the order of the file.
+    pub episodes: Vec<usize>,
+    /// Discount γ of the values.
+    pub gamma: f32,
+    /// Gradient steps of an evaluation.
+    pub steps: u64,
+    /// Evaluations of each policy, from seeds 0, 1, ….
+    pub seeds: u64,
+}
+
+/// An estimated value: the mean over the judged episodes' first states of the discounted return from there on.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct Estimate {
+    /// One for each seed.
+    pub values: Vec<f64>,
+    /// What makes it no estimate, a sentence each, such as that it still moves.
+    pub doubts: Vec<String>,
+}
+
+impl Estimate {
+    /// Over the seeds; none where it is doubtful, because a number beyond all bounds has no part in a mean.
+    fn spread(&self) -> Option<Spread> {
+        Spread::of(&self.values).filter(|_| self.doubts.is_empty())
+    }
+}
+
+/// What is known of one policy.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct Judgement {
+    /// Its run.
+    pub run: String,
+    /// Gradient step of the snapshot.
+    pub step: u64,
+    /// BLAKE3 of the snapshot's file.
+    pub weights: String,
+    /// How it was judged.
+    pub conditions: Conditions,
+    /// Its value.
+    pub estimate: Estimate,
+    /// How far its actions lie from the data's in the judged episodes: root mean square, in standard deviations of the data's.
+    pub distance: f64,
+    /// Whether it has learnt from none of the judged episodes.
+    pub unseen: bool,
+    /// The value of the behaviour that recorded the data, estimated likewise.
+    pub behavior: Estimate,
+    /// That value as the judged episodes have it: the mean of their discounted returns. What comes after an episode that was cut off
+    /// is taken from the estimate.
+    pub recorded: f64,
+}
+
+impl Judgement {
+    /// The judgements of a run's snapshots that its folder has.
+    ///
+    /// # Errors
+    /// The file cannot be read, or is not what `learner judge` writes.
+    pub fn read_all(folder: &RunDir) -> Result<Vec<Self>, RunDirError> {
+        if folder.path().join(FILE).exists() { folder.read_json(FILE) } else { Ok(Vec::new()) }
+    }
+
+    /// Keeps it in the folder, in the place of an earlier one of the same step.
+    ///
+    /// # Errors
+    /// Those of [`Self::read_all`], or the file cannot be written.
+    pub fn keep(&self, folder: &RunDir) -> Result<(), RunDirError> {
+        let mut judgements = Self::read_all(folder)?;
+        judgements.retain(|earlier| earlier.step != self.step);
+        judgements.push(self.clone());
+        judgements.sort_by_key(|judgement| judgement.step);
+        folder.write_json(FILE, &judgements)
+    }
+}
+
+/// Policies that were judged alike, the best first; those of doubtful estimates come last.
+#[derive(Clone, Debug, PartialEq, Serialize)]
+pub struct Ranking {
+    /// How they were judged.
+    pub conditions: Conditions,
+    /// The behaviour's value, estimated.
+    pub behavior: Estimate,
+    /// The behaviour's value, recorded.
+    pub recorded: f64,
+    /// Whether the estimate of the behaviour is closer to what is recorded than the policies' values are to each other.
+    pub can_rank: bool,
+    /// The same in words.
+    pub verdict: String,
+    /// The policies.
+    pub policies: Vec<Judgement>,
+}
+
+impl Ranking {
+    /// A ranking of each kind of conditions, in the order in which they come.
+    pub fn of(judgements: impl IntoIterator<Item = Judgement>) -> Vec<Self> {
+        let mut groups: Vec<Vec<Judgement>> = Vec::new();
+        for judgement in judgements {
+            match groups.iter_mut().find(|group| group[0].conditions == judgement.conditions) {
+                Some(group) => group.push(judgement),
+                None => groups.push(vec![judgement]),
+            }
+        }
+        groups.into_iter().map(Self::of_group).collect()
+    }
+
+    fn of_group(mut policies: Vec<Judgement>) -> Self {
+        let value = |judgement: &Judgement| judgement.estimate.spread().map_or(f64::NEG_INFINITY, |spread| spread.mean);
+        policies.sort_by(|one, other| value(other).total_cmp(&value(one)));
+        let Judgement { conditions, behavior, recorded, .. } = policies[0].clone();
+        let values = Vec::from_iter(policies.iter().map(value).filter(|value| value.is_finite()));
+        let (can_rank, verdict) = verdict(&values, &behavior, recorded);
+        Self { conditions, behavior, recorded, can_rank, verdict, policies }
+    }
+
+    /// As words and a table.
+    pub fn parts(&self) -> [Part; 2] {
+        let Self { conditions: Conditions { episodes, gamma, steps, seeds, .. }, policies, .. } = self;
+        let columns = [("rank", Right), ("policy", Left), ("value", Right), ("distance", Right), ("doubts", Left)];
+        let mut table = Table::new(&columns);
+        let value = |of: &Estimate| of.spread().map_or_else(|| "-".to_owned(), Spread::text);
+        for (judgement, rank) in policies.iter().zip(1..) {
+            let Judgement { run, step, estimate, distance, unseen, .. } = judgement;
+            let mut doubts = estimate.doubts.clone();
+            doubts.extend((!unseen).then(|| "has learnt from some of these episodes".to_owned()));
+            let rank = if estimate.doubts.is_empty() && self.can_rank { format!("{rank}") } else { "-".to_owned() };
+            table.push([rank, format!("{run} @ {step}"), value(estimate), format!("{distance:.2}"), doubts.join("; ")]);
+        }
+        let behavior = ["-".to_owned(), "behaviour, estimated".to_owned(), value(&self.behavior)];
+        table.push([&behavior[..], &["".to_owned(), self.behavior.doubts.join("; ")]].concat());
+        let recorded = ["-", "behaviour, as recorded", &format!("{:.2}", self.recorded), "", ""];
+        table.push(recorded.map(str::to_owned));
+        let words = format!(
+            "Judged without a simulator: a ranking, not a score.\n{}\nValues are discounted returns (γ = {gamma}) from the first \
+             states of {} episodes on, estimated by fitted Q evaluation ({steps} steps), ± standard deviation over {seeds} seeds. \
+             Distance: of the policy's actions from the data's, in standard deviations of the data's.\n",
+            self.verdict,
+            episodes.len(),
+        );
+        [Part::Words(words), Part::Table(table)]
+    }
+}
+
+/// Whether these values, the largest first, can be told apart, and why.
+fn verdict(values: &[f64], behavior: &Estimate, recorded: f64) -> (bool, String) {
+    let (Some(most), Some(least)) = (values.first(), values.last()) else {
+        return (false, "It cannot rank them: no estimate can be relied on.".to_owned());
+    };
+    let Some(estimated) = behavior.spread() else {
+        return (false, "It cannot rank them: the estimate of the behaviour's own value is doubtful.".to_owned());
+    };
+    let (off, range) = ((estimated.mean - recorded).abs(), most - least);
+    let behind = format!("the behaviour's own value is estimated {off:.2} off");
+    match values.len() {
+        1 => (false, format!("One value is no ranking; {behind}.")),
+        _ if off >= range => {
+            (false, format!("It cannot rank them: {behind}, and the policies differ by no more than {range:.2}."))
+        }
+        _ => (true, format!("Policies whose values differ by less than {off:.2} are not told apart: {behind}.")),
+    }
+}
+
+#[cfg(test)]
+#[allow(clippy::unwrap_used)]
+mod tests {
+    use super::*;
+    use crate::table::Style;
+
+    fn estimate(values: &[f64]) -> Estimate {
+        Estimate { values: values.to_vec(), doubts: Vec::new() }
+    }
+
+    fn judgement(run: &str, values: &[f64], behavior: f64) -> Judgement {
+        let conditions =
+            Conditions { dataset: "abc".to_owned(), episodes: vec![3, 5], gamma: 0.99, steps: 100, seeds: 2 };
+        Judgement {
+            run: run.to_owned(),
+            step: 20,
+            weights: String::new(),
+            conditions,
+            estimate: estimate(values),
+            distance: 1.0,
+            unseen: true,
+            behavior: estimate(&[behavior, behavior]),
+            recorded: 10.0,
+        }
+    }
+
+    fn ranked(judgements: &[Judgement]) -> (Vec<String>, bool, String) {
+        let [ranking] = <[Ranking; 1]>::try_from(Ranking::of(judgements.to_vec())).ok().unwrap();
+        (ranking.policies.iter().map(|one| one.run.clone()).collect(), ranking.can_rank, ranking.verdict)
+    }
+
+    #[test]
+    fn the_best_comes_first_and_what_diverged_is_told_but_not_averaged() {
+        let mut diverged = judgement("diverged", &[1e9, 12.0], 10.5);
+        diverged.estimate.doubts.push("beyond what rewards allow".to_owned());
+        let judgements = [judgement("low", &[9.0, 9.2], 10.5), diverged, judgement("high", &[13.0, 14.0], 10.5)];
+        let (order, can_rank, verdict) = ranked(&judgements);
+        assert_eq!((order, can_rank), (["high", "low", "diverged"].map(str::to_owned).to_vec(), true));
+        assert!(verdict.contains("less than 0.50"), "{verdict}");
+        let text = Ranking::of(judgements.to_vec())[0].parts().map(|part| part.render(Style::Text)).concat();
+        assert!(text.contains("a ranking, not a score") && text.contains("13.50 ± 0.71"), "{text}");
+        assert!(!text.contains("500000006") && text.contains("beyond what rewards allow"), "{text}");
+    }
+
+    #[test]
+    fn what_the_behaviour_s_estimate_misses_by_more_is_not_ranked() {
+        let (_, can_rank, verdict) = ranked(&[judgement("a", &[9.0], 14.0), judgement("b", &[12.0], 14.0)]);
+        assert!(!can_rank && verdict.contains("4.00 off") && verdict.contains("3.00"), "{verdict}");
+        let mut doubtful = judgement("a", &[9.0], 10.0);
+        doubtful.behavior.doubts.push("it moves".to_owned());
+        assert!(!ranked(&[doubtful.clone(), doubtful]).1);
+        assert!(!ranked(&[judgement("alone", &[9.0], 10.0)]).1);
+    }
+
+    #[test]
+    fn judgements_of_other_conditions_are_apart() {
+        let mut other = judgement("other", &[1.0], 10.0);
+        other.conditions.gamma = 0.9;
+        assert_eq!(Ranking::of([judgement("a", &[1.0], 10.0), other, judgement("b", &[2.0], 10.0)]).len(), 2);
+    }
+}
