@@ -121,8 +121,9 @@ impl Agent {
     pub fn policy(&self, origin: impl Serialize) -> Result<Vec<u8>, AlgorithmError> {
         let (policy, tensors) = self.algorithm.policy()?;
         let Names { observations: observation_names, actions: action_names } = self.names.clone();
-        Ok(Header { policy, scaling: self.scaling.clone(), observation_names, action_names, origin }
-            .to_safetensors(&tensors)?)
+        let scaling = self.scaling.clone();
+        let header = Header { scaling, observation_names, action_names, ..Header::new(policy, origin) };
+        Ok(header.to_safetensors(&tensors)?)
     }
 
     /// Everything that decides the future of the run, as one safetensors file: the same bytes for the same state.

@@ -1,5 +1,7 @@
 //! What can be wrong with a policy.
 
+use crate::kind::VERSION;
+
 /// Weights that are not what they should be, or that lead to no action.
 #[derive(Debug, thiserror::Error)]
 pub enum PolicyError {
@@ -12,6 +14,16 @@ pub enum PolicyError {
     /// What it says is not understood.
     #[error("what the weights say about themselves is not understood: {0}")]
     Header(#[from] serde_json::Error),
+    /// What it says is not understood, and another version wrote it.
+    #[error(
+        "the weights were written by version {version}, and this version, {VERSION}, does not understand them: {source}"
+    )]
+    Version {
+        /// The version that wrote them, and reads them.
+        version: String,
+        /// What is not understood.
+        source: serde_json::Error,
+    },
     /// A shape with a number out of range.
     #[error("the weights' {field} is {value}, which is out of range")]
     Range {

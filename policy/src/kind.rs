@@ -19,10 +19,13 @@ use quad_kernels::scaling::Scaling;
 use safetensors::{SafeTensorError, SafeTensors};
 use serde::de::{DeserializeOwned, IgnoredAny};
 use serde::{Deserialize, Serialize};
+use serde_json::Value;
 use std::collections::{BTreeMap, HashMap};
 
 /// Key of the header in a safetensors file's metadata.
 const HEADER: &str = "quad";
+/// The version that writes.
+pub(crate) const VERSION: &str = env!("CARGO_PKG_VERSION");
 /// Longest header of a safetensors file that is read, bytes. The paper's networks have 3 KB; a million empty tensors would
 /// take a gigabyte of memory before anything else is known of them.
 const MAX_HEADER: u64 = 1 << 20;
@@ -123,12 +126,25 @@ pub struct Header<O> {
     pub action_names: Vec<String>,
     /// Where it comes from.
     pub origin: O,
+    /// What `learner export` says of the data and of how good it is; nothing in a snapshot.
+    #[serde(default, skip_serializing_if = "Value::is_null")]
+    pub about: Value,
+    /// The version that wrote it; empty before 0.1.0 was released.
+    #[serde(default, skip_serializing_if = "String::is_empty")]
+    pub version: String,
+}
+
+/// What is read of a header that is not understood.
+#[derive(Deserialize)]
+struct Written {
+    version: String,
 }
 
 impl<O> Header<O> {
     /// The header of networks that have learnt in the user's own units, from numbers without names.
     pub fn new(policy: PolicyConfig, origin: O) -> Self {
-        Self { policy, scaling: None, observation_names: Vec::new(), action_names: Vec::new(), origin }
+        let (observation_names, action_names, version) = (Vec::new(), Vec::new(), VERSION.to_owned());
+        Self { policy, scaling: None, observation_names, action_names, origin, about: Value::Null, version }
     }
 }
 
@@ -146,9 +162,14 @@ impl<O: DeserializeOwned> Header<O> {
     /// What a policy's file says of itself.
     ///
     /// # Errors
-    /// As [`read_header`].
+    /// As [`read_header`]; where another version wrote what is not understood, that is said.
     pub fn read(file: &[u8]) -> Result<Self, PolicyError> {
-        read_header(file, HEADER)
+        read_header(file, HEADER).map_err(|error| match (error, read_header(file, HEADER)) {
+            (PolicyError::Header(source), Ok(Written { version })) if version != VERSION => {
+                PolicyError::Version { version, source }
+            }
+            (error, _) => error,
+        })
     }
 }
 
@@ -284,6 +305,21 @@ mod tests {
         let nameless = safetensors::serialize([("weights", tensor)], None).unwrap();
         assert!(matches!(load_policy(&nameless, Precision::F32), Err(PolicyError::NoHeader(_))));
         assert!(matches!(Header::<u64>::read(&file), Err(PolicyError::Header(_))), "another origin than was wanted");
+    }
+
+    #[test]
+    fn what_another_version_wrote_is_read_or_it_says_which_version_reads_it() {
+        let text = |file: &[u8], from: &str, to: &str| {
+            assert_eq!(from.len(), to.len());
+            let at = file.windows(from.len()).position(|window| window == from.as_bytes()).unwrap();
+            [&file[..at], to.as_bytes(), &file[at + from.len()..]].concat()
+        };
+        let (file, ours) = (gaussian(""), format!(r#"\"version\":\"{VERSION}\""#));
+        let theirs = ours.replace(VERSION, &"9".repeat(VERSION.len()));
+        let newer = text(&file, &ours, &theirs);
+        assert!(load_policy(&newer, Precision::F32).is_ok(), "it says nothing that is not known here");
+        let error = load_policy(&text(&newer, "gaussian", "quantile"), Precision::F32).err().unwrap().to_string();
+        assert!(error.contains("version 99") && error.contains("quantile"), "{error}");
     }
 
     #[test]

@@ -10,6 +10,7 @@ use pyo3::types::{PyBytes, PyDict, PyTuple};
 use quad_dataset::Names;
 use quad_policy::{Header, Policy, PolicyConfig, PolicyError, Precision, load_policy};
 use quad_protocol::Origin;
+use serde_json::{Value, json};
 
 use crate::acting::{Array, act, begin, compute, noise, not_seeds, parts, seeds};
 use crate::arrays::{Like, Rows};
@@ -31,6 +32,8 @@ pub struct PyPolicy {
     config: PolicyConfig,
     origin: Origin,
     names: Arc<Names>,
+    /// What else its file says of it, as JSON.
+    about: String,
     /// The file and the precision that was asked for, to make a copy of.
     file: Vec<u8>,
     asked: Precision,
@@ -69,9 +72,19 @@ impl PyPolicy {
         let (policy, header) = read.map_err(|error: PolicyError| {
             with_hint(&std::io::Error::other(format!("{name} is not a saved policy: {error}")), HINT)
         })?;
-        let Header { policy: config, observation_names, action_names, origin, .. } = header;
+        let Header { policy: config, scaling, observation_names, action_names, origin, about, version } = header;
+        let own = json!({
+            "version": version,
+            "environment": origin.environment,
+            "step": origin.step,
+            "observation_names": observation_names,
+            "action_names": action_names,
+            "scaling": scaling,
+        });
+        let mut known = about.as_object().cloned().unwrap_or_default();
+        known.extend(own.as_object().cloned().unwrap_or_default());
         let names = Arc::new(Names { observations: observation_names, actions: action_names });
-        Ok(Self { policy: policy.into(), config, origin, names, file, asked })
+        Ok(Self { policy: policy.into(), config, origin, names, about: Value::from(known).to_string(), file, asked })
     }
 
     /// Acts in each of n states: observations [n, observation_size] -> actions [n, action_size], float32.
@@ -259,6 +272,14 @@ impl PyPolicy {
             PolicyConfig::Score { .. } => "score",
             PolicyConfig::Planner { .. } => "planner",
         }
+    }
+
+    /// All that its file says of it, a dictionary: version that wrote it, environment, step, names of the numbers of observations
+    /// and actions, scaling (user's = offset + scale · network's, or None); and, if `learner export` made the file, run, task,
+    /// algorithm, data with its license, score, and judgement.
+    #[getter]
+    fn about<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyAny>> {
+        py.import("json")?.call_method1("loads", (&self.about,))
     }
 
     /// Arithmetic in effect, "f32" or "bf16".

@@ -8,6 +8,7 @@ import sys
 import threading
 import time
 import warnings
+from importlib.metadata import version
 from pathlib import Path
 
 import mujoco
@@ -237,3 +238,17 @@ def test_a_fork_of_a_process_that_has_acted_is_told_so(snapshots):
     command = [sys.executable, "-W", "ignore", "-c", FORKS, str(snapshots["quad"])]
     ended = subprocess.run(command, capture_output=True, timeout=200)
     assert ended.returncode == 0, ended.stderr.decode()
+
+
+def test_an_exported_policy_says_all_that_is_known_of_it(hopper_runs, tmp_path):
+    run, out = hopper_runs / "seed0", tmp_path / "policy.safetensors"
+    command = ["learner", "export", str(run), "--step", "best", "--out", str(out), "--license", "CC0"]
+    subprocess.run(command, check=True, capture_output=True, timeout=60)
+    policy = Policy.load(out)
+    about = policy.about
+    assert about["step"] == policy.step and about["environment"] == "hopper" and about["version"] == version("quad-rl")
+    assert about["data"]["license"] == "CC0" and about["score"]["episodes"] == 3 and about["judgement"] is None
+    snapshot = Policy.load(run / "snapshots" / f"step_{policy.step:09}.safetensors")
+    observation = np.zeros(policy.observation_size, np.float32)
+    assert np.array_equal(policy.act(observation, seed=1), snapshot.act(observation, seed=1))
+    assert "data" not in snapshot.about and snapshot.about["scaling"] is None

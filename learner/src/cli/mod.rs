@@ -1,5 +1,6 @@
 //! The command line: what the user typed, with every word that scripts rely on.
 
+mod export;
 mod judge;
 mod sweep;
 mod train;
@@ -16,6 +17,7 @@ use quad_run::config::{presets, tasks};
 use quad_run::results::Select;
 use quad_runtime::parse_endpoint;
 
+pub use export::{At, ExportArgs};
 pub use judge::JudgeArgs;
 pub use sweep::{Shard, SweepArgs};
 pub use train::TrainArgs;
@@ -61,6 +63,9 @@ pub enum Command {
     /// Rank policies without a simulator, by what the data alone says of them
     #[command(after_help = judge::EXAMPLES)]
     Judge(JudgeArgs),
+    /// Write a policy's file that stands alone: it says what it has learnt from and how good it is
+    #[command(after_help = export::EXAMPLES)]
+    Export(ExportArgs),
     /// Check in a run's folder that each episode is scored once, with the weights in that folder
     Verify(VerifyArgs),
     /// Check this machine before a run, and say how to fix what is wrong

@@ -2,6 +2,7 @@
 
 mod doctor;
 mod dry_run;
+mod export;
 mod judge;
 mod outside;
 mod page;
@@ -40,6 +41,7 @@ pub fn run(cli: &Cli) -> anyhow::Result<()> {
         Command::Presets(args) => list_presets(args),
         Command::Datasets(command) => datasets(command),
         Command::Report(args) => report(args),
+        Command::Export(args) => export::export(args),
         Command::Judge(args) => judge::run(args),
         Command::Verify(args) => check_runs(args),
         Command::List(args) => list_runs(args),

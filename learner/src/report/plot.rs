@@ -236,7 +236,7 @@ static FONT: LazyLock<()> = LazyLock::new(|| {
 });
 
 /// A reader of the file finds all of it, or what was there.
-pub(super) fn replace(path: &Path, content: &[u8]) -> anyhow::Result<()> {
+pub(crate) fn replace(path: &Path, content: &[u8]) -> anyhow::Result<()> {
     let file = path.file_name().ok_or_else(|| anyhow!("{} is no file name", path.display()))?;
     let partial = path.with_file_name(format!("{}.partial", file.display()));
     let written = std::fs::write(&partial, content).and_then(|()| std::fs::rename(&partial, path));

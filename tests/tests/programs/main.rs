@@ -9,6 +9,7 @@ mod datasets;
 mod doctor;
 mod film;
 mod formats;
+mod judging;
 mod own_data;
 mod score;
 mod systemd;

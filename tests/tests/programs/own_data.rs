@@ -10,7 +10,7 @@ use quad_protocol::Origin;
 use quad_tests::process::binary;
 
 /// Five numbers to observe and two to act by, each up to `strength`, in episodes of 50 steps, in the layout of docs/data.md.
-fn write_log(path: &Path, strength: f64) {
+pub(super) fn write_log(path: &Path, strength: f64) {
     let rows = 1000;
     let file = hdf5::File::create(path).unwrap();
     let layout: hdf5::types::VarLenUnicode = "transitions".parse().unwrap();
@@ -28,7 +28,7 @@ fn write_log(path: &Path, strength: f64) {
     file.new_dataset_builder().with_data(&timeouts).create("timeouts").unwrap();
 }
 
-fn train(dataset: &Path, run_dir: &Path, flags: &[&str]) -> Output {
+pub(super) fn train(dataset: &Path, run_dir: &Path, flags: &[&str]) -> Output {
     let mut command = Command::new(binary("learner"));
     command.args(["train", "--task", "own-data", "--env", "my-robot", "--steps", "20"]);
     command.args(["--agent", "actor.hidden=[32]", "--agent", "critic.hidden=[32]", "--set", "batch_size=64"]);
@@ -36,7 +36,7 @@ fn train(dataset: &Path, run_dir: &Path, flags: &[&str]) -> Output {
 }
 
 /// What a command writes for people, which must end so.
-fn said(output: &Output, code: i32) -> String {
+pub(super) fn said(output: &Output, code: i32) -> String {
     let text = String::from_utf8_lossy(&output.stderr).into_owned();
     assert_eq!(output.status.code(), Some(code), "{text}");
     text

@@ -1,0 +1,73 @@
+//! `learner export`: a policy's file that says all that its run's folder knows of it.
+
+use anyhow::{Context, anyhow};
+use quad_policy::{Header, PolicyError, read_tensors};
+use quad_protocol::Origin;
+use quad_run::results::RunReport;
+use quad_run::run::RunDir;
+use quad_runtime::{Hint, print};
+use serde_json::{Value, json};
+use tracing::warn;
+
+use crate::cli::{At, ExportArgs};
+use crate::data::Source;
+use crate::report::replace;
+
+/// Writes the file.
+///
+/// # Errors
+/// The run or its snapshot cannot be read, or the file cannot be written.
+pub fn export(args: &ExportArgs) -> anyhow::Result<()> {
+    let report = RunReport::scored(&args.run)?;
+    let folder = RunDir::at(&args.run);
+    let steps = folder.snapshots()?;
+    let (step, what) = match args.step {
+        At::Step(step) => (Some(step), "after that step"),
+        At::Last => (steps.last().copied(), "yet"),
+        At::Best => (report.best().map(|best| best.step), "with a complete evaluation"),
+    };
+    let Some(step) = step.filter(|step| steps.contains(step)) else {
+        let there = Vec::from_iter(steps.iter().map(u64::to_string)).join(", ");
+        return Err(anyhow!("{} has no snapshot {what}", args.run.display()))
+            .hint(format!("its snapshots are of the steps {there}; name one: --step N"));
+    };
+    let file = folder.read_snapshot(step)?;
+    let read = || Ok((Header::<Origin>::read(&file)?, read_tensors(&file)?));
+    let (header, tensors) = read()
+        .map_err(|error: PolicyError| anyhow!("{} is not a policy: {error}", folder.snapshot_path(step).display()))?;
+    let about = about(&report, step, args.license.as_deref());
+    let exported = Header { about, ..header }.to_safetensors(&tensors)?;
+    let name = args.out.display();
+    replace(&args.out, &exported).with_context(|| format!("cannot export to {name}"))?;
+    print(&format!("{name}: {} @ {step}, {} bytes", report.run, exported.len()))
+}
+
+/// What the run's folder knows.
+fn about(report: &RunReport, step: u64, license: Option<&str>) -> Value {
+    let (data, experiment) = (&report.config.dataset, &report.config.experiment);
+    let name = experiment.dataset.clone().unwrap_or_default();
+    let entry = Source::parse(&name).ok().and_then(|source| Some(source.entry()?.licence.clone()));
+    let license = license.map(str::to_owned).or(entry);
+    if license.is_none() {
+        warn!("the file does not say which licence the data has; --license says it");
+    }
+    let score = report.evaluations.iter().find(|evaluation| evaluation.step == step);
+    json!({
+        "run": report.run,
+        "task": report.task,
+        "algorithm": report.algorithm,
+        "steps": report.steps,
+        "seed": report.seed,
+        "data": {
+            "name": name,
+            "sha256": data.sha256,
+            "license": license,
+            "transitions": data.transitions,
+            "episodes": data.episodes,
+            "held_out": data.held_out,
+            "mean_return": data.mean_return,
+        },
+        "score": score,
+        "judgement": report.judgements.iter().find(|judgement| judgement.step == step),
+    })
+}
