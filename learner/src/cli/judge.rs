@@ -16,7 +16,7 @@ Examples:
   learner judge runs/quad/snapshots/*.safetensors
 
 This is a ranking, not a score: values are estimated from the data alone, by fitted Q evaluation. The learner says when it cannot
-rank the policies (docs/judging.md). It keeps what it finds in the runs' folders, for `learner report`, and the same command does
+rank the policies (docs/deploying.md). It keeps what it finds in the runs' folders, for `learner report`, and the same command does
 not compute it again.";
 
 /// Arguments of `learner judge`.

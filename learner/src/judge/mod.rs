@@ -80,7 +80,7 @@ fn judge_all(
         let actions = Actions::of(subject, data)?;
         let traces = evaluation.of_policy(&actions, &fqes)?;
         let judgement = Judgement {
-            run: subject.run.clone(),
+            run: subject.folder.path().to_owned(),
             step: subject.step,
             weights: subject.weights.clone(),
             conditions: conditions.clone(),
@@ -90,7 +90,8 @@ fn judge_all(
             behavior: behavior.clone(),
             recorded,
         };
-        info!("{number} of {}: {} @ {} is judged", subjects.len(), subject.run, subject.step);
+        let run = subject.folder.path().display();
+        info!("{number} of {}: {run} @ {} is judged", subjects.len(), subject.step);
         // A folder that cannot be written to, such as another user's, keeps no judgement from being told.
         judgement.keep(&subject.folder).unwrap_or_else(|error| warn!("{error}: the judgement is not kept"));
         judged.push(judgement);

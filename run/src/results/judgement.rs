@@ -1,6 +1,7 @@
 //! What `learner judge` found out about policies, without a simulator: estimates of their values, and whether these can rank them.
 
 use std::fmt::Alignment::{Left, Right};
+use std::path::PathBuf;
 
 use serde::{Deserialize, Serialize};
 
@@ -44,8 +45,9 @@ impl Estimate {
 /// What is known of one policy.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct Judgement {
-    /// Its run.
-    pub run: String,
+    /// The folder of its run, as the reader calls it.
+    #[serde(default)]
+    pub run: PathBuf,
     /// Gradient step of the snapshot.
     pub step: u64,
     /// BLAKE3 of the snapshot's file.
@@ -71,7 +73,12 @@ impl Judgement {
     /// # Errors
     /// The file cannot be read, or is not what `learner judge` writes.
     pub fn read_all(folder: &RunDir) -> Result<Vec<Self>, RunDirError> {
-        if folder.path().join(FILE).exists() { folder.read_json(FILE) } else { Ok(Vec::new()) }
+        if !folder.path().join(FILE).exists() {
+            return Ok(Vec::new());
+        }
+        let mut judgements: Vec<Self> = folder.read_json(FILE)?;
+        judgements.iter_mut().for_each(|judgement| judgement.run = folder.path().to_owned());
+        Ok(judgements)
     }
 
     /// Keeps it in the folder, in the place of an earlier one of the same step.
@@ -137,7 +144,13 @@ impl Ranking {
             let mut doubts = estimate.doubts.clone();
             doubts.extend((!unseen).then(|| "has learnt from some of these episodes".to_owned()));
             let rank = if estimate.doubts.is_empty() && self.can_rank { format!("{rank}") } else { "-".to_owned() };
-            table.push([rank, format!("{run} @ {step}"), value(estimate), format!("{distance:.2}"), doubts.join("; ")]);
+            table.push([
+                rank,
+                format!("{} @ {step}", run.display()),
+                value(estimate),
+                format!("{distance:.2}"),
+                doubts.join("; "),
+            ]);
         }
         let behavior = ["-".to_owned(), "behaviour, estimated".to_owned(), value(&self.behavior)];
         table.push([&behavior[..], &["".to_owned(), self.behavior.doubts.join("; ")]].concat());
@@ -187,7 +200,7 @@ mod tests {
         let conditions =
             Conditions { dataset: "abc".to_owned(), episodes: vec![3, 5], gamma: 0.99, steps: 100, seeds: 2 };
         Judgement {
-            run: run.to_owned(),
+            run: run.into(),
             step: 20,
             weights: String::new(),
             conditions,
@@ -201,7 +214,7 @@ mod tests {
 
     fn ranked(judgements: &[Judgement]) -> (Vec<String>, bool, String) {
         let [ranking] = <[Ranking; 1]>::try_from(Ranking::of(judgements.to_vec())).ok().unwrap();
-        (ranking.policies.iter().map(|one| one.run.clone()).collect(), ranking.can_rank, ranking.verdict)
+        (ranking.policies.iter().map(|one| one.run.display().to_string()).collect(), ranking.can_rank, ranking.verdict)
     }
 
     #[test]

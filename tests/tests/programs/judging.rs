@@ -59,8 +59,9 @@ fn policies_are_judged_by_the_data_alone() {
     assert!(!said(&again, 0).contains("judging"), "nothing is computed twice");
     assert_eq!(json(&again), found);
     let alone = |path: &Path| json(&judge(&[path]))["policies"][0]["estimate"].clone();
-    let of = |name: &str| policies.iter().find(|policy| policy["run"] == name).unwrap()["estimate"].clone();
-    assert_eq!((alone(&quad), alone(&iql)), (of("quad"), of("iql")));
+    let of =
+        |run: &Path| policies.iter().find(|policy| policy["run"] == run.to_str().unwrap()).unwrap()["estimate"].clone();
+    assert_eq!((alone(&quad), alone(&iql)), (of(&quad), of(&iql)));
 
     let html = scratch.path().join("report.html");
     let report = learner("report", &[&all], &["--html", html.to_str().unwrap()]);
