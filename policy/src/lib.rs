@@ -36,6 +36,7 @@ mod choice;
 mod composed;
 mod convolution;
 mod dense;
+mod dense_graph;
 mod device;
 mod differentiable;
 mod diffusion;

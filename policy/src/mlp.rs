@@ -30,7 +30,7 @@ pub(crate) struct Mlp {
     pub layers: Arc<Layers>,
     /// Before the names of their tensors.
     prefix: &'static str,
-    saved: Pool,
+    saved: Pool<SavedActivations>,
 }
 
 impl Mlp {
@@ -108,7 +108,7 @@ struct Operation {
     /// Where the weights' gradient is left, if there is to be one.
     kept: Option<Arc<KeptGradient>>,
     /// What the forward pass keeps for the backward pass, if there is to be one.
-    saved: Option<Lent>,
+    saved: Option<Lent<SavedActivations>>,
     /// What the products between hidden layers use, if nothing is kept.
     packed: Option<Arc<Kernels>>,
     /// How many of the inputs, the first ones, get no gradient.
@@ -116,7 +116,7 @@ struct Operation {
 }
 
 impl Operation {
-    fn forward_saving(&self, weights: &[f32], x: &[f32], lent: &Lent, out: &mut [f32]) {
+    fn forward_saving(&self, weights: &[f32], x: &[f32], lent: &Lent<SavedActivations>, out: &mut [f32]) {
         let layers = &self.mlp.layers;
         let rows = out.len() / (layers.members * layers.outputs());
         let mut saved = lent.lock();

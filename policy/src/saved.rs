@@ -119,31 +119,42 @@ impl SavedActivations {
 }
 
 /// Memory that is used again: fresh memory of such sizes would cost as much as the arithmetic.
-#[derive(Clone, Default)]
-pub(crate) struct Pool(Arc<Mutex<Vec<SavedActivations>>>);
+pub(crate) struct Pool<T>(Arc<Mutex<Vec<T>>>);
 
-impl Pool {
+impl<T> Default for Pool<T> {
+    fn default() -> Self {
+        Self(Arc::default())
+    }
+}
+
+impl<T> Clone for Pool<T> {
+    fn clone(&self) -> Self {
+        Self(self.0.clone())
+    }
+}
+
+impl<T: Default> Pool<T> {
     /// One that is lent until it is dropped.
-    pub fn lend(&self) -> Lent {
+    pub fn lend(&self) -> Lent<T> {
         let lent = self.0.lock().unwrap_or_else(PoisonError::into_inner).pop().unwrap_or_default();
         Lent { lent: Mutex::new(lent), home: self.clone() }
     }
 }
 
 /// What a pool has lent.
-pub(crate) struct Lent {
-    lent: Mutex<SavedActivations>,
-    home: Pool,
+pub(crate) struct Lent<T: Default> {
+    lent: Mutex<T>,
+    home: Pool<T>,
 }
 
-impl Lent {
+impl<T: Default> Lent<T> {
     /// Access to it, of one at a time.
-    pub fn lock(&self) -> MutexGuard<'_, SavedActivations> {
+    pub fn lock(&self) -> MutexGuard<'_, T> {
         self.lent.lock().unwrap_or_else(PoisonError::into_inner)
     }
 }
 
-impl Drop for Lent {
+impl<T: Default> Drop for Lent<T> {
     fn drop(&mut self) {
         let lent = std::mem::take(self.lent.get_mut().unwrap_or_else(PoisonError::into_inner));
         self.home.0.lock().unwrap_or_else(PoisonError::into_inner).push(lent);

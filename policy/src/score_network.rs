@@ -2,6 +2,7 @@
 //! the narrowing ones made. A score is −ε_θ/σ_t.
 
 use crate::dense::Dense;
+use crate::dense_graph::{DenseGraph, Step};
 use crate::dpm_solver::DpmSolver;
 use crate::mlp_config::MlpConfig;
 use crate::weighted::Weighted;
@@ -31,67 +32,100 @@ pub struct ScoreShape {
     pub layers: MlpConfig,
 }
 
-/// A block: f(x·W + b) plus what state and time add; then the same again, plus the block's input.
-struct Block {
-    first: Dense,
-    condition: Dense,
-    second: Dense,
-    /// The input in the output's width, if it has another.
-    skip: Option<Dense>,
+/// The layers while they are put together.
+struct Builder<'a> {
+    layers: &'a MlpConfig,
+    parts: Vec<Part>,
+    start: usize,
+    steps: Vec<Step>,
 }
 
-/// All layers.
-struct Layers {
-    state: Dense,
-    time: Dense,
-    mix: [Dense; 2],
-    down: Vec<Block>,
-    middle: Block,
-    up: Vec<Block>,
-    last: Dense,
-    layout: Layout,
-}
-
-impl Layers {
-    fn new(shape: &ScoreShape) -> Self {
-        let MlpConfig { hidden: widths, activation, initial, .. } = &shape.layers;
-        let (mut parts, mut start): (Vec<Part>, usize) = (Vec::new(), 0);
-        let mut layer = |name: &str, inputs, outputs, is_active: bool| {
-            let layer = Dense::new(start, inputs, outputs, is_active.then_some(*activation));
-            start = layer.range().end;
-            parts.extend(layer.parts(name, *initial));
-            layer
-        };
-        let narrowest = widths.last().copied().unwrap_or(1);
-        let state = layer("state", shape.observation_dim, EMBEDDING, true);
-        let time = layer("time", EMBEDDING, EMBEDDING, false);
-        let mix = [layer("mix.0", 2 * EMBEDDING, narrowest, true), layer("mix.1", narrowest, narrowest, true)];
-        let mut block = |name: &str, inputs, outputs| Block {
-            first: layer(&format!("{name}.first"), inputs, outputs, true),
-            condition: layer(&format!("{name}.condition"), narrowest, outputs, false),
-            second: layer(&format!("{name}.second"), outputs, outputs, true),
-            skip: (inputs != outputs).then(|| layer(&format!("{name}.skip"), inputs, outputs, false)),
-        };
-        let mut width = shape.action_dim;
-        let mut narrow = |(i, outputs): (usize, &usize)| {
-            let block = block(&format!("down.{i}"), width, *outputs);
-            width = *outputs;
-            block
-        };
-        let down = widths.iter().enumerate().map(&mut narrow).collect();
-        let middle = block("middle", narrowest, narrowest);
-        // Each sees the block before it and the narrowing block of that width, and is as wide as the one above that.
-        let widening = widths.windows(2).rev().enumerate();
-        let up = widening.map(|(i, pair)| block(&format!("up.{i}"), 2 * pair[1], pair[0])).collect();
-        let last = layer("last", 2 * widths.first().copied().unwrap_or(1), shape.action_dim, false);
-        Self { state, time, mix, down, middle, up, last, layout: Layout::new(parts) }
+impl Builder<'_> {
+    /// The number of the next value; numbers 0 to 2 are the inputs.
+    fn next(&self) -> usize {
+        3 + self.steps.len()
     }
+
+    /// A layer, whose weights come behind those of the layers before it.
+    fn dense(&mut self, name: &str, (inputs, outputs): (usize, usize), active: bool) -> Dense {
+        let layer = Dense::new(self.start, inputs, outputs, active.then_some(self.layers.activation));
+        self.start = layer.range().end;
+        self.parts.extend(layer.parts(name, self.layers.initial));
+        layer
+    }
+
+    /// Applies a layer to value number `x`, and adds value number `added`. Gives the number of what comes out.
+    fn apply(&mut self, layer: Dense, x: usize, added: Option<usize>) -> usize {
+        self.steps.push(Step::Dense { layer, x, added });
+        self.next() - 1
+    }
+
+    fn layer(&mut self, name: &str, x: usize, sizes: (usize, usize), active: bool) -> usize {
+        let layer = self.dense(name, sizes, active);
+        self.apply(layer, x, None)
+    }
+
+    fn beside(&mut self, one: usize, other: usize) -> usize {
+        self.steps.push(Step::Beside(one, other));
+        self.next() - 1
+    }
+
+    /// A block: f(x·W + b) plus what state and time add, value number `condition` of width `of_condition`; then the same again, plus
+    /// the block's input, in the output's width.
+    fn block(
+        &mut self,
+        name: &str,
+        x: usize,
+        (inputs, outputs): (usize, usize),
+        (condition, of_condition): (usize, usize),
+    ) -> usize {
+        let first = self.dense(&format!("{name}.first"), (inputs, outputs), true);
+        let of_condition = self.dense(&format!("{name}.condition"), (of_condition, outputs), false);
+        let second = self.dense(&format!("{name}.second"), (outputs, outputs), true);
+        let added = self.apply(of_condition, condition, None);
+        let inner = self.apply(first, x, Some(added));
+        let skip = match inputs == outputs {
+            true => x,
+            false => {
+                let skip = self.dense(&format!("{name}.skip"), (inputs, outputs), false);
+                self.apply(skip, x, None)
+            }
+        };
+        self.apply(second, inner, Some(skip))
+    }
+}
+
+/// The network of (state, features of time, actions), and the layout of its weights.
+fn build(shape: &ScoreShape) -> (DenseGraph, Layout) {
+    let (layers, a) = (&shape.layers, shape.action_dim);
+    let (widths, mut of) = (&layers.hidden, Builder { layers, parts: Vec::new(), start: 0, steps: Vec::new() });
+    let narrowest = widths.last().copied().unwrap_or(1);
+    let state = of.layer("state", 0, (shape.observation_dim, EMBEDDING), true);
+    let time = of.layer("time", 1, (EMBEDDING, EMBEDDING), false);
+    let both = of.beside(state, time);
+    let mixed = of.layer("mix.0", both, (2 * EMBEDDING, narrowest), true);
+    let condition = (of.layer("mix.1", mixed, (narrowest, narrowest), true), narrowest);
+    let (mut x, mut width, mut narrowed) = (2, a, Vec::new());
+    for (i, outputs) in widths.iter().enumerate() {
+        x = of.block(&format!("down.{i}"), x, (width, *outputs), condition);
+        width = *outputs;
+        narrowed.push(x);
+    }
+    x = of.block("middle", x, (narrowest, narrowest), condition);
+    // Each sees the block before it and the narrowing block of that width, and is as wide as the one above that.
+    for (i, pair) in widths.windows(2).rev().enumerate() {
+        let both = of.beside(narrowed.pop().unwrap_or(x), x);
+        x = of.block(&format!("up.{i}"), both, (2 * pair[1], pair[0]), condition);
+    }
+    let both = of.beside(narrowed.pop().unwrap_or(x), x);
+    of.layer("last", both, (2 * widths.first().copied().unwrap_or(1), a), false);
+    (DenseGraph::new(vec![shape.observation_dim, EMBEDDING, a], of.steps, of.start), Layout::new(of.parts))
 }
 
 /// A noise predictor in continuous time, and its weights.
 pub struct ScoreNetwork {
     shape: ScoreShape,
-    layers: Arc<Layers>,
+    graph: Arc<DenseGraph>,
     weights: Weights,
     /// Fixed random frequencies, `[16]`.
     frequencies: Tensor,
@@ -103,7 +137,7 @@ impl ScoreShape {
 
     /// Tensors of the network's layers, each with `.kernel` `[in, out]` and `.bias` `[out]`.
     pub fn layout(&self) -> Layout {
-        Layers::new(self).layout
+        build(self).1
     }
 
     /// Frequencies to begin with, `[16]`: normal, with a standard deviation of 30.
@@ -138,7 +172,7 @@ impl Weighted for ScoreNetwork {
 impl ScoreNetwork {
     /// `weights` are of the shape's layout; `frequencies` `[16]` on the CPU.
     pub fn new(shape: ScoreShape, weights: Weights, frequencies: Tensor) -> Self {
-        Self { layers: Arc::new(Layers::new(&shape)), shape, weights, frequencies }
+        Self { graph: Arc::new(build(&shape).0), shape, weights, frequencies }
     }
 
     /// Its shape.
@@ -153,42 +187,19 @@ impl ScoreNetwork {
 
     /// Makes constants of the weights; they share the memory of this network.
     pub fn detach(&self) -> Self {
-        let (shape, layers, frequencies) = (self.shape.clone(), self.layers.clone(), self.frequencies.clone());
-        Self { shape, layers, weights: self.weights.detach(), frequencies }
+        let (shape, graph, frequencies) = (self.shape.clone(), self.graph.clone(), self.frequencies.clone());
+        Self { shape, graph, weights: self.weights.detach(), frequencies }
     }
 
     /// ε_θ(a_t, s, t), `[rows, a]`: `observations [n, o]` and `t` (n of them) of states, `actions [rows, a]`, where equally many
     /// consecutive rows share a state. Differentiable in the weights.
     pub fn predict(&self, observations: &Tensor, actions: &Tensor, t: &[f64]) -> Result<Tensor> {
-        let (layers, n, rows) = (&*self.layers, observations.dim(0)?, actions.dim(0)?);
+        let (n, rows) = (observations.dim(0)?, actions.dim(0)?);
         if n == 0 || n != t.len() || !rows.is_multiple_of(n) {
             bail!("a noise predictor got {n} states, {} times and {rows} actions", t.len());
         }
-        let dense = |layer: &Dense, x: &Tensor, added: Option<&Tensor>| layer.forward(&self.weights, x, added);
-        let of_time = dense(&layers.time, &self.time_features(t, observations.device())?, None)?;
-        let condition = Tensor::cat(&[&dense(&layers.state, observations, None)?, &of_time], 1)?;
-        let condition = layers.mix.iter().try_fold(condition, |x, layer| dense(layer, &x, None))?;
-        let block = |block: &Block, x: &Tensor| {
-            let inner = dense(&block.first, x, Some(&dense(&block.condition, &condition, None)?))?;
-            match &block.skip {
-                Some(skip) => dense(&block.second, &inner, Some(&dense(skip, x, None)?)),
-                None => dense(&block.second, &inner, Some(x)),
-            }
-        };
-        let (mut x, mut narrowed) = (actions.clone(), Vec::new());
-        for down in &layers.down {
-            x = block(down, &x)?;
-            narrowed.push(x.clone());
-        }
-        x = block(&layers.middle, &x)?;
-        let mut beside = |x: &Tensor| {
-            let before = narrowed.pop();
-            Tensor::cat(&[before.as_ref().unwrap_or(x), x], 1)
-        };
-        for up in &layers.up {
-            x = block(up, &beside(&x)?)?;
-        }
-        dense(&layers.last, &beside(&x)?, None)
+        let time = self.time_features(t, observations.device())?;
+        self.graph.forward(&self.weights, &[observations.clone(), time, actions.clone()])
     }
 
     /// Sines of 2π·t·frequency, then the cosines, `[n, 32]`.
