@@ -137,7 +137,7 @@ def phases(algorithm):
 def names():
     """{name: (algorithm, task, changes, the phase's number)} of all algorithms, as algorithms/benches/update.rs has them."""
     found = {name: (*which, 0) for name, which in CONFIGURATIONS.items()}
-    for algorithm in [name for name in ALGORITHMS if name != "quad"]:
+    for algorithm in [name for name in ALGORITHMS if name not in ("quad", "fqe")]:  # fqe trains no policy, and has no preset
         count = len(phases(algorithm))
         for i in range(count):
             found[algorithm if count == 1 else f"{algorithm}, phase {i + 1}"] = (algorithm, TASK, {}, i)
