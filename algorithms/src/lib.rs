@@ -32,6 +32,7 @@ mod replay;
 mod returns;
 mod sfbc;
 mod squashed;
+mod td3bc;
 mod trained;
 mod values;
 mod xql;
@@ -45,7 +46,7 @@ pub use parts::Parts;
 pub use values::{Values, fits, merge};
 
 /// All algorithms, the one that learns unless another is asked for first.
-pub const ALGORITHMS: [Definition; 11] = [
+pub const ALGORITHMS: [Definition; 12] = [
     quad::DEFINITION,
     iql::DEFINITION,
     align_iql::DEFINITION,
@@ -56,6 +57,7 @@ pub const ALGORITHMS: [Definition; 11] = [
     ivr::DEFINITION,
     onestep::DEFINITION,
     sfbc::DEFINITION,
+    td3bc::DEFINITION,
     xql::DEFINITION,
 ];
 

@@ -26,6 +26,7 @@ import ivr
 import onestep
 import quad
 import sfbc
+import td3bc
 import xql
 
 HERE = Path(__file__).parent
@@ -64,8 +65,10 @@ FOLDERS = {
     "diffuser": (40, "diffuser", "small"),
     "diffuser-attention": (41, "diffuser-attention", "small"),
     "fqe": (50, "fqe", "small"),
+    "td3-bc": (51, "td3-bc", "small"),
+    "td3-bc-critic": (52, "td3-bc-critic", "small"),
 }
-MODULES = quad, iql, ivr, xql, dql, align_iql, onestep, cql, dtql, sfbc, diffuser, fqe
+MODULES = quad, iql, ivr, xql, dql, align_iql, onestep, cql, dtql, sfbc, diffuser, fqe, td3bc
 ALGORITHMS = {variant: algorithm for algorithm in MODULES for variant in algorithm.VARIANTS}
 
 

@@ -1,0 +1,86 @@
+"""One update of TD3+BC (Fujimoto and Gu 2021), in the order of its authors' code: with its policy's step, or without."""
+
+import implicit
+import jax
+import jax.numpy as jnp
+import numpy as np
+from implicit import CRITICS, SIZES, critic_gradient, fast_action, mean_action, widened
+
+from networks import adam_step, compiled, fast_values, follow, near, random_moments, random_network, shape, single, values
+
+# The step: the policy moves in every second one, counted from 1.
+VARIANTS = {"td3-bc": 701, "td3-bc-critic": 700}
+AGENT = {
+    "gamma": 0.99,
+    "weight": 2.5,
+    "target_noise": 0.2,
+    "target_noise_limit": 0.25,
+    "actor_learning_rate": 0.02,
+    "critic_learning_rate": 0.03,
+    "ema_rate": 0.05,
+    "actor_every": 2,
+}
+
+
+def make_config(variant, size):
+    hidden, activation = SIZES[size]["hidden"], "mish" if size == "hopper" else "relu"
+    networks = dict.fromkeys(("actor", "critic"), shape([hidden, hidden], activation))
+    return implicit.make_config("td3-bc", size, networks | AGENT) | {"step": VARIANTS[variant]}
+
+
+def actor_losses(actor, critics, states, actions, weight, activation):
+    """The actor's loss, and the distance to the data in it."""
+    taken = mean_action(actor, states, activation)
+    q = values(critics, states, taken, activation)[0]
+    distance = jnp.mean((taken - actions) ** 2)
+    return -weight / jax.lax.stop_gradient(jnp.mean(jnp.abs(q))) * jnp.mean(q) + distance, distance
+
+
+actor_gradient = compiled(jax.value_and_grad(actor_losses, has_aux=True))
+
+
+def noisy_actions(config, state, inputs):
+    agent = config["agent"]
+    noise = np.clip(agent["target_noise"] * inputs["target_noise"], -agent["target_noise_limit"], agent["target_noise_limit"])
+    return fast_action(state["target_actor"], inputs["next_observations"], agent["actor"]["activation"]) + noise
+
+
+def update(config, state, inputs):
+    agent, s, a, step = config["agent"], inputs["observations"], inputs["actions"], config["step"]
+    activation = agent["critic"]["activation"]
+    next_actions = np.clip(noisy_actions(config, state, inputs), -1, 1)
+    next_q = fast_values(state["target_critic"], inputs["next_observations"], next_actions, activation).min(0)
+    targets = inputs["rewards"] + agent["gamma"] * inputs["masks"] * next_q
+    critic_loss, gradients = critic_gradient(state["critic"], s, a, targets, activation)
+    out = state | adam_step(state, "critic", gradients, agent["critic_learning_rate"], step)
+    out |= {"targets": targets, "q_mean": targets.mean(), "critic_loss": critic_loss}
+    if (step + 1) % agent["actor_every"] == 0:
+        (loss, distance), gradients = actor_gradient(state["actor"], out["critic"], s, a, agent["weight"], activation)
+        out |= adam_step(state, "actor", gradients, agent["actor_learning_rate"], step // agent["actor_every"])
+        out["target_critic"] = follow(state["target_critic"], out["critic"], agent["ema_rate"])
+        out["target_actor"] = follow(state["target_actor"], out["actor"], agent["ema_rate"])
+        out["of_actor"] = np.stack([loss, distance])
+    return out | {"actor_loss": out["of_actor"][0], "bc_loss": out["of_actor"][1]}, None
+
+
+act = implicit.act
+
+
+def draw(config, variant, size, rng):
+    """A state, inputs and what comes out; None where noise and actions are not clipped, or come close to it."""
+    agent, o, a, b = config["agent"], config["observation_dim"], config["action_dim"], config["batch_size"]
+    state = {
+        "actor": widened(random_network(rng, o, agent["actor"], a, 1), 2),
+        "critic": widened(random_network(rng, o + a, agent["critic"], 1, CRITICS), SIZES[size]["spread"]),
+    }
+    state |= {f"target_{name}": near(rng, network) for name, network in state.items()}
+    state["of_actor"] = single([0.7, 0.3])
+    for name in "actor", "critic":
+        state |= random_moments(rng, name, state[name])
+    inputs = implicit.random_inputs(config, rng, size) | {"target_noise": single(rng.normal(size=(b, a)))}
+    noise = agent["target_noise"] * inputs["target_noise"]
+    for clipped, limit in (noise, agent["target_noise_limit"]), (noisy_actions(config, state, inputs), 1):
+        beyond = np.abs(clipped) - limit
+        if np.any(np.abs(beyond) < 1e-5) or not np.any(beyond > 0):
+            return None
+    return state, inputs, update(config, state, inputs)[0] | act(config, state, inputs)
