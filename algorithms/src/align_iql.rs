@@ -6,7 +6,7 @@
 #[cfg(test)]
 #[allow(clippy::unwrap_used)]
 #[path = "golden/align_iql.rs"]
-mod golden;
+pub(super) mod golden;
 
 use super::algorithm::{Measured, smaller};
 use super::context::{Context, Minibatch};
@@ -33,26 +33,26 @@ pub(super) const DEFINITION: Definition = Definition {
     metrics: METRICS,
     report: Reporting { counts: &["candidates"], ..Reporting::PLAIN },
     check: readable::<Config>,
-    start: |table, context| Ok(Box::new(read::<Config>(table)?.start(context)?)),
+    start: |table, context| Ok(Box::new(read::<Config>(table)?.start(Rule::Nearest, context)?)),
 };
 
 /// Critics, of whose values the smaller counts.
 const CRITICS: usize = 2;
 
-const METRICS: &[Metric] = &metrics! {
+pub(super) const METRICS: &[Metric] = &metrics! {
     q_mean: "Mean over the batch of the critics' target y = r + γ·mask·V(s') (IQL's Eq. 6).";
     v_mean ["V"]: "Mean over the batch of the value V(s) after its step.";
     value_loss ["value loss"]: "Expectile loss of V: mean over the batch of |expectile − 1(u < 0)|·u² with u = min_k Q̂_k(s, a) − V(s) (IQL's Eq. 5).";
     critic_loss ["critic loss"]: "Mean over critics and batch of (Q_k(s, a) − y)² (IQL's Eq. 6).";
     bc_loss ["BC loss"]: "Mean over the batch of the sum over dimensions of (ε − ε_θ(a^t, s, t))². A network that always outputs 0 has the number of dimensions as its loss.";
-    advantage_mean: "Mean over the batch of the advantage min_k Q̂_k(s, a) − V(s): the policy takes the sample for which it is closest to 0.";
+    advantage_mean: "Mean over the batch of the advantage min_k Q̂_k(s, a) − V(s): AlignIQL's policy takes the sample for which it is closest to 0.";
     learning_rate: "The actor's learning rate; falls to 0 along a cosine.";
 };
 
-/// AlignIQL's hyper-parameters: the `[agent]` table of a preset.
+/// The hyper-parameters of AlignIQL and of IDQL: the `[agent]` table of a preset.
 #[derive(Deserialize)]
 #[serde(deny_unknown_fields)]
-struct Config {
+pub(super) struct Config {
     actor: MlpConfig,
     critic: MlpConfig,
     value: MlpConfig,
@@ -75,19 +75,22 @@ struct Config {
     candidates: Candidates,
 }
 
-/// AlignIQL beside its diffusion policy and critics.
-struct AlignIql {
+/// AlignIQL, or IDQL, beside its diffusion policy and critics.
+pub(super) struct AlignIql {
     config: Config,
+    /// How the policy chooses.
+    rule: Rule,
     /// V.
     value: Trained<Ensemble>,
 }
 
 impl Config {
-    fn start(self, context: Context) -> Result<Diffusion<AlignIql>> {
+    /// The algorithm at its beginning, whose policy chooses by this rule: IDQL's by `best`.
+    pub(super) fn start(self, rule: Rule, context: Context) -> Result<Diffusion<AlignIql>> {
         let shape = DiffusionShape {
             actor: self.actor.clone(),
             critic: self.critic.clone(),
-            value: Some(self.value.clone()),
+            value: (rule == Rule::Nearest).then(|| self.value.clone()),
             critics: CRITICS,
             diffusion_steps: *self.diffusion_steps,
             reverse: Reverse::ClipSample,
@@ -96,7 +99,7 @@ impl Config {
         let networks = Networks::new(shape, *self.weight_decay, context)?;
         let value = EnsembleShape { members: 1, action_dim: 0, layers: self.value.clone(), ..networks.shape.critics() };
         let value = ensemble(value, &networks.context, 2)?;
-        Ok(Diffusion::new(networks, AlignIql { config: self, value }))
+        Ok(Diffusion::new(networks, AlignIql { config: self, rule, value }))
     }
 }
 
@@ -116,7 +119,7 @@ impl Update for AlignIql {
     }
 
     fn work(&mut self, networks: &mut Networks, batch: &Minibatch, noise: &Denoising) -> Result<Computed> {
-        let Self { config, value } = self;
+        let Self { config, value, .. } = self;
 
         // The policy: cloning, whatever the actions are worth.
         let (_, predicted) = networks.denoise(batch, noise)?;
@@ -155,11 +158,12 @@ impl Update for AlignIql {
         Ok(vec![("learning_rate", networks.actor.adam.step().rate)])
     }
 
-    /// Takes the EMA actor's sample with the largest −(Q − V)²: the constraint Q = V of the aligned policy, as a penalty.
+    /// AlignIQL takes the EMA actor's sample with the largest −(Q − V)²: the constraint Q = V of the aligned policy, as a penalty.
     fn policy(&self, networks: &Networks) -> Result<(Choice, Tensors)> {
         let Networks { target_actor, target_critics, .. } = networks;
-        let tensors = DiffusionPolicy::tensors(target_actor, target_critics, Some(&self.value.network))?;
-        Ok((Choice { candidates: *self.config.candidates, value: Reduce::Min, rule: Rule::Nearest }, tensors))
+        let value = (self.rule == Rule::Nearest).then_some(&self.value.network);
+        let tensors = DiffusionPolicy::tensors(target_actor, target_critics, value)?;
+        Ok((Choice { candidates: *self.config.candidates, value: Reduce::Min, rule: self.rule }, tensors))
     }
 
     fn parts<'a>(&'a mut self, parts: Parts<'a>, _: &'a Device) -> Parts<'a> {

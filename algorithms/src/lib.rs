@@ -19,6 +19,7 @@ mod dtql;
 mod fqe;
 mod gaussian;
 mod hyperparameters;
+mod idql;
 mod in_sample;
 mod iql;
 mod ivr;
@@ -46,7 +47,7 @@ pub use parts::Parts;
 pub use values::{Values, fits, merge};
 
 /// All algorithms, the one that learns unless another is asked for first.
-pub const ALGORITHMS: [Definition; 12] = [
+pub const ALGORITHMS: [Definition; 13] = [
     quad::DEFINITION,
     iql::DEFINITION,
     align_iql::DEFINITION,
@@ -54,6 +55,7 @@ pub const ALGORITHMS: [Definition; 12] = [
     diffuser::DEFINITION,
     dql::DEFINITION,
     dtql::DEFINITION,
+    idql::DEFINITION,
     ivr::DEFINITION,
     onestep::DEFINITION,
     sfbc::DEFINITION,

@@ -187,7 +187,7 @@ fn a_nan_is_never_dropped() {
             let values = train(&mut agent, STEPS);
             // By these the policy acts, but nothing is learned from them: they are averages of networks that are watched.
             let unread = match definition.name {
-                "align-iql" => name == "target_actor",
+                "align-iql" | "idql" => name == "target_actor",
                 "diffuser" => name.starts_with("target"),
                 "dtql" => name == "target_critic",
                 _ => false,

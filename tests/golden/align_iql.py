@@ -1,4 +1,4 @@
-"""One update of AlignIQL (He et al. 2024), without its multipliers."""
+"""One update of AlignIQL (He et al. 2024), without its multipliers, and of IDQL, which differs in the choice of an action."""
 
 import math
 
@@ -21,12 +21,12 @@ AGENT = {
     "candidates": 10,
 }
 HIDDEN = {"narrow": 5, "small": 7, "hopper": 256}  # the actor's
-VARIANTS = ("align-iql",)
+VARIANTS = "align-iql", "idql"
 
 
 def make_config(variant, size):
     networks = implicit.value_networks(size) | {"actor": shape([HIDDEN[size]] * 3, "silu")}
-    return implicit.make_config("align-iql", size, networks | AGENT | RATES)
+    return implicit.make_config(variant, size, networks | AGENT | RATES)
 
 
 @compiled
@@ -86,13 +86,16 @@ def update(config, state, inputs):
 
 
 def act(config, state, inputs):
-    """The candidate of the target actor whose value is closest to V, with the networks as they are before the update."""
+    """The candidate of the target actor whose value is closest to V, IDQL's whose is largest, with the networks as they are
+    before the update.
+    """
     agent, noise, observations = config["agent"], inputs["select_noise"], inputs["select_observations"]
     states = repeated(observations, noise)
     candidates = sample(state["target_actor"], states, noise, agent["actor"]["activation"])
     q = least(state["target_critic"], states, candidates, config)
     v = fast_value(state["value"], observations, agent["value"]["activation"])
-    index = abs(q - v[:, None]).argmin(-1)
+    distance = -q if config["algorithm"] == "idql" else abs(q - v[:, None])
+    index = distance.argmin(-1)
     out = {"select.candidates": candidates, "select.q": q, "select.v": v, "select.index": index}
     return out | {"select.actions": candidates[np.arange(len(index)), index]}
 
@@ -117,13 +120,14 @@ def random_inputs(config, rng, size, state):
         "t": rng.permutation(np.arange(b) % steps + 1),
         "epsilon": single(rng.normal(size=(b, a))),
     }
-    # A choice between candidates nearly as close to V would depend on rounding: draw such states' noise again.
+    # A choice between candidates nearly alike would depend on rounding: draw such states' noise again.
     noise = np.zeros((steps, n, agent["candidates"], a))
     close = np.full(n, True)
     while close.any():
         noise[:, close] = single(rng.normal(size=noise[:, close].shape))
         came = act(config, state, inputs | {"select_noise": noise})
-        distances = np.sort(abs(came["select.q"] - came["select.v"][:, None]))
+        best = config["algorithm"] == "idql"
+        distances = np.sort(-came["select.q"] if best else abs(came["select.q"] - came["select.v"][:, None]))
         close = distances[:, 1] - distances[:, 0] < 1e-3
     return inputs | {"select_noise": noise}
 
@@ -139,6 +143,6 @@ def draw(config, variant, size, rng):
     v = fast_value(state["value"], inputs["observations"], config["agent"]["value"]["activation"])
     chosen = expected["select.index"]
     extremes = [np.mean(chosen == worst) for worst in (expected["select.q"].argmin(-1), expected["select.q"].argmax(-1))]
-    if not 0.1 < np.mean(q > v) < 0.9 or max(extremes) > 0.5:
+    if not 0.1 < np.mean(q > v) < 0.9 or (variant == "align-iql" and max(extremes) > 0.5):
         return None
     return state, inputs, expected

@@ -50,6 +50,7 @@ FOLDERS = {
     "dql": (18, "dql", "small"),
     "dql-max-backup": (19, "dql-max-backup", "small"),
     "align-iql": (20, "align-iql", "small"),
+    "idql": (53, "idql", "small"),
     "onestep-behavior": (21, "onestep-behavior", "small"),
     "onestep-critic": (22, "onestep-critic", "small"),
     "onestep-policy": (23, "onestep-policy", "small"),

@@ -6,10 +6,11 @@ use crate::golden::{Golden, batch, check_candidates, check_update, context, deno
 use candle_core::Device;
 
 fn start(golden: &Golden, device: &Device) -> Diffusion<AlignIql> {
-    read::<Config>(&table(golden)).unwrap().start(context(golden, device)).unwrap()
+    let rule = if golden.config["algorithm"] == "idql" { Rule::Best } else { Rule::Nearest };
+    read::<Config>(&table(golden)).unwrap().start(rule, context(golden, device)).unwrap()
 }
 
-fn check(golden: &Golden, device: &Device) {
+pub(crate) fn check(golden: &Golden, device: &Device) {
     let mut align_iql = start(golden, device);
     load(golden, align_iql.parts());
     check_choice(golden, &align_iql);
@@ -20,16 +21,21 @@ fn check(golden: &Golden, device: &Device) {
     check_update(golden, METRICS, &measured, align_iql.parts().save().unwrap());
 }
 
-/// What the published networks say of the candidates, and that the one whose Q is nearest to V is to be taken.
+/// What the published networks say of the candidates, and that the one whose Q is nearest to V, or largest, is to be taken.
 fn check_choice(golden: &Golden, align_iql: &Diffusion<AlignIql>) {
     let drawn = check_candidates(golden, align_iql);
     let candidates = golden.count("/agent/candidates") as u32;
-    assert_eq!(drawn.choice, Choice { candidates, value: Reduce::Min, rule: Rule::Nearest });
-    let v = drawn.v.unwrap();
-    golden.close("select.v", &v);
-    let index = drawn.q.broadcast_sub(&v.unsqueeze(1).unwrap()).unwrap().abs().unwrap().argmin(1).unwrap();
+    assert_eq!(drawn.choice, Choice { candidates, value: Reduce::Min, rule: align_iql.update.rule });
+    let index = match &drawn.v {
+        Some(v) => {
+            golden.close("select.v", v);
+            drawn.q.broadcast_sub(&v.unsqueeze(1).unwrap()).unwrap().abs().unwrap().argmin(1).unwrap()
+        }
+        None => drawn.q.argmax(1).unwrap(),
+    };
+    assert_eq!(drawn.v.is_some(), align_iql.update.rule == Rule::Nearest);
     golden.close("select.index", &index);
-    let first = (0..v.elem_count()).map(|state| state as u32 * candidates);
+    let first = (0..index.elem_count()).map(|state| state as u32 * candidates);
     let rows: Vec<u32> = first.zip(index.to_vec1::<u32>().unwrap()).map(|(first, chosen)| first + chosen).collect();
     let rows = candle_core::Tensor::new(rows, &Device::Cpu).unwrap();
     golden.close("select.actions", &drawn.candidates.index_select(&rows, 0).unwrap());
