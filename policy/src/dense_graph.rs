@@ -38,6 +38,18 @@ pub(crate) enum Step {
     Beside(usize, usize),
 }
 
+impl Step {
+    /// The values that it makes use of.
+    fn values(&self) -> impl Iterator<Item = usize> + use<> {
+        match *self {
+            Self::Dense { x, added, .. } => [Some(x), added],
+            Self::Beside(one, other) => [Some(one), Some(other)],
+        }
+        .into_iter()
+        .flatten()
+    }
+}
+
 /// A network; its output is what the last step makes.
 pub(crate) struct DenseGraph {
     /// How many of the values are inputs.
@@ -87,16 +99,22 @@ impl DenseGraph {
             let operation = Operation { graph: self.clone(), kept: kept.clone(), parts: self.pool.lend() };
             return values.apply_op2(&x, operation);
         }
-        let mut known = inputs.to_vec();
-        for step in &self.steps {
-            known.push(match step {
-                Step::Dense { layer, x, added } => {
-                    layer.forward(values, &known[*x], added.map(|added| &known[added]))?
-                }
-                Step::Beside(one, other) => Tensor::cat(&[&known[*one], &known[*other]], 1)?,
-            });
+        let mut known: Vec<Option<Tensor>> = inputs.iter().cloned().map(Some).collect();
+        for (i, step) in self.steps.iter().enumerate() {
+            let value = |number: usize| {
+                known[number].as_ref().ok_or_else(|| candle_core::Error::Msg("a value was dropped too early".into()))
+            };
+            let next = match step {
+                Step::Dense { layer, x, added } => layer.forward(values, value(*x)?, added.map(value).transpose()?)?,
+                Step::Beside(one, other) => Tensor::cat(&[value(*one)?, value(*other)?], 1)?,
+            };
+            known.push(Some(next));
+            // Values are dropped after their last use, because they are large.
+            step.values()
+                .filter(|number| !self.steps[i + 1..].iter().any(|step| step.values().any(|n| n == *number)))
+                .for_each(|number| known[number] = None);
         }
-        known.pop().map_or_else(|| candle_core::bail!("a network without layers"), Ok)
+        known.pop().flatten().map_or_else(|| candle_core::bail!("a network without layers"), Ok)
     }
 
     /// The output of some rows of the inputs side by side.
