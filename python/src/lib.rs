@@ -8,6 +8,7 @@ mod dataset;
 mod episodes;
 mod error;
 mod evaluate;
+mod file;
 mod policy;
 mod runs;
 

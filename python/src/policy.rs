@@ -4,22 +4,18 @@ use std::fs;
 use std::path::PathBuf;
 use std::sync::Arc;
 
-use pyo3::exceptions::{PyUserWarning, PyValueError};
+use pyo3::exceptions::PyValueError;
 use pyo3::prelude::*;
 use pyo3::types::{PyBytes, PyDict, PyTuple};
 use quad_dataset::Names;
-use quad_policy::{Header, Policy, PolicyConfig, PolicyError, Precision, load_policy};
+use quad_policy::{Header, Policy, PolicyConfig, Precision};
 use quad_protocol::Origin;
-use serde_json::{Value, json};
 
 use crate::acting::{Array, act, begin, compute, noise, not_seeds, parts, seeds};
 use crate::arrays::{Like, Rows};
 use crate::choosing::{Changes, as_dictionary, choosing};
 use crate::episodes::Episodes;
-use crate::error::with_hint;
-
-const HINT: &str =
-    "a policy is a file like RUN/snapshots/step_000020000.safetensors, as `learner train` of this version writes them";
+use crate::file::{HINT, all_about, read};
 
 /// A policy that `learner train` has saved: `Policy.load(path)`.
 ///
@@ -61,30 +57,11 @@ impl PyPolicy {
     #[staticmethod]
     #[pyo3(signature = (file, precision = "f32", name = "the file"))]
     fn from_bytes(py: Python<'_>, file: Vec<u8>, precision: &str, name: &str) -> PyResult<Self> {
-        let asked: Precision = precision
-            .parse()
-            .map_err(|_| PyValueError::new_err(format!("precision is {precision:?}, not f32 or bf16")))?;
-        if !asked.is_available() {
-            let message = std::ffi::CString::new(Precision::UNAVAILABLE)?;
-            PyErr::warn(py, &py.get_type::<PyUserWarning>(), &message, 2)?;
-        }
-        let read = py.detach(|| Ok((load_policy(&file, asked)?, Header::<Origin>::read(&file)?)));
-        let (policy, header) = read.map_err(|error: PolicyError| {
-            with_hint(&std::io::Error::other(format!("{name} is not a saved policy: {error}")), HINT)
-        })?;
-        let Header { policy: config, scaling, observation_names, action_names, origin, about, version } = header;
-        let own = json!({
-            "version": version,
-            "environment": origin.environment,
-            "step": origin.step,
-            "observation_names": observation_names,
-            "action_names": action_names,
-            "scaling": scaling,
-        });
-        let mut known = about.as_object().cloned().unwrap_or_default();
-        known.extend(own.as_object().cloned().unwrap_or_default());
+        let (asked, policy, header) = read(py, &file, precision, name)?;
+        let about = all_about(&header);
+        let Header { policy: config, observation_names, action_names, origin, .. } = header;
         let names = Arc::new(Names { observations: observation_names, actions: action_names });
-        Ok(Self { policy: policy.into(), config, origin, names, about: Value::from(known).to_string(), file, asked })
+        Ok(Self { policy: policy.into(), config, origin, names, about, file, asked })
     }
 
     /// Acts in each of n states: observations [n, observation_size] -> actions [n, action_size], float32.

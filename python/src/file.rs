@@ -1,0 +1,49 @@
+//! A policy's file, and what it says of itself.
+
+use pyo3::exceptions::{PyUserWarning, PyValueError};
+use pyo3::prelude::*;
+use quad_policy::{Header, Policy, PolicyError, Precision, load_policy};
+use quad_protocol::Origin;
+use serde_json::{Value, json};
+
+use crate::error::with_hint;
+
+/// What such a file is.
+pub const HINT: &str =
+    "a policy is a file like RUN/snapshots/step_000020000.safetensors, as `learner train` of this version writes them";
+
+/// Reads a policy of this file, which errors call `name`, in this precision; others than this CPU has warn.
+pub fn read(
+    py: Python<'_>,
+    file: &[u8],
+    precision: &str,
+    name: &str,
+) -> PyResult<(Precision, Box<dyn Policy>, Header<Origin>)> {
+    let asked: Precision =
+        precision.parse().map_err(|_| PyValueError::new_err(format!("precision is {precision:?}, not f32 or bf16")))?;
+    if !asked.is_available() {
+        let message = std::ffi::CString::new(Precision::UNAVAILABLE)?;
+        PyErr::warn(py, &py.get_type::<PyUserWarning>(), &message, 2)?;
+    }
+    let read = py.detach(|| Ok((load_policy(file, asked)?, Header::<Origin>::read(file)?)));
+    let (policy, header) = read.map_err(|error: PolicyError| {
+        with_hint(&std::io::Error::other(format!("{name} is not a saved policy: {error}")), HINT)
+    })?;
+    Ok((asked, policy, header))
+}
+
+/// What any file says, and what `learner export` has added.
+pub fn all_about(header: &Header<Origin>) -> String {
+    let Header { scaling, observation_names, action_names, origin, about, version, .. } = header;
+    let of_any = json!({
+        "version": version,
+        "environment": origin.environment,
+        "step": origin.step,
+        "observation_names": observation_names,
+        "action_names": action_names,
+        "scaling": scaling,
+    });
+    let mut all = about.as_object().cloned().unwrap_or_default();
+    all.extend(of_any.as_object().cloned().unwrap_or_default());
+    Value::from(all).to_string()
+}
