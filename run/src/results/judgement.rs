@@ -103,7 +103,7 @@ pub struct Ranking {
     pub behavior: Estimate,
     /// The behaviour's value, recorded.
     pub recorded: f64,
-    /// Whether the estimate of the behaviour is closer to what is recorded than the policies' values are to each other.
+    /// Whether the policies' values differ by more than the estimate of the behaviour is off, and than other seeds would change them.
     pub can_rank: bool,
     /// The same in words.
     pub verdict: String,
@@ -128,8 +128,8 @@ impl Ranking {
         let value = |judgement: &Judgement| judgement.estimate.spread().map_or(f64::NEG_INFINITY, |spread| spread.mean);
         policies.sort_by(|one, other| value(other).total_cmp(&value(one)));
         let Judgement { conditions, behavior, recorded, .. } = policies[0].clone();
-        let values = Vec::from_iter(policies.iter().map(value).filter(|value| value.is_finite()));
-        let (can_rank, verdict) = verdict(&values, &behavior, recorded);
+        let sure = Vec::from_iter(policies.iter().filter_map(|judgement| judgement.estimate.spread()));
+        let (can_rank, verdict) = verdict(&sure, conditions.seeds, &behavior, recorded);
         Self { conditions, behavior, recorded, can_rank, verdict, policies }
     }
 
@@ -167,22 +167,26 @@ impl Ranking {
     }
 }
 
-/// Whether these values, the largest first, can be told apart, and why.
-fn verdict(values: &[f64], behavior: &Estimate, recorded: f64) -> (bool, String) {
+/// Whether policies of these values, the largest first, can be told apart, and why.
+fn verdict(values: &[Spread], seeds: u64, behavior: &Estimate, recorded: f64) -> (bool, String) {
     let (Some(most), Some(least)) = (values.first(), values.last()) else {
         return (false, "It cannot rank them: no estimate can be relied on.".to_owned());
     };
     let Some(estimated) = behavior.spread() else {
         return (false, "It cannot rank them: the estimate of the behaviour's own value is doubtful.".to_owned());
     };
-    let (off, range) = ((estimated.mean - recorded).abs(), most - least);
-    let behind = format!("the behaviour's own value is estimated {off:.2} off");
+    let (off, range) = ((estimated.mean - recorded).abs(), most.mean - least.mean);
+    // Twice the standard error of a difference of two means over the seeds.
+    let variance = values.iter().map(|value| value.std.unwrap_or(0.0).powi(2)).sum::<f64>() / values.len() as f64;
+    let noise = 2.0 * (2.0 * variance / seeds as f64).sqrt();
+    let behind = format!(
+        "the behaviour's own value is estimated {off:.2} off, and by other seeds two policies differ by {noise:.2}"
+    );
+    let margin = off.max(noise);
     match values.len() {
-        1 => (false, format!("One value is no ranking; {behind}.")),
-        _ if off >= range => {
-            (false, format!("It cannot rank them: {behind}, and the policies differ by no more than {range:.2}."))
-        }
-        _ => (true, format!("Policies whose values differ by less than {off:.2} are not told apart: {behind}.")),
+        1 => (false, format!("One value is no ranking; the behaviour's own value is estimated {off:.2} off.")),
+        _ if margin >= range => (false, format!("It cannot rank them: {behind}, these by no more than {range:.2}.")),
+        _ => (true, format!("Policies whose values differ by less than {margin:.2} are not told apart: {behind}.")),
     }
 }
 
@@ -222,9 +226,10 @@ mod tests {
         let mut diverged = judgement("diverged", &[1e9, 12.0], 10.5);
         diverged.estimate.doubts.push("beyond what rewards allow".to_owned());
         let judgements = [judgement("low", &[9.0, 9.2], 10.5), diverged, judgement("high", &[13.0, 14.0], 10.5)];
+        // Of the deviations 0.71 and 0.14 the root mean square is 0.51, twice that 1.02.
         let (order, can_rank, verdict) = ranked(&judgements);
         assert_eq!((order, can_rank), (["high", "low", "diverged"].map(str::to_owned).to_vec(), true));
-        assert!(verdict.contains("less than 0.50"), "{verdict}");
+        assert!(verdict.contains("less than 1.02") && verdict.contains("0.50 off"), "{verdict}");
         let text = Ranking::of(judgements.to_vec())[0].parts().map(|part| part.render(Style::Text)).concat();
         assert!(text.contains("a ranking, not a score") && text.contains("13.50 ± 0.71"), "{text}");
         assert!(!text.contains("500000006") && text.contains("beyond what rewards allow"), "{text}");
@@ -234,6 +239,9 @@ mod tests {
     fn what_the_behaviour_s_estimate_misses_by_more_is_not_ranked() {
         let (_, can_rank, verdict) = ranked(&[judgement("a", &[9.0], 14.0), judgement("b", &[12.0], 14.0)]);
         assert!(!can_rank && verdict.contains("4.00 off") && verdict.contains("3.00"), "{verdict}");
+        assert!(ranked(&[judgement("a", &[8.0, 10.0], 10.0), judgement("b", &[12.0, 14.0], 10.0)]).1);
+        let (_, can_rank, verdict) = ranked(&[judgement("a", &[8.0, 12.0], 10.0), judgement("b", &[12.0, 14.0], 10.0)]);
+        assert!(!can_rank && verdict.contains("no more than 3.00"), "the seeds differ as much: {verdict}");
         let mut doubtful = judgement("a", &[9.0], 10.0);
         doubtful.behavior.doubts.push("it moves".to_owned());
         assert!(!ranked(&[doubtful.clone(), doubtful]).1);
