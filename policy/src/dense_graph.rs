@@ -57,6 +57,8 @@ pub(crate) struct DenseGraph {
     steps: Vec<Step>,
     /// The width of each value.
     widths: Vec<usize>,
+    /// The values that no step after this one makes use of, for each step.
+    done: Vec<Vec<usize>>,
     /// Weights.
     len: usize,
     pool: Pool<Vec<Part>>,
@@ -83,7 +85,10 @@ impl DenseGraph {
                 Step::Beside(one, other) => widths[*one] + widths[*other],
             });
         }
-        Self { inputs: count, steps, widths, len, pool: Pool::default() }
+        let is_last = |i: usize, number: &usize| !steps[i + 1..].iter().any(|step| step.values().any(|n| n == *number));
+        let done =
+            steps.iter().enumerate().map(|(i, step)| step.values().filter(|n| is_last(i, n)).collect()).collect();
+        Self { inputs: count, steps, widths, done, len, pool: Pool::default() }
     }
 
     /// The output of these inputs, `[n, width]` each; of one with fewer rows equally many consecutive rows of the others share
@@ -100,7 +105,7 @@ impl DenseGraph {
             return values.apply_op2(&x, operation);
         }
         let mut known: Vec<Option<Tensor>> = inputs.iter().cloned().map(Some).collect();
-        for (i, step) in self.steps.iter().enumerate() {
+        for (step, done) in self.steps.iter().zip(&self.done) {
             let value = |number: usize| {
                 known[number].as_ref().ok_or_else(|| candle_core::Error::Msg("a value was dropped too early".into()))
             };
@@ -109,10 +114,8 @@ impl DenseGraph {
                 Step::Beside(one, other) => Tensor::cat(&[value(*one)?, value(*other)?], 1)?,
             };
             known.push(Some(next));
-            // Values are dropped after their last use, because they are large.
-            step.values()
-                .filter(|number| !self.steps[i + 1..].iter().any(|step| step.values().any(|n| n == *number)))
-                .for_each(|number| known[number] = None);
+            // They are large.
+            done.iter().for_each(|number| known[*number] = None);
         }
         known.pop().flatten().map_or_else(|| candle_core::bail!("a network without layers"), Ok)
     }

@@ -35,9 +35,9 @@ pub struct ExportArgs {
 /// Which snapshot of a run.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub enum At {
-    /// That after a gradient step.
+    /// The one after a gradient step.
     Step(u64),
-    /// That with the best evaluation.
+    /// The one with the best evaluation.
     Best,
     /// The last one.
     Last,

@@ -76,9 +76,10 @@ impl Evaluation<'_> {
         let times = self.for_each_seed(|seed| {
             let mut fqe = self.behavior(seed)?;
             // The first ones also fetch memory.
-            self.updates(&mut fqe, seed, 0..TIMED)?;
+            let mut sampler = self.sampler(&fqe, seed);
+            updates(&mut fqe, &mut sampler, 0..TIMED)?;
             let begin = Instant::now();
-            self.updates(&mut fqe, seed, TIMED..2 * TIMED)?;
+            updates(&mut fqe, &mut sampler, TIMED..2 * TIMED)?;
             Ok(begin.elapsed().mul_f64(self.effort.steps as f64 / TIMED as f64))
         })?;
         Ok(times.into_iter().max().unwrap_or_default())
@@ -91,28 +92,21 @@ impl Evaluation<'_> {
 
     /// Trains to the end. `first` are the actions in the judged episodes' first states.
     fn train(&self, fqe: &mut Fqe, seed: u64, first: &[f32]) -> anyhow::Result<Trace> {
-        let mut trace = Trace { values: Vec::new(), losses: Vec::new() };
+        let (mut trace, mut sampler) = (Trace { values: Vec::new(), losses: Vec::new() }, self.sampler(fqe, seed));
         let at = |note: usize| self.effort.steps * note as u64 / NOTES as u64;
         for note in 0..NOTES {
-            trace.losses.push(self.updates(fqe, seed, at(note)..at(note + 1))?);
+            trace.losses.push(updates(fqe, &mut sampler, at(note)..at(note + 1))?);
             trace.values.push(mean(fqe.values(&self.data.first.observations, first)?.into_iter()));
         }
         Ok(trace)
     }
 
-    /// Does these updates, and gives their mean loss.
-    fn updates(&self, fqe: &mut Fqe, seed: u64, steps: std::ops::Range<u64>) -> anyhow::Result<f64> {
-        let batch = self.data.context(seed).batch_size;
-        let mut sampler = BatchSampler::new(fqe.items(), batch, seed, steps.start);
-        let (mut sum, count) = (0.0, steps.end - steps.start);
-        for step in steps {
-            let measured = fqe.update(step, sampler.next_items())?;
-            sum += measured.iter().find(|(name, _)| *name == "critic_loss").map_or(0.0, |(_, loss)| f64::from(*loss));
-        }
-        Ok(sum / count as f64)
+    /// The batches of an evaluation, from its beginning.
+    fn sampler(&self, fqe: &Fqe, seed: u64) -> BatchSampler {
+        BatchSampler::new(fqe.items(), self.data.context(seed).batch_size, seed, 0)
     }
 
-    /// The same for each seed, at the same time. Each has its share of the cores: updates this small gain little by more.
+    /// Does the work of all seeds at the same time. Each has its share of the cores: updates this small gain little by more.
     fn for_each_seed<T: Send>(&self, work: impl Fn(u64) -> anyhow::Result<T> + Sync) -> anyhow::Result<Vec<T>> {
         let seeds = self.effort.seeds;
         let cores = thread::available_parallelism().map_or(1, NonZero::get);
@@ -125,6 +119,16 @@ impl Evaluation<'_> {
             started.into_iter().map(|thread| thread.join().map_err(|_| anyhow!("an evaluation panicked"))?).collect()
         })
     }
+}
+
+/// Does these updates, and gives their mean loss.
+fn updates(fqe: &mut Fqe, sampler: &mut BatchSampler, steps: std::ops::Range<u64>) -> anyhow::Result<f64> {
+    let (mut sum, count) = (0.0, steps.end - steps.start);
+    for step in steps {
+        let measured = fqe.update(step, sampler.next_items())?;
+        sum += measured.iter().find(|(name, _)| *name == "critic_loss").map_or(0.0, |(_, loss)| f64::from(*loss));
+    }
+    Ok(sum / count as f64)
 }
 
 /// What the evaluations of one policy say of its value.

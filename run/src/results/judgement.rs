@@ -62,7 +62,7 @@ pub struct Judgement {
     pub unseen: bool,
     /// The value of the behaviour that recorded the data, estimated likewise.
     pub behavior: Estimate,
-    /// That value as the judged episodes have it: the mean of their discounted returns. What comes after an episode that was cut off
+    /// The behaviour's value as the judged episodes have it: the mean of their discounted returns. What comes after an episode that was cut off
     /// is taken from the estimate.
     pub recorded: f64,
 }
@@ -105,7 +105,7 @@ pub struct Ranking {
     pub recorded: f64,
     /// Whether the policies' values differ by more than the estimate of the behaviour is off, and than other seeds would change them.
     pub can_rank: bool,
-    /// The same in words.
+    /// What follows from this, in words.
     pub verdict: String,
     /// The policies.
     pub policies: Vec<Judgement>,
