@@ -22,8 +22,8 @@ use super::squashed::{Normal, Squashed};
 use super::trained::{Trained, ensemble, initial};
 use candle_core::{Result, Tensor};
 use quad_policy::{
-    AdamStep, Choice, Denoiser, DenoiserShape, Ensemble, EnsembleShape, MlpConfig, NoiseLevels, PolicyConfig, Reduce,
-    Rule, SquashedPolicy, SquashedShape, Tensors, Weighted, cosine_decay,
+    ActorCriticShape, AdamStep, Choice, Denoiser, DenoiserShape, Ensemble, EnsembleShape, MlpConfig, NoiseLevels,
+    PolicyConfig, Reduce, Rule, SquashedActor, Tensors, Weighted, cosine_decay,
 };
 use rand_chacha::ChaCha8Rng;
 use serde::Deserialize;
@@ -144,7 +144,7 @@ impl Dtql {
         let critics = ensemble(shape(CRITICS, action_dim, &config.critic), &context, 1)?;
         Ok(Self {
             diffusion: Trained::new(diffusion, 0.0)?,
-            actor: Squashed::new(&config.actor, SquashedShape::LOG_STD, None, &context, 0)?,
+            actor: Squashed::new(&config.actor, SquashedActor::LOG_STD, None, &context, 0)?,
             value: ensemble(shape(1, 0, &config.value), &context, 2)?,
             target_critics: critics.network.copy()?,
             critics,
@@ -267,7 +267,7 @@ impl Algorithm for Dtql {
     /// The one-step policy as it is; one of its candidates is drawn by what the target critics say of them.
     fn policy(&self) -> Result<(PolicyConfig, Tensors)> {
         let Config { actor, critic, candidates, temperature, .. } = &self.config;
-        let shape = SquashedShape {
+        let shape = ActorCriticShape {
             observation_dim: self.context.observation_dim(),
             action_dim: self.context.action_dim(),
             actor: actor.clone(),
@@ -276,7 +276,7 @@ impl Algorithm for Dtql {
         };
         let rule = Rule::Softmax { temperature: **temperature };
         let choice = Choice { candidates: **candidates, value: Reduce::Min, rule };
-        let tensors = SquashedPolicy::tensors(&self.actor.network.network, &self.target_critics)?;
+        let tensors = ActorCriticShape::tensors(&self.actor.network.network, &self.target_critics)?;
         Ok((PolicyConfig::Squashed { shape, choice }, tensors))
     }
 

@@ -13,8 +13,8 @@ use super::parts::Parts;
 use candle_core::{Device, Tensor};
 use quad_dataset::{Arrays, Transitions};
 use quad_policy::{
-    Choice, Ensemble, EnsembleShape, Header, Layout, NoisePredictor, PolicyConfig, Precision, Reverse, Schedule,
-    SquashedActor, Tensors, Weights, load_policy, open_gpu, read_tensors,
+    ActorCriticShape, Choice, Ensemble, EnsembleShape, Header, Layout, NoisePredictor, OneStepActor, PolicyConfig,
+    Precision, Reverse, Schedule, SquashedActor, Tensors, Weights, load_policy, open_gpu, read_tensors,
 };
 pub(super) use reader::{Golden, MAKE, goldens, run};
 
@@ -190,7 +190,13 @@ pub(super) fn check_candidates(golden: &Golden, algorithm: &dyn Algorithm) -> Dr
             (choice, actor.sample(&observations, &noise), shape.critics(), value)
         }
         PolicyConfig::Squashed { shape, choice } => {
-            let actor = SquashedActor::new(ensemble(shape.actor(), weights(shape.actor().layout(), "actor.")));
+            let of = SquashedActor::shape(&shape);
+            let actor = SquashedActor::new(ensemble(of.clone(), weights(of.layout(), "actor.")));
+            (choice, actor.sample(&observations, &noise.squeeze(0).unwrap()), shape.critics(), None)
+        }
+        PolicyConfig::OneStep { shape, choice } => {
+            let of = OneStepActor::shape(&shape);
+            let actor = OneStepActor::new(ensemble(of.clone(), weights(of.layout(), "actor.")));
             (choice, actor.sample(&observations, &noise.squeeze(0).unwrap()), shape.critics(), None)
         }
         other => panic!("{other:?}"),

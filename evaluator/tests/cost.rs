@@ -6,8 +6,8 @@ use std::sync::atomic::{AtomicUsize, Ordering::Relaxed};
 
 use candle_core::{DType, Device, Tensor};
 use quad_policy::{
-    Attention, Choice, DiffusionShape, GaussianShape, Guidance, Header, MlpConfig, PlannerShape, Policy, PolicyConfig,
-    Precision, Rule, Scaling, ScorePolicyShape, SquashedShape, WindowConfig, load_policy,
+    ActorCriticShape, Attention, Choice, DiffusionShape, GaussianShape, Guidance, Header, MlpConfig, PlannerShape,
+    Policy, PolicyConfig, Precision, Rule, Scaling, ScorePolicyShape, WindowConfig, load_policy,
 };
 
 /// What is not counted, such as the embedding of each denoising step: little of what an evaluator gives, bytes.
@@ -55,7 +55,7 @@ fn gaussian(hidden: usize) -> Box<dyn Policy> {
 fn squashed(hidden: usize, norm: bool) -> Box<dyn Policy> {
     let actor = MlpConfig::mish(&[hidden; 3]);
     let critic = MlpConfig { norm, ..actor.clone() };
-    let shape = SquashedShape { observation_dim: 11, action_dim: 3, actor, critic, critics: 2 };
+    let shape = ActorCriticShape { observation_dim: 11, action_dim: 3, actor, critic, critics: 2 };
     loaded(PolicyConfig::Squashed { shape, choice: Choice::best_of(1024) })
 }
 

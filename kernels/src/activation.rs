@@ -63,6 +63,25 @@ pub enum Activation {
     Silu,
     /// tanh(x).
     Tanh,
+    /// The tanh form of x·Φ(x) (Hendrycks and Gimpel 2016): x/2·(1 + tanh(√(2/π)·(x + 0.044715·x³))).
+    Gelu,
+}
+
+/// Below this, GELU and its slope are taken to be what they are here, -8e-15; above, GELU is x to the last bit of f32.
+const GELU_ZERO: f32 = -6.9;
+const GELU_LINEAR: f32 = 5.4;
+
+/// GELU as x·σ(2u), where u is what the tanh is of.
+#[inline(always)]
+pub(crate) fn gelu_and_slope(x: f32) -> (f32, f32) {
+    const TWICE: f32 = 2.0 * 0.797_884_6; // 2·√(2/π)
+    let x = x.clamp(GELU_ZERO, f32::INFINITY);
+    let bounded = x.clamp(GELU_ZERO, GELU_LINEAR);
+    let square = bounded * bounded;
+    let e = exp(TWICE * bounded * square.mul_add(0.044_715, 1.0));
+    let r = 1.0 / (e + 1.0);
+    let s = e * r;
+    (x * s, s * (bounded * r * TWICE * square.mul_add(3.0 * 0.044_715, 1.0) + 1.0))
 }
 
 /// The bound keeps e^2x, and with it tanh, finite; beyond it tanh is ±1 to the last bit of f32.
@@ -120,6 +139,7 @@ vectorised! {
             Activation::Relu => rows(x, bias, relu),
             Activation::Silu => rows(x, bias, |x| silu_and_slope(x).0),
             Activation::Tanh => rows(x, bias, |x| tanh_and_slope(x).0),
+            Activation::Gelu => rows(x, bias, |x| gelu_and_slope(x).0),
         }
     }
 }
@@ -132,6 +152,7 @@ vectorised! {
             Activation::Relu => rows_with_slope(x, bias, slope, relu_and_slope),
             Activation::Silu => rows_with_slope(x, bias, slope, silu_and_slope),
             Activation::Tanh => rows_with_slope(x, bias, slope, tanh_and_slope),
+            Activation::Gelu => rows_with_slope(x, bias, slope, gelu_and_slope),
         }
     }
 }
@@ -176,10 +197,16 @@ pub(crate) mod tests {
             Activation::Relu => (x.max(0.0), f64::from(x > 0.0)),
             Activation::Silu => (x * sigmoid, sigmoid * (1.0 + x * (1.0 - sigmoid))),
             Activation::Tanh => (x.tanh(), 1.0 - x.tanh().powi(2)),
+            Activation::Gelu => {
+                let c = (2.0 / std::f64::consts::PI).sqrt();
+                let t = (c * (x + 0.044715 * x.powi(3))).tanh();
+                (0.5 * x * (1.0 + t), 0.5 * (1.0 + t) + 0.5 * x * (1.0 - t * t) * c * (1.0 + 0.134145 * x * x))
+            }
         }
     }
 
-    const ALL: [Activation; 4] = [Activation::Mish, Activation::Relu, Activation::Silu, Activation::Tanh];
+    const ALL: [Activation; 5] =
+        [Activation::Mish, Activation::Relu, Activation::Silu, Activation::Tanh, Activation::Gelu];
 
     fn at(f: Activation, x: f32) -> (f32, f32) {
         let (mut y, mut plain, mut slope) = ([x], [x], [0.0]);
@@ -211,8 +238,9 @@ pub(crate) mod tests {
 
     #[test]
     fn a_unit_that_is_off_makes_no_subnormal_numbers() {
-        for (f, x) in
-            [Activation::Mish, Activation::Silu].into_iter().flat_map(|f| [-30.0, -87.0, -1e30].map(|x| (f, x)))
+        for (f, x) in [Activation::Mish, Activation::Silu, Activation::Gelu]
+            .into_iter()
+            .flat_map(|f| [-30.0, -87.0, -1e30].map(|x| (f, x)))
         {
             let (y, slope) = at(f, x);
             assert!((1e-10 * y).is_normal() && (1e-10 * slope).is_normal(), "{f:?} at {x}: {y} {slope}");

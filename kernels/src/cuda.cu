@@ -21,6 +21,11 @@ extern "C" __global__ void activate(const float *z, const float *bias, float *y,
     } else if (activation == 3) {
       value = tanhf(x);
       derivative = 1.0f - value * value;
+    } else if (activation == 4) {
+      // x·s with s = σ(2u), where u is what GELU's tanh is of.
+      float square = x * x, s = 1.0f / (1.0f + expf(-1.5957692f * x * (1.0f + 0.044715f * square)));
+      value = x * s;
+      derivative = s >= 1.0f || s <= 0.0f ? s : s + value * (1.0f - s) * 1.5957692f * (1.0f + 0.134145f * square);
     }
     y[i] = value;
     if (slope) slope[i] = derivative;

@@ -120,6 +120,7 @@ pub fn activate(
         Some(Activation::Relu) => 1,
         Some(Activation::Silu) => 2,
         Some(Activation::Tanh) => 3,
+        Some(Activation::Gelu) => 4,
         None => 4,
     };
     let kernels = kernels(stream)?;

@@ -2,7 +2,7 @@
 //!
 //! Matrices are row-major slices; `width` is the number of columns.
 
-use crate::activation::{Activation, mish, relu, silu_and_slope, tanh_and_slope};
+use crate::activation::{Activation, gelu_and_slope, mish, relu, silu_and_slope, tanh_and_slope};
 use crate::vectorised::vectorised;
 
 /// Lanes that the loops work on at a time: one AVX-512 register of f32.
@@ -98,6 +98,7 @@ vectorised! {
             Some(Activation::Relu) => first_rows(layer, out, relu),
             Some(Activation::Silu) => first_rows(layer, out, |x| silu_and_slope(x).0),
             Some(Activation::Tanh) => first_rows(layer, out, |x| tanh_and_slope(x).0),
+            Some(Activation::Gelu) => first_rows(layer, out, |x| gelu_and_slope(x).0),
         }
     }
 }

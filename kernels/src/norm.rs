@@ -52,6 +52,15 @@ vectorised! {
 }
 
 vectorised! {
+    /// `x = x + shift`, row by row.
+    pub fn shift_rows(x: &mut [f32], shift: &[f32]) {
+        for row in x.chunks_exact_mut(shift.len()) {
+            row.iter_mut().zip(shift).for_each(|(x, shift)| *x += shift);
+        }
+    }
+}
+
+vectorised! {
     /// Turns gradients behind a norm, `rows × width`, into those before it, and leaves the gradients of scale and shift in what
     /// [`normalise`] has kept.
     pub fn normalise_backward(delta: &mut [f32], scale: &[f32], kept: &mut [f32]) {

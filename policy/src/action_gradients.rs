@@ -3,8 +3,8 @@
 
 use crate::layers::TILE;
 use crate::mlp::Mlp;
-use crate::network::with_workspace;
 use crate::operation::{Arguments, Operation};
+use crate::workspace::with_workspace;
 use candle_core::{Result, Shape};
 use rayon::prelude::*;
 

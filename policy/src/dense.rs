@@ -34,7 +34,7 @@ impl Dense {
 
     /// Its tensors `{name}.kernel` and `{name}.bias`.
     pub fn parts(&self, name: &str, initial: Initial) -> [Part; 2] {
-        let (kernel, bias) = initial.of_layer(self.inputs, self.outputs);
+        let (kernel, bias) = initial.of_layer(self.inputs, self.outputs, false);
         let part = |kind: &str, shape: &[usize], start| {
             let name = format!("{name}.{kind}");
             Part { name, shape: shape.to_vec(), start }

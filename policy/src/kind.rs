@@ -1,16 +1,18 @@
 //! Kinds of policy, and how one is read from a file that says which it is.
 
+use crate::actor_critic::ActorCriticShape;
 use crate::choice::Choice;
 use crate::diffusion::{ACTOR, CRITIC, DiffusionPolicy, DiffusionShape, VALUE};
 use crate::error::PolicyError;
 use crate::gaussian::{GaussianPolicy, GaussianShape};
+use crate::one_step::OneStepActor;
 use crate::planner::{self, Planner, PlannerShape};
 use crate::policy::Policy;
 use crate::precision::Precision;
 use crate::scaled::scaled;
 use crate::score::{FREQUENCIES, ScorePolicy, ScorePolicyShape};
 use crate::score_network::ScoreShape;
-use crate::squashed::{SquashedPolicy, SquashedShape};
+use crate::squashed::SquashedActor;
 use crate::weights::{Layout, Tensors, Weights, check_finite};
 use crate::window_networks::{WindowModel, WindowValue};
 use candle_core::safetensors::Load;
@@ -44,7 +46,15 @@ pub enum PolicyConfig {
     /// One of several samples of a tanh-squashed Gaussian.
     Squashed {
         /// Shape of its networks.
-        shape: SquashedShape,
+        shape: ActorCriticShape,
+        /// Which sample it is.
+        choice: Choice,
+    },
+    /// What a network says of state and noise, for one of several noises.
+    #[serde(rename = "one-step")]
+    OneStep {
+        /// Shape of its networks.
+        shape: ActorCriticShape,
         /// Which sample it is.
         choice: Choice,
     },
@@ -89,7 +99,11 @@ impl PolicyConfig {
                 shape.value().map(|value| add(VALUE, value.layout())).transpose()?;
             }
             Self::Squashed { shape, .. } => {
-                add(ACTOR, shape.actor().layout())?;
+                add(ACTOR, SquashedActor::shape(shape).layout())?;
+                add(CRITIC, shape.critics().layout())?;
+            }
+            Self::OneStep { shape, .. } => {
+                add(ACTOR, OneStepActor::shape(shape).layout())?;
                 add(CRITIC, shape.critics().layout())?;
             }
             Self::Gaussian { shape } => add(ACTOR, shape.actor().layout())?,
@@ -186,7 +200,12 @@ pub fn load_policy(file: &[u8], precision: Precision) -> Result<Box<dyn Policy>,
             Box::new(DiffusionPolicy::load(shape, choice, &mut tensors, precision)?)
         }
         PolicyConfig::Squashed { shape, choice } => {
-            Box::new(SquashedPolicy::load(&shape, choice, &mut tensors, precision)?)
+            let actor = (SquashedActor::shape as fn(&_) -> _, SquashedActor::new as fn(_) -> _);
+            Box::new(shape.load(actor, choice, &mut tensors, precision)?)
+        }
+        PolicyConfig::OneStep { shape, choice } => {
+            let actor = (OneStepActor::shape as fn(&_) -> _, OneStepActor::new as fn(_) -> _);
+            Box::new(shape.load(actor, choice, &mut tensors, precision)?)
         }
         PolicyConfig::Gaussian { shape } => Box::new(GaussianPolicy::load(shape, &mut tensors)?),
         PolicyConfig::Score { shape, choice } => Box::new(ScorePolicy::load(shape, choice, &mut tensors, precision)?),

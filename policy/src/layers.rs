@@ -20,6 +20,8 @@ pub(crate) struct Layers {
     widths: Vec<usize>,
     /// Whether a norm stands between the hidden layers' linear maps and their activations.
     pub norm: bool,
+    /// Whether it stands behind the activations instead.
+    pub norm_after: bool,
     /// What it adds to the variance.
     pub norm_epsilon: Epsilon,
     pub activation: Activation,
@@ -42,8 +44,9 @@ impl Layers {
     /// The first kernel lies at `start`.
     pub fn new(members: usize, inputs: usize, config: &MlpConfig, outputs: usize, start: usize) -> Self {
         let widths: Vec<usize> = [inputs].iter().chain(&config.hidden).chain(&[outputs]).copied().collect();
-        let MlpConfig { norm, norm_epsilon, activation, initial, .. } = *config;
-        let mut layers = Self { members, widths, norm, norm_epsilon, activation, initial, offsets: vec![start] };
+        let MlpConfig { norm, norm_after, norm_epsilon, activation, initial, .. } = *config;
+        let offsets = vec![start];
+        let mut layers = Self { members, widths, norm, norm_after, norm_epsilon, activation, initial, offsets };
         for layer in 0..layers.count() {
             let ((inputs, outputs), normed) = (layers.shape(layer), layers.is_normed(layer));
             let numbers = (inputs + if normed { 3 } else { 1 }) * outputs;
@@ -144,7 +147,7 @@ impl Layers {
         let mut parts = Vec::new();
         for layer in 0..self.count() {
             let (inputs, outputs) = self.shape(layer);
-            let (kernel, bias) = self.initial.of_layer(inputs, outputs);
+            let (kernel, bias) = self.initial.of_layer(inputs, outputs, layer + 1 == self.count());
             let mut push = |kind: &str, shape: &[usize], start| {
                 let members = leading.then_some(&self.members);
                 let shape = members.into_iter().chain(shape).copied().collect();

@@ -14,15 +14,16 @@
 //! - [`Weights`] (`weights`): a network's weights as one vector with named tensors in it; [`Gradients`] (`gradient`) of a loss
 //!   with respect to them; [`Adam`] (`optimiser`).
 //! - [`Policy`] (`policy`): what any policy can do; [`EpisodeState`] (`episode`): what it carries through an episode. `kind`
-//!   reads one from a file whose [`Header`] says what it is: [`DiffusionPolicy`] (`diffusion`), [`SquashedPolicy`]
-//!   (`squashed`) and [`ScorePolicy`] (`score`) take one of N_a samples (`candidates`), or the mean of some, by their [`Choice`]
+//!   reads one from a file whose [`Header`] says what it is: [`DiffusionPolicy`] (`diffusion`),
+//!   [`ScorePolicy`] (`score`), and with a [`SquashedActor`] (`squashed`) or a [`OneStepActor`] (`one_step`) those of an
+//!   [`ActorCriticShape`] (`actor_critic`) take one of N_a samples (`candidates`), or the mean of some, by their [`Choice`]
 //!   (`choice`), [`GaussianPolicy`] (`gaussian`) a mean; one with a [`Scaling`] is asked in its user's units (`scaled`).
 //! - [`WindowModel`] and [`WindowValue`] (`window_networks`): networks over windows of consecutive steps, of the layers in
 //!   `window_layers`, `convolution` and `group_norm`; `window` lists their tensors. [`Planner`] (`planner`) acts by plans that
 //!   `planning` draws with them.
 //! - [`Precision`] (`precision`): how exactly networks are evaluated that no gradient is taken of.
 //! - Below: `layers` (where each layer lies in the vector), `network` (one network on one tile of rows, over the crate
-//!   `kernels`), `saved` and `kept_gradient` (what forward and backward passes leave), `operation` (candle's custom
+//!   `kernels`, with the buffers of `workspace`), `saved` and `kept_gradient` (what forward and backward passes leave), `operation` (candle's custom
 //!   operations), `packed` (kernels packed once), `slices` (candle's tensors as slices), `gpu` (the same on a GPU), `device`
 //!   (a GPU to compute on), [`Recording`] (`recording`: its work, recorded), `statistics` (mean and variance over an ensemble).
 //!
@@ -31,6 +32,7 @@
 #![deny(unsafe_code)]
 
 mod action_gradients;
+mod actor_critic;
 mod candidates;
 mod choice;
 mod composed;
@@ -66,6 +68,7 @@ mod mlp;
 mod mlp_config;
 mod network;
 mod noise_predictor;
+mod one_step;
 mod operation;
 mod optimiser;
 mod packed;
@@ -90,7 +93,9 @@ mod weights;
 mod window;
 mod window_layers;
 mod window_networks;
+mod workspace;
 
+pub use actor_critic::ActorCriticShape;
 pub use choice::{Choice, Reduce, Rule};
 pub use device::open_gpu;
 pub use diffusion::{DiffusionPolicy, DiffusionShape};
@@ -104,6 +109,7 @@ pub use gradient::Gradients;
 pub use kind::{Header, PolicyConfig, load_policy, read_header, read_tensors, write_tensors};
 pub use mlp_config::{Epsilon, Initial, MlpConfig};
 pub use noise_predictor::NoisePredictor;
+pub use one_step::OneStepActor;
 pub use optimiser::{Adam, AdamStep, cosine_decay};
 pub use planner::{Guidance, Planner, PlannerShape};
 pub use planning::{Planning, with_first_state};
@@ -116,7 +122,7 @@ pub use schedule::{Reverse, Schedule};
 pub use score::{ScorePolicy, ScorePolicyShape};
 pub use score_network::{ScoreNetwork, ScoreShape};
 pub use shape::{EnsembleShape, NoiseShape};
-pub use squashed::{SquashedActor, SquashedPolicy, SquashedShape};
+pub use squashed::SquashedActor;
 pub use statistics::mean_and_variance;
 pub use weighted::Weighted;
 pub use weights::{Layout, Part, Start, Tensors, Weights, take};

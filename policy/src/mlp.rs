@@ -6,11 +6,12 @@
 use crate::composed::{Composed, Pass};
 use crate::kept_gradient::KeptGradient;
 use crate::layers::{Layers, TILE};
-use crate::network::{Input, Network, rows_of, with_workspace};
+use crate::network::{Input, Network, rows_of};
 use crate::plain;
 use crate::saved::{Lent, Pool, SavedActivations};
 use crate::slices::{has_fast_implementation, on_cpu, slice};
 use crate::weights::Weights;
+use crate::workspace::with_workspace;
 use candle_core::{CpuStorage, CustomOp2, Layout, Result, Shape, Tensor, bail};
 use quad_kernels::product::Packed;
 use rayon::prelude::*;

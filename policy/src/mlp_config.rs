@@ -21,6 +21,9 @@ pub struct MlpConfig {
     /// Whether a layer norm (Ba et al. 2016) stands before each activation.
     #[serde(default)]
     pub norm: bool,
+    /// Whether it stands after each activation instead.
+    #[serde(default, skip_serializing_if = "std::ops::Not::not")]
+    pub norm_after: bool,
     /// What the norm adds to the variance.
     #[serde(default, skip_serializing_if = "Epsilon::is_default")]
     pub norm_epsilon: Epsilon,
@@ -67,12 +70,23 @@ pub enum Initial {
     Orthonormal,
     /// PyTorch's: kernels and biases U(±1/√in).
     Torch,
+    /// ReBRAC's actor: kernels U(±1/√in), biases 0.1; the last layer's kernel and bias U(±0.001).
+    #[serde(rename = "rebrac-actor")]
+    RebracActor,
+    /// ReBRAC's critics, whose last layer is U(±0.003).
+    #[serde(rename = "rebrac-critic")]
+    RebracCritic,
 }
 
 impl Initial {
-    /// Initial values of a linear layer's kernel and bias.
-    pub(crate) fn of_layer(self, inputs: usize, outputs: usize) -> (Start, Start) {
+    /// Initial values of the kernel and bias of a linear layer, the last or another.
+    pub(crate) fn of_layer(self, inputs: usize, outputs: usize, last: bool) -> (Start, Start) {
         match self {
+            Self::RebracActor if last => (Start::Uniform(1e-3), Start::Uniform(1e-3)),
+            Self::RebracCritic if last => (Start::Uniform(3e-3), Start::Uniform(3e-3)),
+            Self::RebracActor | Self::RebracCritic => {
+                (Start::Uniform(1.0 / (inputs as f32).sqrt()), Start::Constant(0.1))
+            }
             Self::Xavier => (Start::Uniform((6.0 / (inputs + outputs) as f32).sqrt()), Start::Constant(0.0)),
             Self::Orthogonal => (Start::Orthogonal(std::f32::consts::SQRT_2), Start::Constant(0.0)),
             Self::Orthonormal => (Start::Orthogonal(1.0), Start::Constant(0.0)),
@@ -115,12 +129,25 @@ mod tests {
         let json = serde_json::to_string(&config).unwrap();
         assert!(json.contains(r#""norm_epsilon":"torch""#), "{json}");
         assert_eq!(serde_json::from_str::<MlpConfig>(&json).unwrap(), config);
-        assert!(!serde_json::to_string(&MlpConfig::mish(&[4])).unwrap().contains("epsilon"));
+        assert!(!serde_json::to_string(&MlpConfig::mish(&[4])).unwrap().contains("norm_"));
+    }
+
+    #[test]
+    fn rebrac_s_last_layer_begins_smaller_than_the_others() {
+        let shape = |initial| {
+            let layers = MlpConfig { initial, ..MlpConfig::mish(&[4]) };
+            crate::shape::EnsembleShape { members: 1, observation_dim: 16, action_dim: 0, layers, outputs: 2 }
+        };
+        for (initial, last) in [(Initial::RebracActor, 1e-3), (Initial::RebracCritic, 3e-3)] {
+            let starts: Vec<Start> = shape(initial).layout().parts().iter().map(|part| part.start).collect();
+            let (first, last) = ([Start::Uniform(0.25), Start::Constant(0.1)], [Start::Uniform(last); 2]);
+            assert_eq!(starts, [first, last].concat());
+        }
     }
 
     #[test]
     fn orthogonal_weights_have_the_gain_that_their_name_says() {
-        let gains = [Initial::Orthogonal, Initial::Orthonormal].map(|initial| initial.of_layer(3, 5).0);
+        let gains = [Initial::Orthogonal, Initial::Orthonormal].map(|initial| initial.of_layer(3, 5, false).0);
         assert_eq!(gains, [Start::Orthogonal(std::f32::consts::SQRT_2), Start::Orthogonal(1.0)]);
     }
 }

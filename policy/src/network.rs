@@ -6,12 +6,12 @@
 
 use crate::layers::{Layers, TILE};
 use crate::precision::Precision;
+use crate::workspace::{Activations, Workspace};
 use quad_kernels::Buffer;
 use quad_kernels::activation::{activate, activate_with_slope, multiply};
 use quad_kernels::narrow::{FirstLayer, dots, first_layer, scale_by_combination};
-use quad_kernels::norm::{kept, normalise, normalise_backward};
+use quad_kernels::norm::{kept, normalise, normalise_backward, shift_rows};
 use quad_kernels::product::{Packed, product, product_transposed};
-use std::cell::RefCell;
 
 /// Rows of a tile that are worked on together in a task whose products are rounded: these are so fast that activations must be in the nearest cache.
 const BLOCK: usize = 32;
@@ -40,75 +40,6 @@ pub(crate) struct Input<'a> {
     pub actions: &'a [f32],
     /// The first kernel's rows that multiply them: `a × width`.
     pub kernel: &'a [f32],
-}
-
-/// Activations of a tile's hidden layers, and their slopes; on the backward pass the gradients before the activations.
-pub(crate) struct Activations<'a> {
-    pub x: Vec<&'a mut [f32]>,
-    pub slope: Vec<&'a mut [f32]>,
-    /// What norms keep ([`quad_kernels::norm`]); empty without a norm.
-    pub norm: Vec<&'a mut [f32]>,
-}
-
-/// Buffers of one thread, grown to the largest tile it met.
-#[derive(Default)]
-pub(crate) struct Workspace {
-    pair: [Buffer; 2],
-    /// The output layer's kernel, transposed.
-    output: Buffer,
-    /// State part of the first layer.
-    base: Buffer,
-    /// Network output or its gradient.
-    out: Buffer,
-    x: Vec<Buffer>,
-    slope: Vec<Buffer>,
-    norm: Vec<Buffer>,
-    /// What a norm keeps when no gradient is taken.
-    not_kept: Buffer,
-}
-
-thread_local! {
-    static WORKSPACE: RefCell<Workspace> = RefCell::default();
-}
-
-/// Lends the thread's workspace. Not re-entrant: a task that holds it must not start others.
-pub(crate) fn with_workspace<R>(work: impl FnOnce(&mut Workspace) -> R) -> R {
-    WORKSPACE.with_borrow_mut(work)
-}
-
-impl Workspace {
-    /// Lends the buffer of the state part, `len` numbers, and that of the output, `out` numbers, beside the others.
-    pub fn with_base<R>(
-        &mut self,
-        len: usize,
-        out: usize,
-        work: impl FnOnce(&mut [f32], &mut [f32], &mut Self) -> R,
-    ) -> R {
-        let (mut base, mut outputs) = (std::mem::take(&mut self.base), std::mem::take(&mut self.out));
-        let result = work(base.sized(len), outputs.sized(out), self);
-        (self.base, self.out) = (base, outputs);
-        result
-    }
-
-    /// Lends room for the activations of `rows` rows, for a tile whose gradients are taken at once.
-    pub fn with_activations<R>(
-        &mut self,
-        rows: usize,
-        layers: &Layers,
-        work: impl FnOnce(&mut Activations<'_>, &mut Self) -> R,
-    ) -> R {
-        let mut all = [&mut self.x, &mut self.slope, &mut self.norm].map(std::mem::take);
-        let widths = layers.hidden();
-        all.iter_mut().for_each(|buffers| buffers.resize_with(widths.len().max(buffers.len()), Buffer::default));
-        let [x, slope, norm] = &mut all;
-        let normed = if layers.norm { widths } else { &[] };
-        let x = x.iter_mut().zip(widths).map(|(buffer, width)| buffer.sized(rows * width)).collect();
-        let slope = slope.iter_mut().zip(widths).map(|(buffer, width)| buffer.sized(rows * width)).collect();
-        let norm = norm.iter_mut().zip(normed).map(|(buffer, width)| buffer.sized(kept(rows, *width))).collect();
-        let result = work(&mut Activations { x, slope, norm }, self);
-        [self.x, self.slope, self.norm] = all;
-        result
-    }
 }
 
 impl<'a> Network<'a> {
@@ -194,12 +125,15 @@ impl<'a> Network<'a> {
             let first = FirstLayer { base, repeat, shift, actions, kernel };
             let out_of_first = x.sized(count * width);
             match self.norm(0) {
-                None => first_layer(Some(self.layers.activation), &first, out_of_first),
-                Some([scale, shift]) => {
+                Some([scale, shift]) if !self.layers.norm_after => {
                     first_layer(None, &first, out_of_first);
                     let room = work.not_kept.sized(kept(count, width));
                     normalise(out_of_first, None, scale, self.layers.epsilon(), room);
                     activate(self.layers.activation, out_of_first, shift);
+                }
+                _ => {
+                    first_layer(Some(self.layers.activation), &first, out_of_first);
+                    self.normalise_after(0, out_of_first, || work.not_kept.sized(kept(count, width)));
                 }
             }
             for layer in 1..last {
@@ -212,6 +146,7 @@ impl<'a> Network<'a> {
                 }
                 let bias = self.normalise(layer, y, || work.not_kept.sized(kept(count, width)));
                 activate(self.layers.activation, y, bias);
+                self.normalise_after(layer, y, || work.not_kept.sized(kept(count, width)));
             }
             let width = self.layers.shape(last).0;
             let x = if last % 2 == 1 { &mut *x } else { &mut *y };
@@ -229,38 +164,63 @@ impl<'a> Network<'a> {
             product(x, self.kernel(layer), here[0], inputs, width);
             let bias = self.normalise(layer, here[0], || left.norm[layer]);
             activate_with_slope(self.layers.activation, here[0], bias, left.slope[layer]);
+            self.normalise_after(layer, here[0], || left.norm[layer]);
         }
         dots(left.x[last - 1], self.output_rows(&mut work.output), self.bias(last), out, self.layers.shape(last).0);
     }
 
-    /// Adds the bias of a layer that has a norm, and normalises. Gives what is to be added before the activation.
+    /// Adds the bias of a layer that has a norm before its activation, and normalises. Gives what is to be added before the
+    /// activation.
     fn normalise<'b>(&self, layer: usize, x: &mut [f32], keep: impl FnOnce() -> &'b mut [f32]) -> &'a [f32] {
         let bias = self.bias(layer);
-        let Some([scale, shift]) = self.norm(layer) else { return bias };
-        normalise(x, Some(bias), scale, self.layers.epsilon(), keep());
-        shift
+        match self.norm(layer) {
+            Some([scale, shift]) if !self.layers.norm_after => {
+                normalise(x, Some(bias), scale, self.layers.epsilon(), keep());
+                shift
+            }
+            _ => bias,
+        }
+    }
+
+    /// Normalises what follows the activation of a layer that has a norm there.
+    fn normalise_after<'b>(&self, layer: usize, x: &mut [f32], keep: impl FnOnce() -> &'b mut [f32]) {
+        if let Some([scale, shift]) = self.norm(layer).filter(|_| self.layers.norm_after) {
+            normalise(x, None, scale, self.layers.epsilon(), keep());
+            shift_rows(x, shift);
+        }
     }
 
     /// Turns the slopes of a tile into the gradients δ before each activation and norm, given that of the output.
     pub fn backward(&self, output_gradient: &[f32], left: &mut Activations<'_>, work: &mut Workspace) {
         let last = self.last();
         let Activations { slope, norm, .. } = left;
-        let mut through_norm = |layer: usize, delta: &mut [f32]| {
-            if let Some([scale, _]) = self.norm(layer) {
+        let after = self.layers.norm_after;
+        let mut through_norm = |layer: usize, here: bool, delta: &mut [f32]| {
+            if let Some([scale, _]) = self.norm(layer).filter(|_| here) {
                 normalise_backward(delta, scale, norm[layer]);
             }
         };
         let output = self.output_rows(&mut work.output);
-        scale_by_combination(slope[last - 1], output_gradient, output, self.layers.shape(last).0);
-        through_norm(last - 1, slope[last - 1]);
+        let (top, width) = (&mut *slope[last - 1], self.layers.shape(last).0);
+        if self.layers.norm && after {
+            let temporary = work.pair[0].sized(top.len());
+            temporary.fill(1.0);
+            scale_by_combination(temporary, output_gradient, output, width);
+            through_norm(last - 1, true, temporary);
+            multiply(top, temporary);
+        } else {
+            scale_by_combination(top, output_gradient, output, width);
+            through_norm(last - 1, true, top);
+        }
         for layer in (1..last).rev() {
             let (inputs, width) = self.layers.shape(layer);
             let (below, above) = slope.split_at_mut(layer);
             let (below, above) = (&mut *below[layer - 1], &*above[0]);
             let temporary = work.pair[0].sized(below.len());
             product_transposed(above, self.kernel(layer), temporary, inputs, width);
+            through_norm(layer - 1, after, temporary);
             multiply(below, temporary);
-            through_norm(layer - 1, below);
+            through_norm(layer - 1, !after, below);
         }
     }
 

@@ -22,6 +22,7 @@ pub(crate) fn activate(f: Activation, x: &Tensor) -> Result<Tensor> {
         Activation::Relu => x.relu()? + (x * 0.0)?,
         Activation::Silu => x.silu(),
         Activation::Tanh => x.tanh(),
+        Activation::Gelu => x.gelu(),
     }
 }
 
@@ -45,12 +46,19 @@ pub(crate) fn mlp(weights: &Tensors, prefix: &str, layers: &Layers, x: &Tensor) 
     let mut x = x.clone();
     for layer in 0..layers.count() {
         x = x.contiguous()?.broadcast_matmul(&get(layer, "kernel")?)?.broadcast_add(&get(layer, "bias")?)?;
-        if layer + 1 < layers.count() {
-            if layers.norm {
-                x = layer_norm(&x, &get(layer, "scale")?, &get(layer, "shift")?, layers.norm_epsilon.value())?;
-            }
-            x = activate(layers.activation, &x)?;
+        if layer + 1 == layers.count() {
+            break;
         }
+        if !layers.norm {
+            x = activate(layers.activation, &x)?;
+            continue;
+        }
+        let norm =
+            |x: &Tensor| layer_norm(x, &get(layer, "scale")?, &get(layer, "shift")?, layers.norm_epsilon.value());
+        x = match layers.norm_after {
+            false => activate(layers.activation, &norm(&x)?)?,
+            true => norm(&activate(layers.activation, &x)?)?,
+        };
     }
     Ok(x)
 }

@@ -3,8 +3,9 @@
 
 use crate::layers::TILE;
 use crate::mlp::{Kernels, Mlp, of_member};
-use crate::network::{Input, Network, rows_of, with_workspace};
+use crate::network::{Input, Network, rows_of};
 use crate::operation::{Arguments, Operation};
+use crate::workspace::with_workspace;
 
 use crate::schedule::Schedule;
 use crate::shape::{NoiseShape, TIME_EMBEDDING};

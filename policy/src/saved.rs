@@ -1,7 +1,7 @@
 //! What a forward pass leaves behind for its backward pass, and the weights' gradient made of it.
 
 use crate::layers::{LayerMut, Layers, TILE};
-use crate::network::Activations;
+use crate::workspace::Activations;
 use quad_kernels::Buffer;
 use quad_kernels::activation::column_sums;
 use quad_kernels::norm::kept;

@@ -1,63 +1,28 @@
 //! The squashed Gaussian policy: its candidates are tanh(u), where u is normal and a network of the state gives its mean and
 //! log σ. Of these it takes one by what critics say of them.
 
-use crate::candidates::{Actor, CandidatePolicy, Networks};
-use crate::choice::Choice;
+use crate::actor_critic::ActorCriticShape;
+use crate::candidates::Actor;
 use crate::ensemble::Ensemble;
-use crate::error::{MOST, PolicyError, check_range};
-use crate::mlp_config::MlpConfig;
-use crate::precision::Precision;
 use crate::shape::EnsembleShape;
-use crate::weighted::Weighted;
-use crate::weights::Tensors;
 use candle_core::Tensor;
-use serde::{Deserialize, Serialize};
-
-/// Before the names of the networks' tensors.
-const ACTOR: &str = "actor.";
-const CRITIC: &str = "critic.";
-
-/// The shapes of a squashed Gaussian policy's networks.
-#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
-#[serde(deny_unknown_fields)]
-pub struct SquashedShape {
-    /// Numbers in an observation s.
-    pub observation_dim: usize,
-    /// Numbers in an action a.
-    pub action_dim: usize,
-    /// The hidden layers of the network that gives mean and log σ.
-    pub actor: MlpConfig,
-    /// The critics' hidden layers.
-    pub critic: MlpConfig,
-    /// Ensemble size K.
-    pub critics: usize,
-}
-
-impl SquashedShape {
-    /// Bounds of log σ.
-    pub const LOG_STD: (f32, f32) = (-5.0, 2.0);
-
-    /// Shape of the network of which the mean comes first, then log σ.
-    pub fn actor(&self) -> EnsembleShape {
-        let Self { observation_dim, action_dim, .. } = *self;
-        let layers = self.actor.clone();
-        EnsembleShape { members: 1, observation_dim, action_dim: 0, layers, outputs: 2 * action_dim }
-    }
-
-    /// Shape of the critics.
-    pub fn critics(&self) -> EnsembleShape {
-        let Self { observation_dim, action_dim, critics, .. } = *self;
-        EnsembleShape { members: critics, observation_dim, action_dim, layers: self.critic.clone(), outputs: 1 }
-    }
-}
 
 /// A network that draws such candidates.
 pub struct SquashedActor(Ensemble);
 
 impl SquashedActor {
-    /// Draws with a network of the shape [`SquashedShape::actor`].
+    /// Bounds of log σ.
+    pub const LOG_STD: (f32, f32) = (-5.0, 2.0);
+
+    /// Draws with a network of [`Self::shape`].
     pub fn new(network: Ensemble) -> Self {
         Self(network)
+    }
+
+    /// Shape of the network of which the mean comes first, then log σ.
+    pub fn shape(of: &ActorCriticShape) -> EnsembleShape {
+        let ActorCriticShape { observation_dim, action_dim, .. } = *of;
+        EnsembleShape { members: 1, observation_dim, action_dim: 0, layers: of.actor.clone(), outputs: 2 * action_dim }
     }
 
     /// Actions `[rows, a]` in the states of `observations`, `[n, o]`, with standard normal `noise`, `[rows, a]`; equally many
@@ -69,7 +34,7 @@ impl SquashedActor {
         let (rows, a) = noise.dims2()?;
         let out = self.0.state_outputs(observations)?.detach().transpose(0, 1)?; // [n, 1, 2a]
         let (mean, log_std) = (out.narrow(2, 0, a)?, out.narrow(2, a, a)?);
-        let std = log_std.clamp(SquashedShape::LOG_STD.0, SquashedShape::LOG_STD.1)?.exp()?;
+        let std = log_std.clamp(Self::LOG_STD.0, Self::LOG_STD.1)?.exp()?;
         let noise = noise.reshape((out.dim(0)?, (), a))?;
         noise.broadcast_mul(&std)?.broadcast_add(&mean)?.tanh()?.reshape((rows, a))
     }
@@ -95,42 +60,16 @@ impl Actor for SquashedActor {
     }
 }
 
-/// The squashed Gaussian policy, of an actor and critics.
-pub struct SquashedPolicy;
-
-impl SquashedPolicy {
-    /// The tensors of a policy of these networks, as they are named in a file.
-    ///
-    /// # Errors
-    /// Candle fails.
-    pub fn tensors(actor: &Ensemble, critics: &Ensemble) -> candle_core::Result<Tensors> {
-        let mut tensors = actor.weights().tensors(ACTOR)?;
-        tensors.extend(critics.weights().tensors(CRITIC)?);
-        Ok(tensors)
-    }
-
-    pub(crate) fn load(
-        shape: &SquashedShape,
-        choice: Choice,
-        tensors: &mut Tensors,
-        precision: Precision,
-    ) -> Result<CandidatePolicy, PolicyError> {
-        check_range("observation_dim", shape.observation_dim, MOST)?;
-        check_range("action_dim", shape.action_dim, MOST)?;
-        check_range("critics", shape.critics, MOST)?;
-        let actor = SquashedActor(Ensemble::take(shape.actor(), tensors, ACTOR, precision)?);
-        let critics = Ensemble::take(shape.critics(), tensors, CRITIC, precision)?;
-        CandidatePolicy::new(Networks { actor: Box::new(actor), critics, value: None }, choice, precision)
-    }
-}
-
 #[cfg(test)]
 #[allow(clippy::unwrap_used)]
 mod tests {
     use super::*;
-    use crate::choice::{Reduce, Rule};
+    use crate::choice::{Choice, Reduce, Rule};
+    use crate::error::PolicyError;
     use crate::kind::{Header, PolicyConfig, load_policy};
+    use crate::mlp_config::MlpConfig;
     use crate::policy::{Policy, Sampled};
+    use crate::precision::Precision;
     use candle_core::Device;
 
     const CHOICE: Choice =
@@ -140,7 +79,7 @@ mod tests {
     fn policy() -> Box<dyn Policy> {
         let layers = MlpConfig { activation: crate::Activation::Relu, ..MlpConfig::mish(&[2]) };
         let shape =
-            SquashedShape { observation_dim: 1, action_dim: 2, actor: layers.clone(), critic: layers, critics: 2 };
+            ActorCriticShape { observation_dim: 1, action_dim: 2, actor: layers.clone(), critic: layers, critics: 2 };
         let tensor = |numbers: &[f32], dims: &[usize]| Tensor::from_slice(numbers, dims, &Device::Cpu).unwrap();
         // relu(x) and relu(−x), put together again.
         let actor = [

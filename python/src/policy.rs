@@ -238,13 +238,14 @@ impl PyPolicy {
         self.origin.step
     }
 
-    /// "diffusion", "squashed" (a Gaussian through a tanh) or "score" (SfBC's), which draw actions and choose; "planner", which
+    /// "diffusion", "squashed" (a Gaussian through a tanh), "one-step" (FQL's) or "score" (SfBC's), which draw actions and choose; "planner", which
     /// draws plans and chooses one; or "gaussian", which acts by its mean.
     #[getter]
     fn kind(&self) -> &'static str {
         match self.config {
             PolicyConfig::Diffusion { .. } => "diffusion",
             PolicyConfig::Squashed { .. } => "squashed",
+            PolicyConfig::OneStep { .. } => "one-step",
             PolicyConfig::Gaussian { .. } => "gaussian",
             PolicyConfig::Score { .. } => "score",
             PolicyConfig::Planner { .. } => "planner",

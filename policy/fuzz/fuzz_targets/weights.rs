@@ -8,8 +8,8 @@ use std::path::Path;
 use candle_core::{Device, Tensor};
 use libfuzzer_sys::fuzz_target;
 use quad_policy::{
-    Affine, Choice, DiffusionShape, GaussianShape, Header, Layout, MlpConfig, PolicyConfig, Precision, Rule, Scaling,
-    ScorePolicyShape, SquashedShape, load_policy,
+    ActorCriticShape, Affine, Choice, DiffusionShape, GaussianShape, Header, Layout, MlpConfig, PolicyConfig,
+    Precision, Rule, Scaling, ScorePolicyShape, load_policy,
 };
 
 const STATES: usize = 2;
@@ -34,7 +34,7 @@ fn write_seeds() {
     let (best, nearest) = (diffusion(Rule::Best), diffusion(Rule::Nearest));
     let softmax = diffusion(Rule::Softmax { temperature: 0.5 });
     let (actor, critic) = (layers.clone(), MlpConfig { norm: true, ..layers.clone() });
-    let shape = SquashedShape { observation_dim: 2, action_dim: 1, actor, critic, critics: 2 };
+    let shape = ActorCriticShape { observation_dim: 2, action_dim: 1, actor, critic, critics: 2 };
     let choice = Choice { rule: Rule::Softmax { temperature: 0.5 }, ..Choice::best_of(2) };
     let squashed = file(PolicyConfig::Squashed { shape, choice }, None);
     let (actor, critic) = (layers.clone(), layers.clone());

@@ -7,13 +7,13 @@ from typing import Any
 from onnx import ModelProto
 
 from quad_rl._quad_rl import Policy
-from quad_rl.onnx import diffusion, gaussian, planner, score, squashed
+from quad_rl.onnx import diffusion, gaussian, one_step, planner, score, squashed
 from quad_rl.onnx.choosing import choose
 from quad_rl.onnx.file import File
 from quad_rl.onnx.graph import Graph, Value
 from quad_rl.onnx.mlp import of_actions, of_states
 
-DRAW = {"diffusion": diffusion.draw, "score": score.draw, "squashed": squashed.draw}
+DRAW = {"diffusion": diffusion.draw, "one-step": one_step.draw, "score": score.draw, "squashed": squashed.draw}
 
 
 def to_network(file: File, observations: Value) -> Value:

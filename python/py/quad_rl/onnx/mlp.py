@@ -9,6 +9,8 @@ import numpy as np
 from quad_rl.onnx.file import Array, File
 from quad_rl.onnx.graph import Value
 
+_TWICE = 2 * np.sqrt(2 / np.pi)
+
 
 def activate(name: str, x: Value) -> Value:
     if name == "mish":
@@ -16,6 +18,9 @@ def activate(name: str, x: Value) -> Value:
         e = x.graph("Exp", x.graph("Min", x, 20.0))
         n = e * (e + 2.0)
         return x * (n / (n + 2.0))
+    if name == "gelu":
+        # The tanh form of x·Φ(x), as x·σ(2u).
+        return x * x.graph("Sigmoid", x * (x * x * (0.044715 * _TWICE) + _TWICE))
     return x * x.graph("Sigmoid", x) if name == "silu" else x.graph({"relu": "Relu", "tanh": "Tanh"}[name], x)
 
 
@@ -38,10 +43,13 @@ def layers(file: File, prefix: str, config: dict[str, Any], x: Value) -> Value:
             array = file[f"{prefix}{layer}.{kind}"]
             return array if array.ndim == 1 or kind == "kernel" else array[:, None]
 
-        if config["norm"]:
+        def normed(x: Value, after: bool) -> Value:
+            if not config["norm"] or config.get("norm_after", False) != after:
+                return x
             epsilon = 1e-5 if config.get("norm_epsilon") == "torch" else 1e-6
-            x = layer_norm(x, tensor(i, "scale"), tensor(i, "shift"), epsilon)
-        x = activate(config["activation"], x) @ tensor(i + 1, "kernel") + tensor(i + 1, "bias")
+            return layer_norm(x, tensor(i, "scale"), tensor(i, "shift"), epsilon)
+
+        x = normed(activate(config["activation"], normed(x, False)), True) @ tensor(i + 1, "kernel") + tensor(i + 1, "bias")
     return x
 
 
@@ -51,10 +59,13 @@ def of_states(file: File, prefix: str, config: dict[str, Any], observations: Val
     return layers(file, prefix, config, first)
 
 
-def of_actions(file: File, prefix: str, config: dict[str, Any], observations: Value, actions: Value, each: int) -> Value:
-    """An ensemble's values, [K, n, each], of observations [n, o] and so many actions in each, [n, each, a]."""
+def of_actions(
+    file: File, prefix: str, config: dict[str, Any], observations: Value, actions: Value, each: int, outputs: int = 1
+) -> Value:
+    """What an ensemble gives, [K, n, each] or [K, n, each, outputs], of observations [n, o] and so many actions in each, [n, each, a]."""
     kernel, bias = file[f"{prefix}0.kernel"], file[f"{prefix}0.bias"]
     (members, _, width), a = kernel.shape, file.shape["action_dim"]
     state = (observations @ kernel[:, :-a] + bias[:, None]).reshape(members, -1, 1, width)
     action = (actions.reshape(-1, a) @ kernel[:, -a:]).reshape(members, -1, each, width)
-    return layers(file, prefix, config, (state + action).reshape(members, -1, width)).reshape(members, -1, each)
+    out = layers(file, prefix, config, (state + action).reshape(members, -1, width))
+    return out.reshape(members, -1, each, *([outputs] if outputs > 1 else []))
