@@ -22,7 +22,7 @@ EPISODES=20
 CANDIDATES=
 
 seeds="0 1 2"
-methods="bc quad iql align-iql dql ivr xql onestep cql dtql sfbc diffuser td3-bc idql"
+methods="bc quad iql align-iql dql ivr xql onestep cql dtql sfbc diffuser td3-bc rebrac idql fql"
 while [ $# -gt 1 ]; do
   case $1 in
     --seeds) seeds=$2 ;;

@@ -13,8 +13,8 @@ use super::parts::Parts;
 use candle_core::{Device, Tensor};
 use quad_dataset::{Arrays, Transitions};
 use quad_policy::{
-    ActorCriticShape, Choice, Ensemble, EnsembleShape, Header, Layout, NoisePredictor, OneStepActor, PolicyConfig,
-    Precision, Reverse, Schedule, SquashedActor, Tensors, Weights, load_policy, open_gpu, read_tensors,
+    Choice, Ensemble, EnsembleShape, Header, Layout, NoisePredictor, OneStepActor, PolicyConfig, Precision, Reverse,
+    Schedule, SquashedActor, Tensors, Weights, load_policy, open_gpu, read_tensors,
 };
 pub(super) use reader::{Golden, MAKE, goldens, run};
 

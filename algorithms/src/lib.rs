@@ -17,6 +17,7 @@ mod diffusion;
 mod dql;
 mod dtql;
 mod fqe;
+mod fql;
 mod gaussian;
 mod hyperparameters;
 mod idql;
@@ -29,10 +30,12 @@ mod phases;
 mod pool;
 mod quad;
 mod random;
+mod rebrac;
 mod replay;
 mod returns;
 mod sfbc;
 mod squashed;
+mod td3;
 mod td3bc;
 mod trained;
 mod values;
@@ -47,7 +50,7 @@ pub use parts::Parts;
 pub use values::{Values, fits, merge};
 
 /// All algorithms, the one that learns unless another is asked for first.
-pub const ALGORITHMS: [Definition; 13] = [
+pub const ALGORITHMS: [Definition; 15] = [
     quad::DEFINITION,
     iql::DEFINITION,
     align_iql::DEFINITION,
@@ -55,9 +58,11 @@ pub const ALGORITHMS: [Definition; 13] = [
     diffuser::DEFINITION,
     dql::DEFINITION,
     dtql::DEFINITION,
+    fql::DEFINITION,
     idql::DEFINITION,
     ivr::DEFINITION,
     onestep::DEFINITION,
+    rebrac::DEFINITION,
     sfbc::DEFINITION,
     td3bc::DEFINITION,
     xql::DEFINITION,

@@ -21,6 +21,9 @@ pub enum RewardRule {
     /// `10(r - 0.5)`: CQL's rule for AntMaze. Rewards of 0 and 1 become -5 and 5.
     #[serde(rename = "centre-times-10")]
     CentreTimes10,
+    /// `100r`: ReBRAC's rule for AntMaze.
+    #[serde(rename = "times-100")]
+    Times100,
 }
 
 /// Training rewards as a function of recorded ones: `(r - subtract) · times`.
@@ -52,6 +55,7 @@ impl RewardRule {
             Self::Subtract1 => (1.0, 1.0),
             Self::CentreTimes4 => (0.5, 4.0),
             Self::CentreTimes10 => (0.5, 10.0),
+            Self::Times100 => (0.0, 100.0),
         };
         Some(RewardScaling { subtract, times })
     }
@@ -70,6 +74,7 @@ mod tests {
             ("subtract-1", -1.0, 0.0),
             ("centre-times-4", -2.0, 2.0),
             ("centre-times-10", -5.0, 5.0),
+            ("times-100", 0.0, 100.0),
         ] {
             let rule: RewardRule = serde_json::from_value(name.into()).unwrap();
             let scaling = rule.scaling(&[3.0, -1.0, 0.5]).unwrap();

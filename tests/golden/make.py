@@ -21,6 +21,7 @@ import diffuser
 import dql
 import dtql
 import fqe
+import fql
 import iql
 import ivr
 import onestep
@@ -68,8 +69,12 @@ FOLDERS = {
     "fqe": (50, "fqe", "small"),
     "td3-bc": (51, "td3-bc", "small"),
     "td3-bc-critic": (52, "td3-bc-critic", "small"),
+    "rebrac": (54, "rebrac", "small"),
+    "rebrac-critic": (55, "rebrac-critic", "small"),
+    "fql": (56, "fql", "small"),
+    "fql-normalised": (57, "fql-normalised", "small"),
 }
-MODULES = quad, iql, ivr, xql, dql, align_iql, onestep, cql, dtql, sfbc, diffuser, fqe, td3bc
+MODULES = quad, iql, ivr, xql, dql, align_iql, onestep, cql, dtql, sfbc, diffuser, fqe, td3bc, fql
 ALGORITHMS = {variant: algorithm for algorithm in MODULES for variant in algorithm.VARIANTS}
 
 

@@ -26,7 +26,7 @@ def compiled(function):
     """The function, compiled once for each shape of its arguments, each activation, and each number of groups or heads of
     attention; it gives NumPy arrays.
     """
-    static = [name for name in inspect.signature(function).parameters if name.endswith(("activation", "groups", "attention"))]
+    static = [name for name in inspect.signature(function).parameters if name.endswith(("activation", "groups", "attention", "after"))]
     fast = jax.jit(function, static_argnames=static)
     return lambda *arguments: jax.tree.map(np.asarray, fast(*arguments))
 
@@ -38,7 +38,11 @@ def mish(x):
     return x * jnp.tanh(jnp.logaddexp(x, 0.0))
 
 
-ACTIVATIONS = {"mish": mish, "relu": jax.nn.relu, "silu": jax.nn.silu, "tanh": jnp.tanh}
+def gelu(x):
+    return 0.5 * x * (1 + jnp.tanh(math.sqrt(2 / math.pi) * (x + 0.044715 * x**3)))
+
+
+ACTIVATIONS = {"mish": mish, "relu": jax.nn.relu, "silu": jax.nn.silu, "tanh": jnp.tanh, "gelu": gelu}
 
 
 def normalised(x, epsilon):
@@ -46,24 +50,27 @@ def normalised(x, epsilon):
     return (x - x.mean(-1, keepdims=True)) / jnp.sqrt(x.var(-1, keepdims=True) + epsilon)
 
 
-def mlp(parameters, prefix, activation, x, epsilon=1e-6):
+def mlp(parameters, prefix, activation, x, epsilon=1e-6, after=False):
+    """Layers; what is normalised is before its activation, or after."""
     last = sum(bool(re.fullmatch(rf"{prefix}\d+\.kernel", name)) for name in parameters) - 1
     for i in range(last + 1):
         x = x @ parameters[f"{prefix}{i}.kernel"] + parameters[f"{prefix}{i}.bias"]
+        if i == last:
+            return x
+        x = ACTIVATIONS[activation](x) if after else x
         if f"{prefix}{i}.scale" in parameters:
             x = parameters[f"{prefix}{i}.scale"] * normalised(x, epsilon) + parameters[f"{prefix}{i}.shift"]
-        x = ACTIVATIONS[activation](x) if i < last else x
-    return x
+        x = x if after else ACTIVATIONS[activation](x)
 
 
-def ensemble(networks, x, activation, epsilon=1e-6):
+def ensemble(networks, x, activation, epsilon=1e-6, after=False):
     """The outputs of all members of an ensemble of MLPs for the same inputs [..., in], as [K, ..., out]."""
-    return jax.vmap(lambda network: mlp(network, "", activation, x, epsilon))(networks)
+    return jax.vmap(lambda network: mlp(network, "", activation, x, epsilon, after))(networks)
 
 
-def values(critics, states, actions, activation, epsilon=1e-6):
+def values(critics, states, actions, activation, epsilon=1e-6, after=False):
     """Q_k(s, a) of the whole ensemble, [K, ...]."""
-    return ensemble(critics, jnp.concatenate([states, actions], -1), activation, epsilon)[..., 0]
+    return ensemble(critics, jnp.concatenate([states, actions], -1), activation, epsilon, after)[..., 0]
 
 
 fast_values = compiled(values)

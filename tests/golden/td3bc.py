@@ -1,4 +1,6 @@
-"""One update of TD3+BC (Fujimoto and Gu 2021), in the order of its authors' code: with its policy's step, or without."""
+"""One update of TD3+BC (Fujimoto and Gu 2021), in the order of its authors' code, or of ReBRAC (Tarasov et al. 2023), in that of
+CORL: with its policy's step, or without.
+"""
 
 import implicit
 import jax
@@ -8,11 +10,10 @@ from implicit import CRITICS, SIZES, critic_gradient, fast_action, mean_action, 
 
 from networks import adam_step, compiled, fast_values, follow, near, random_moments, random_network, shape, single, values
 
-# The step: the policy moves in every second one, counted from 1.
-VARIANTS = {"td3-bc": 701, "td3-bc-critic": 700}
+# The step: in every second one the policy moves, too; TD3+BC counts from 1.
+VARIANTS = {"td3-bc": 701, "td3-bc-critic": 700, "rebrac": 700, "rebrac-critic": 701}
 AGENT = {
     "gamma": 0.99,
-    "weight": 2.5,
     "target_noise": 0.2,
     "target_noise_limit": 0.25,
     "actor_learning_rate": 0.02,
@@ -25,18 +26,37 @@ AGENT = {
 def make_config(variant, size):
     hidden, activation = SIZES[size]["hidden"], "mish" if size == "hopper" else "relu"
     networks = dict.fromkeys(("actor", "critic"), shape([hidden, hidden], activation))
-    return implicit.make_config("td3-bc", size, networks | AGENT) | {"step": VARIANTS[variant]}
+    if variant.startswith("td3-bc"):
+        return implicit.make_config("td3-bc", size, networks | AGENT | {"weight": 2.5}) | {"step": VARIANTS[variant]}
+    networks["critic"] = shape([hidden, hidden], activation, True) | {"norm_after": True}
+    own = {"actor_penalty": 0.4, "critic_penalty": 0.2}
+    return implicit.make_config("rebrac", size, networks | AGENT | own) | {"step": VARIANTS[variant]}
 
 
 def actor_losses(actor, critics, states, actions, weight, activation):
-    """The actor's loss, and the distance to the data in it."""
+    """TD3+BC's: the actor's loss, and the distance to the data in it."""
     taken = mean_action(actor, states, activation)
     q = values(critics, states, taken, activation)[0]
     distance = jnp.mean((taken - actions) ** 2)
     return -weight / jax.lax.stop_gradient(jnp.mean(jnp.abs(q))) * jnp.mean(q) + distance, distance
 
 
+def penalised_losses(actor, critics, states, actions, penalty, activation):
+    """ReBRAC's."""
+    taken = mean_action(actor, states, activation)
+    q = jnp.min(values(critics, states, taken, activation, after=True), 0)
+    distance = jnp.sum((taken - actions) ** 2, -1)
+    scale = jax.lax.stop_gradient(1 / jnp.mean(jnp.abs(q)))
+    return jnp.mean(penalty * distance - scale * q), jnp.mean(distance)
+
+
+def normed_critic_loss(critics, states, actions, targets, activation):
+    return jnp.sum(jnp.mean((values(critics, states, actions, activation, after=True) - targets) ** 2, 1))
+
+
 actor_gradient = compiled(jax.value_and_grad(actor_losses, has_aux=True))
+penalised_gradient = compiled(jax.value_and_grad(penalised_losses, has_aux=True))
+normed_critic_gradient = compiled(jax.value_and_grad(normed_critic_loss))
 
 
 def noisy_actions(config, state, inputs):
@@ -47,18 +67,22 @@ def noisy_actions(config, state, inputs):
 
 def update(config, state, inputs):
     agent, s, a, step = config["agent"], inputs["observations"], inputs["actions"], config["step"]
-    activation = agent["critic"]["activation"]
+    activation, rebrac = agent["critic"]["activation"], config["algorithm"] == "rebrac"
     next_actions = np.clip(noisy_actions(config, state, inputs), -1, 1)
-    next_q = fast_values(state["target_critic"], inputs["next_observations"], next_actions, activation).min(0)
+    next_q = fast_values(state["target_critic"], inputs["next_observations"], next_actions, activation, 1e-6, rebrac).min(0)
+    if rebrac:
+        next_q = next_q - agent["critic_penalty"] * ((next_actions - inputs["next_actions"]) ** 2).sum(-1)
     targets = inputs["rewards"] + agent["gamma"] * inputs["masks"] * next_q
-    critic_loss, gradients = critic_gradient(state["critic"], s, a, targets, activation)
+    critic_loss, gradients = (normed_critic_gradient if rebrac else critic_gradient)(state["critic"], s, a, targets, activation)
     out = state | adam_step(state, "critic", gradients, agent["critic_learning_rate"], step)
     out |= {"targets": targets, "q_mean": targets.mean(), "critic_loss": critic_loss}
-    if (step + 1) % agent["actor_every"] == 0:
-        (loss, distance), gradients = actor_gradient(state["actor"], out["critic"], s, a, agent["weight"], activation)
+    if step % agent["actor_every"] == (0 if rebrac else agent["actor_every"] - 1):
+        moved, weight = (penalised_gradient, "actor_penalty") if rebrac else (actor_gradient, "weight")
+        (loss, distance), gradients = moved(state["actor"], out["critic"], s, a, agent[weight], activation)
         out |= adam_step(state, "actor", gradients, agent["actor_learning_rate"], step // agent["actor_every"])
         out["target_critic"] = follow(state["target_critic"], out["critic"], agent["ema_rate"])
-        out["target_actor"] = follow(state["target_actor"], out["actor"], agent["ema_rate"])
+        # CORL's target follows the policy from before its step.
+        out["target_actor"] = follow(state["target_actor"], (state if rebrac else out)["actor"], agent["ema_rate"])
         out["of_actor"] = np.stack([loss, distance])
     return out | {"actor_loss": out["of_actor"][0], "bc_loss": out["of_actor"][1]}, None
 
@@ -78,6 +102,8 @@ def draw(config, variant, size, rng):
     for name in "actor", "critic":
         state |= random_moments(rng, name, state[name])
     inputs = implicit.random_inputs(config, rng, size) | {"target_noise": single(rng.normal(size=(b, a)))}
+    if config["algorithm"] == "rebrac":
+        inputs["next_actions"] = single(rng.uniform(-0.99999, 0.99999, (b, a)))
     noise = agent["target_noise"] * inputs["target_noise"]
     for clipped, limit in (noise, agent["target_noise_limit"]), (noisy_actions(config, state, inputs), 1):
         beyond = np.abs(clipped) - limit

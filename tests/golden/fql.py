@@ -1,0 +1,155 @@
+"""One update of FQL (Park, Li and Levine 2025), in the order of its authors' code: all losses are those of the networks before
+it, and the target critics follow the critics from before it.
+"""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from networks import adam_step, compiled, configuration, ensemble, fast_values, follow, near, random_batch, random_moments
+from networks import random_network, shape, single, values
+
+CRITICS = 2
+VARIANTS = {"fql": 700, "fql-normalised": 701}
+SIZES = {
+    "narrow": {"hidden": 5, "batch_size": 23, "select": 3},
+    "small": {"hidden": 11, "batch_size": 24, "select": 6},
+    "hopper": {"hidden": 256, "batch_size": 256, "select": 32},
+}
+AGENT = {
+    "gamma": 0.99,
+    "alpha": 3.0,
+    "flow_steps": 10,
+    "learning_rate": 0.02,
+    "ema_rate": 0.05,
+    "candidates": 5,
+}
+
+
+def make_config(variant, size):
+    hidden, normalised = SIZES[size]["hidden"], variant == "fql-normalised"
+    networks = {
+        "actor": shape([hidden, hidden, hidden - 2], "gelu"),
+        "critic": shape([hidden, hidden - 1], "gelu", True) | {"norm_after": True},
+    }
+    own = {"target": "min" if normalised else "mean", "normalize_q": normalised}
+    return configuration("fql", SIZES[size]["batch_size"], VARIANTS[variant], networks | AGENT | own)
+
+
+# Networks: flow and one-step policy are ensembles of one.
+
+
+def one_step(actor, states, noise, activation):
+    return ensemble(actor, jnp.concatenate([states, noise], -1), activation)[0]
+
+
+def velocity(flow, states, x, times, activation):
+    return ensemble(flow, jnp.concatenate([states, x, times[..., None]], -1), activation)[0]
+
+
+fast_one_step, fast_velocity = compiled(one_step), compiled(velocity)
+
+
+# Losses and their gradients.
+
+
+def critic_loss(critics, states, actions, targets, activation):
+    return jnp.mean((values(critics, states, actions, activation, after=True) - targets) ** 2)
+
+
+def flow_loss(flow, states, actions, start, times, activation):
+    between = (1 - times[:, None]) * start + times[:, None] * actions
+    return jnp.mean((velocity(flow, states, between, times, activation) - (actions - start)) ** 2)
+
+
+def actor_loss(actor, critics, states, noise, led, numbers, activation, critic_activation):
+    """The actor's loss, with the distance to where the flow led, and −Q."""
+    alpha, normalize_q = numbers
+    taken = one_step(actor, states, noise, activation)
+    distance = jnp.mean((taken - led) ** 2)
+    q = jnp.mean(values(critics, states, jnp.clip(taken, -1, 1), critic_activation, after=True), 0)
+    size = jax.lax.stop_gradient(jnp.mean(jnp.abs(q)))
+    q_loss = -jnp.mean(q) / jnp.where(normalize_q, size, 1.0)
+    return alpha * distance + q_loss, (distance, q_loss)
+
+
+critic_gradient = compiled(jax.value_and_grad(critic_loss))
+flow_gradient = compiled(jax.value_and_grad(flow_loss))
+actor_gradient = compiled(jax.value_and_grad(actor_loss, has_aux=True))
+
+
+# One update.
+
+
+def flow_actions(config, flow, states, noise):
+    """Where the flow leads in Euler steps, before it is clipped."""
+    steps, x = config["agent"]["flow_steps"], noise
+    for i in range(steps):
+        times = np.full(len(states), i / steps)
+        x = x + fast_velocity(flow, states, x, times, config["agent"]["actor"]["activation"]) / steps
+    return x
+
+
+def update(config, state, inputs):
+    """All that must come out; and what is clipped on the way."""
+    agent, s, a, step = config["agent"], inputs["observations"], inputs["actions"], config["step"]
+    activation, critic_activation = agent["actor"]["activation"], agent["critic"]["activation"]
+    next_actions = fast_one_step(state["actor"], inputs["next_observations"], inputs["next_noise"], activation)
+    clipped = np.clip(next_actions, -1, 1)
+    next_q = fast_values(state["target_critic"], inputs["next_observations"], clipped, critic_activation, 1e-6, True)
+    next_q = next_q.min(0) if agent["target"] == "min" else next_q.mean(0)
+    targets = inputs["rewards"] + agent["gamma"] * inputs["masks"] * next_q
+    led = flow_actions(config, state["flow"], s, inputs["policy_noise"])
+    taken = fast_one_step(state["actor"], s, inputs["policy_noise"], activation)
+
+    out = dict(state) | {"targets": targets, "q_mean": targets.mean(), "flow_actions": np.clip(led, -1, 1)}
+    out["critic_loss"], of_critics = critic_gradient(state["critic"], s, a, targets, critic_activation)
+    out["bc_loss"], of_flow = flow_gradient(state["flow"], s, a, inputs["start_noise"], inputs["times"], activation)
+    given = state["critic"], s, inputs["policy_noise"], out["flow_actions"], (agent["alpha"], agent["normalize_q"])
+    (out["actor_loss"], parts), of_actor = actor_gradient(state["actor"], *given, activation, critic_activation)
+    out["distill_loss"], out["q_loss"] = parts
+    for name, gradients in ("critic", of_critics), ("flow", of_flow), ("actor", of_actor):
+        out |= adam_step(state, name, gradients, agent["learning_rate"], step)
+    out["target_critic"] = follow(state["target_critic"], state["critic"], agent["ema_rate"])
+    return out, np.concatenate([next_actions, led, taken])
+
+
+def act(config, state, inputs):
+    """What the one-step policy draws, and the smaller of the target critics' values."""
+    agent, noise = config["agent"], inputs["select_noise"][0]
+    states = np.broadcast_to(inputs["select_observations"][:, None], noise.shape[:-1] + (config["observation_dim"],))
+    drawn = np.clip(fast_one_step(state["actor"], states, noise, agent["actor"]["activation"]), -1, 1)
+    q = fast_values(state["target_critic"], states, drawn, agent["critic"]["activation"], 1e-6, True).min(0)
+    return {"select.candidates": drawn, "select.q": q}
+
+
+def draw(config, variant, size, rng):
+    """A state, inputs and what comes out; None where what is clipped is so close to ±1 that rounding could turn a gradient on or
+    off, or is never beyond it.
+    """
+    agent, b, n = config["agent"], config["batch_size"], SIZES[size]["select"]
+    o, a = config["observation_dim"], config["action_dim"]
+    state = {
+        "actor": random_network(rng, o + a, agent["actor"], a, 1),
+        "flow": random_network(rng, o + a + 1, agent["actor"], a, 1),
+        "critic": random_network(rng, o + a, agent["critic"], 1, CRITICS),
+    }
+    # Actions that are beyond ±1 now and then.
+    last = f"{len(agent['actor']['hidden'])}.kernel"
+    state["actor"][last] = single(1.5 * state["actor"][last])
+    for name in list(state):
+        state |= random_moments(rng, name, state[name])
+    state["target_critic"] = near(rng, state["critic"])
+    inputs = random_batch(rng, config) | {
+        name: single(rng.normal(size=(b, a))) for name in ("start_noise", "policy_noise", "next_noise")
+    }
+    inputs |= {
+        "times": single(rng.uniform(size=b)),
+        "select_observations": single(rng.normal(size=(n, o))),
+        "select_noise": single(rng.normal(size=(1, n, agent["candidates"], a))),
+    }
+    expected, bounded = update(config, state, inputs)
+    room = 1e-4 if size != "hopper" else 0
+    if np.any(abs(abs(bounded) - 1) < room) or not np.any(abs(bounded) > 1):
+        return None
+    return state, inputs, expected | act(config, state, inputs)
