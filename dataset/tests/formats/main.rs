@@ -6,7 +6,8 @@ use std::process::Command;
 
 use hdf5::H5Type;
 use ndarray::ArrayViewD;
-use quad_dataset::{Batch, DatasetError, EnvironmentSpec, ReadOptions, RewardRule, Scale, Transitions, environment, ogbench};
+use quad_dataset::ogbench::maze_task;
+use quad_dataset::{Batch, DatasetError, EnvironmentSpec, ReadOptions, RewardRule, Scale, Transitions, environment};
 use tempfile::{TempDir, tempdir};
 
 mod broken;
@@ -36,7 +37,7 @@ fn shared(path: &str) -> Option<PathBuf> {
 
 /// A task of OGBench's is the environment's.
 fn options(environment: Option<&'static EnvironmentSpec>, reward: RewardRule) -> ReadOptions {
-    let task = environment.and_then(|environment| ogbench::maze_task(&environment.name));
+    let task = environment.and_then(|environment| maze_task(&environment.name));
     ReadOptions { environment, task, reward, scale: Scale::default() }
 }
 

@@ -21,8 +21,12 @@ fn lacks(values: &Values, task: &Task) -> bool {
 /// As [`Values::of`].
 pub fn not_given(definition: &Definition, task: &Task) -> anyhow::Result<Option<String>> {
     let lacking = lacks(&Values::of(definition)?, task);
+    let instead = match task.valued_as() {
+        own if own == task.name => "its general values are used".to_owned(),
+        other => format!("those for {other} are used"),
+    };
     let (algorithm, task) = (definition.name, &task.name);
-    Ok(lacking.then(|| format!("{algorithm}'s authors give no values for {task}; its general values are used")))
+    Ok(lacking.then(|| format!("{algorithm}'s authors give no values for {task}; {instead}")))
 }
 
 /// The algorithm of that name.
