@@ -1,18 +1,20 @@
-//! The datasets that can be asked for by name: the table `datasets.toml`.
+//! The datasets that can be asked for by name: the table `datasets.toml`, and OGBench's.
 
 use std::sync::LazyLock;
 
 use serde::Deserialize;
 
+use crate::{hdf5_file, npz_file, ogbench};
+
 /// A file that can be fetched, and what it must be.
 #[derive(Clone, Debug, PartialEq, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct NamedDataset {
-    /// D4RL's name, e.g. `hopper-medium-v2`.
+    /// Its benchmark's name for it, e.g. `hopper-medium-v2`.
     pub name: String,
     /// The environment that it was recorded in.
     pub environment: String,
-    /// D4RL's name of the file.
+    /// Its benchmark's name of the file.
     pub file: String,
     /// Size in bytes, if it is known.
     pub bytes: Option<u64>,
@@ -24,6 +26,18 @@ pub struct NamedDataset {
     /// Where it can be had, best first: the file in each folder of its collection.
     #[serde(skip)]
     pub addresses: Vec<String>,
+}
+
+impl NamedDataset {
+    /// Whether it is OGBench's, which has npz files in a folder of its own; the others are D4RL's HDF5.
+    pub fn is_ogbench(&self) -> bool {
+        self.file.ends_with(".npz")
+    }
+
+    /// The first bytes of its file, and what people call such a file.
+    pub fn format(&self) -> (&'static [u8], &'static str) {
+        if self.is_ogbench() { (npz_file::SIGNATURE, "npz archive") } else { (hdf5_file::SIGNATURE, "HDF5 file") }
+    }
 }
 
 #[derive(Deserialize)]
@@ -53,10 +67,10 @@ impl Collection {
 #[allow(clippy::expect_used)] // The table is part of the program; the first test here reads it.
 static DATASETS: LazyLock<Vec<NamedDataset>> = LazyLock::new(|| {
     let table: Table = toml::from_str(include_str!("../datasets.toml")).expect("the embedded table is valid");
-    table.collection.into_iter().flat_map(Collection::into_datasets).collect()
+    table.collection.into_iter().flat_map(Collection::into_datasets).chain(ogbench::files()).collect()
 });
 
-/// All datasets of the table.
+/// All datasets.
 pub fn all() -> &'static [NamedDataset] {
     &DATASETS
 }
@@ -78,7 +92,7 @@ mod tests {
 
     #[test]
     fn the_table_is_consistent() {
-        for dataset in all() {
+        for dataset in all().iter().filter(|dataset| !dataset.is_ogbench()) {
             let NamedDataset { name, file, sha256, addresses, .. } = dataset;
             assert_eq!((find(name), find_file(file)), (Some(dataset), Some(dataset)), "names are unique");
             let environment = environment::find(&dataset.environment).unwrap();

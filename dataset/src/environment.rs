@@ -4,11 +4,12 @@ use std::sync::LazyLock;
 
 use serde::Deserialize;
 
+use crate::ogbench;
 use crate::reward::RewardRule;
 use crate::simulated::{Collect, Planar};
 
 /// One environment. Sizes and reference returns are what data is read by; the rest is how evaluators simulate it.
-#[derive(Debug, PartialEq, Deserialize)]
+#[derive(Clone, Debug, PartialEq, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct EnvironmentSpec {
     /// Name used on command lines, in files and on the wire.
@@ -53,6 +54,8 @@ pub enum Goal {
     EachInstance,
     /// The goal is drawn at each reset (D4RL's AntMaze v2).
     EachEpisode,
+    /// Never: the task, which the environment's name says, has one ([`ogbench::maze_task`]).
+    OfTask,
 }
 
 #[derive(Deserialize)]
@@ -64,7 +67,7 @@ struct Table {
 #[allow(clippy::expect_used)] // The table is part of the program; the first test here reads it.
 static ENVIRONMENTS: LazyLock<Vec<EnvironmentSpec>> = LazyLock::new(|| {
     let table: Table = toml::from_str(include_str!("../environments.toml")).expect("the embedded table is valid");
-    table.environment
+    table.environment.into_iter().flat_map(EnvironmentSpec::with_tasks).collect()
 });
 
 /// All environments of the table.
@@ -98,7 +101,27 @@ pub(crate) fn find_gymnasium(id: &str) -> Option<&'static EnvironmentSpec> {
     all().iter().find(|environment| environment.gymnasium.iter().any(|known| known == id))
 }
 
+/// Name of the physics of an environment, known here or not.
+pub fn simulation_of(name: &str) -> String {
+    match find(name) {
+        Ok(spec) => spec.simulation().to_owned(),
+        Err(_) => ogbench::default_task(name).unwrap_or_else(|| name.to_owned()),
+    }
+}
+
 impl EnvironmentSpec {
+    /// The row and, where it stands for several tasks, one for each.
+    fn with_tasks(self) -> Vec<Self> {
+        let Some(place) = self.name.strip_suffix("-singletask-v0").filter(|_| self.goal == Some(Goal::OfTask)) else {
+            return vec![self];
+        };
+        let task = |name: String| match name == self.name {
+            true => self.clone(),
+            false => Self { simulation: Some(self.name.clone()), maze: None, name, ..self.clone() },
+        };
+        ogbench::endings().map(|ending| task(format!("{place}{ending}"))).collect()
+    }
+
     /// Name of the physics, which several environments may share.
     pub fn simulation(&self) -> &str {
         self.simulation.as_deref().unwrap_or(&self.name)
@@ -126,6 +149,13 @@ mod tests {
             assert!(spec.reference_returns.1 > spec.reference_returns.0, "{}", spec.name);
             assert!(physics.planar.is_some() != physics.maze.is_some(), "{}: one kind of simulation", spec.name);
             assert_eq!(physics.maze.is_some(), spec.goal.is_some(), "{}: a maze has a goal", spec.name);
+            let is_free = |[x, y]: [f64; 2]| {
+                let rows = physics.maze.as_ref().unwrap();
+                rows[(y / 4.0) as usize + 1].as_bytes()[(x / 4.0) as usize + 1] == b'0'
+            };
+            let task = ogbench::maze_task(&spec.name);
+            assert_eq!(task.is_some(), spec.goal == Some(Goal::OfTask), "{}", spec.name);
+            assert!(task.is_none_or(|task| is_free(task.start) && is_free(task.goal)), "{}", spec.name);
             match &spec.collect {
                 Collect::None(reason) => assert!(!reason.is_empty(), "{}: no recipe and no reason", spec.name),
                 Collect::Recipe(recipe) => {

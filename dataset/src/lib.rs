@@ -9,7 +9,7 @@
 //! beside it; `doubts` and `resets` are what makes learning from them doubtful; `sampler` draws mini-batches; `inspect`
 //! describes a source to people, whatever is wrong with it. `recorded` is a D4RL file as it was recorded, row by row; `writer`
 //! writes such a file, and `arrays` one of the custom layout, both by `new_file`. [`catalogue`] lists the files that can be
-//! asked for by name; `error` is what can go wrong with any of them.
+//! asked for by name, [`ogbench`] what OGBench's names mean; `error` is what can go wrong with any of them.
 //!
 //! This crate knows nothing of networks, simulators or the wire.
 
@@ -29,6 +29,7 @@ mod hold_out;
 mod inspect;
 mod new_file;
 mod npz_file;
+pub mod ogbench;
 mod recorded;
 mod recording;
 mod resets;
@@ -46,7 +47,7 @@ pub use catalogue::NamedDataset;
 pub use environment::{EnvironmentSpec, Goal, UnknownEnvironment};
 pub use error::{DatasetError, Problem};
 pub use formats::{data_file, minari_folder, recorded_environment};
-pub use hdf5_file::{SIGNATURE as HDF5_SIGNATURE, hdf5_library};
+pub use hdf5_file::hdf5_library;
 pub use hold_out::{HoldOut, Split};
 pub use inspect::{Inspection, inspect};
 pub use recorded::{RecordedRows, Row, environments_of_its_sizes};

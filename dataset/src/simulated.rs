@@ -4,7 +4,7 @@ use serde::Deserialize;
 
 /// A robot in a vertical plane that is rewarded for running along x. Positions begin with its x, z (metres) and pitch (radians);
 /// a policy observes all but x, then the velocities.
-#[derive(Debug, PartialEq, Deserialize)]
+#[derive(Clone, Debug, PartialEq, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Planar {
     /// Steps of the model that a control is held for.
@@ -38,7 +38,7 @@ pub enum Noise {
 }
 
 /// Limits, themselves excluded, within which an episode continues.
-#[derive(Debug, PartialEq, Deserialize)]
+#[derive(Clone, Debug, PartialEq, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Healthy {
     /// Height of the torso, metres.
@@ -62,7 +62,7 @@ impl Healthy {
 }
 
 /// Whether a dataset of mediocre behaviour can be recorded in an environment.
-#[derive(Debug, PartialEq, Deserialize)]
+#[derive(Clone, Debug, PartialEq, Deserialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum Collect {
     /// How.
@@ -72,7 +72,7 @@ pub enum Collect {
 }
 
 /// How a dataset is recorded.
-#[derive(Debug, PartialEq, Deserialize)]
+#[derive(Clone, Debug, PartialEq, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Recipe {
     /// Independent searches. Each finds its own gait, so that the recorded actions in a state differ by more than noise.

@@ -10,6 +10,7 @@ use crate::environment::EnvironmentSpec;
 use crate::error::{DatasetError, Problem};
 use crate::formats::Source;
 use crate::hold_out::{HoldOut, Split};
+use crate::ogbench::MazeTask;
 use crate::recording::Recording;
 use crate::reward::{RewardRule, RewardScaling};
 use crate::scale::{self, Scale};
@@ -52,6 +53,8 @@ pub struct ReadOptions {
     /// The environment it was recorded in, if it is known: sizes, time limit and reference returns come from there. Else
     /// the source's own sizes count, and without timeouts nothing is cut off.
     pub environment: Option<&'static EnvironmentSpec>,
+    /// The task in a maze of OGBench's that rewards and masks are to be of; else they are the source's.
+    pub task: Option<MazeTask>,
     /// What happens to its rewards.
     pub reward: RewardRule,
     /// What is scaled; actions that are not must lie within [-1, 1].
@@ -104,13 +107,13 @@ impl Transitions {
         options: &ReadOptions,
         hold_out: HoldOut<'_>,
     ) -> Result<Split, DatasetError> {
-        let (path, ReadOptions { environment, .. }) = (path.as_ref(), *options);
+        let (path, ReadOptions { environment, task, .. }) = (path.as_ref(), *options);
         let error = |problem| DatasetError::new(path, problem);
         let mut source = Source::open(path)?;
         if let Some(environment) = environment {
             source.check_environment(environment).map_err(error)?;
         }
-        let recording = source.read(environment)?;
+        let recording = source.read(environment, task)?;
         Self::split(recording, options, hold_out).map_err(error)
     }
 
@@ -121,13 +124,13 @@ impl Transitions {
     pub fn of(arrays: Arrays) -> Result<Self, DatasetError> {
         let error = |problem| DatasetError::new("arrays in memory", problem);
         let recording = arrays.into_recording().map_err(error)?;
-        let options = ReadOptions { environment: None, reward: RewardRule::AsIs, scale: Scale::default() };
+        let options = ReadOptions { environment: None, task: None, reward: RewardRule::AsIs, scale: Scale::default() };
         let split = Self::split(recording, &options, HoldOut::NONE).map_err(error)?;
         Ok(split.training)
     }
 
     fn split(recording: Recording, options: &ReadOptions, hold_out: HoldOut<'_>) -> Result<Split, Problem> {
-        let ReadOptions { environment, reward, scale } = *options;
+        let ReadOptions { environment, reward, scale, .. } = *options;
         let problems = checks::problems(&recording, environment);
         let outside = if scale.actions { None } else { checks::actions_outside(&recording) };
         if let Some(problem) = problems.into_iter().chain(outside).next() {

@@ -98,6 +98,30 @@ class AntMaze:
         return np.concatenate([self.data.qpos, self.data.qvel]), float(reached), reached
 
 
+class OgBench:
+    """A task of OGBench's AntMaze. Its states are random like D4RL's ant's."""
+
+    frame_skip = 5
+    random_state = AntMaze.random_state
+
+    def __init__(self, name):
+        import ogbench
+
+        self.environment = gymnasium.make(name).unwrapped
+        self.model = self.environment.model
+        halve_margins(self.model)
+        self.free = [self.environment.ij_to_xy(cell) for cell in np.argwhere(self.environment.maze_map == 0)]
+
+    def set_state(self, qpos, qvel, goal):
+        mujoco.mj_resetData(self.model, self.environment.data)
+        self.environment.set_state(qpos, qvel)
+        self.environment.set_goal(goal_xy=np.array(goal))
+
+    def step(self, action):
+        observation, reward, terminated = self.environment.step(action)[:3]
+        return observation, reward + 1, terminated
+
+
 def halve_margins(model):
     model.geom_margin[:] *= 0.5
     model.body_margin[:] *= 0.5  # The largest of a body's geoms', for the broad phase.
@@ -113,6 +137,9 @@ TASKS = {
     "antmaze-large": lambda: AntMaze(
         "111111111111 1R0001000001 101101010101 100000010001 101111011101 100101000001 110101010111 100100010G01 111111111111"
     ),
+    "antmaze-medium-singletask-v0": lambda: OgBench("antmaze-medium-singletask-v0"),
+    "antmaze-large-singletask-v0": lambda: OgBench("antmaze-large-singletask-v0"),
+    "antmaze-giant-singletask-v0": lambda: OgBench("antmaze-giant-singletask-v0"),
 }
 
 

@@ -9,11 +9,12 @@ use std::fs::File;
 use std::io::Read;
 use std::path::{Path, PathBuf};
 
-use crate::environment::{self, EnvironmentSpec};
+use crate::environment::{self, EnvironmentSpec, Goal};
 use crate::error::{DatasetError, Problem};
 use crate::foreign;
 use crate::hdf5_file::{self, Hdf5File};
 use crate::npz_file::{self, NpzFile};
+use crate::ogbench::MazeTask;
 use crate::recording::Recording;
 
 pub use minari::minari_folder;
@@ -93,11 +94,11 @@ impl Source {
     }
 
     /// Refuses another environment's recording. Environments that share their physics suit each other. OGBench's files do
-    /// not name theirs, but its mazes, whose sizes are those of ours, have other starts and goals.
+    /// not name theirs, but its mazes, whose sizes are those of D4RL's, have other starts and goals.
     pub(crate) fn check_environment(&self, asked: &EnvironmentSpec) -> Result<(), Problem> {
-        let maze_of_ogbench =
-            || (matches!(self, Self::OgBench(_)) && asked.goal.is_some()).then(|| "OGBench".to_owned());
-        let Some(claimed) = self.environment().or_else(maze_of_ogbench) else { return Ok(()) };
+        let has_other_goals = asked.goal.is_some_and(|goal| goal != Goal::OfTask);
+        let maze_of_ogbench = (matches!(self, Self::OgBench(_)) && has_other_goals).then(|| "OGBench".to_owned());
+        let Some(claimed) = self.environment().or(maze_of_ogbench) else { return Ok(()) };
         let simulation = environment::find(&claimed).map(EnvironmentSpec::simulation);
         match simulation == Ok(asked.simulation()) {
             true => Ok(()),
@@ -110,18 +111,27 @@ impl Source {
         matches!(self, Self::D4rl(file) if !file.has("timeouts"))
     }
 
-    /// Reads all of it. The environment says what a D4RL file may leave open: a time limit, and whether there is a goal.
-    pub(crate) fn read(&mut self, environment: Option<&EnvironmentSpec>) -> Result<Recording, DatasetError> {
+    /// Reads all of it. The environment says what a D4RL file may leave open: a time limit, and whether there is a goal. Of a
+    /// task in a maze of OGBench's come rewards and masks, whatever the file says.
+    pub(crate) fn read(
+        &mut self,
+        environment: Option<&EnvironmentSpec>,
+        task: Option<MazeTask>,
+    ) -> Result<Recording, DatasetError> {
         let (path, recording) = match self {
             Self::D4rl(file) => (file.path(), d4rl::read(file, environment)),
             Self::Own(file) => (file.path(), own::read(file)),
             Self::Minari(file, metadata) => (file.path(), minari::read(file, metadata)),
             Self::OgBench(file) => {
-                let recording = ogbench::read(file);
+                let recording = ogbench::read(file, task);
                 (file.path(), recording)
             }
         };
-        recording.map_err(|problem| DatasetError::new(path, problem))
+        let mut recording = recording.map_err(|problem| DatasetError::new(path, problem))?;
+        if let Some(task) = task {
+            task.label(&mut recording);
+        }
+        Ok(recording)
     }
 }
 

@@ -2,15 +2,16 @@
 
 use crate::error::Problem;
 use crate::npz_file::NpzFile;
+use crate::ogbench::MazeTask;
 use crate::recording::{Recording, RowKind};
 
-/// Reads `observations`, `actions`, `rewards`, `terminals` and, if there, `masks`.
+/// Reads `observations`, `actions`, `terminals`, `rewards` unless they follow from a `task`, and, if there, `masks`.
 ///
 /// `terminals` mark the end of a trajectory, not of what can be gained: that is where `masks` are 0, and nowhere in a file
 /// without masks. As OGBench stores its data, the last state of a trajectory is a row of its own, so that a row at a
 /// terminal starts no transition. As its loader returns the data, either each row is a transition with its own
 /// `next_observations`, or `valids` say which rows start one.
-pub(super) fn read(file: &mut NpzFile) -> Result<Recording, Problem> {
+pub(super) fn read(file: &mut NpzFile, task: Option<MazeTask>) -> Result<Recording, Problem> {
     let observations = file.numbers("observations")?;
     let (rows, observation_dim) = (observations.rows(), observations.width);
     let actions = file.actions("actions")?.of_rows(rows)?;
@@ -40,7 +41,10 @@ pub(super) fn read(file: &mut NpzFile) -> Result<Recording, Problem> {
         action_dim: actions.width,
         observations: observations.values,
         actions: actions.values,
-        rewards: file.table("rewards", rows, 1)?,
+        rewards: match task {
+            Some(_) => vec![0.0; rows],
+            None => file.table("rewards", rows, 1)?,
+        },
         kinds: last_states.iter().map(kind).collect(),
         terminals: masks.iter().zip(&last_states).map(|(&mask, &last)| !mask && !last).collect(),
         timeouts: (0..rows).map(|row| ends[row] && masks[row]).collect(),

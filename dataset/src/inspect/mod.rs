@@ -14,6 +14,7 @@ use crate::checks;
 use crate::environment::{self, EnvironmentSpec};
 use crate::error::{DatasetError, Problem};
 use crate::formats::Source;
+use crate::ogbench;
 use crate::recording::RowKind;
 use crate::statistics::Extent;
 
@@ -134,7 +135,7 @@ pub fn inspect(
     let mut source = Source::open(path)?;
     let claimed = source.environment();
     let spec = environment.or_else(|| environment::find(claimed.as_deref()?).ok());
-    let recording = source.read(spec)?;
+    let recording = source.read(spec, spec.and_then(|spec| ogbench::maze_task(&spec.name)))?;
 
     let other = environment.and_then(|environment| source.check_environment(environment).err());
     let refused: Vec<Problem> = other.into_iter().chain(checks::problems(&recording, spec)).collect();

@@ -146,6 +146,6 @@ fn observations_too_large_to_train_on_as_they_are() {
     let path = folder.path().join("cart.hdf5");
     cart.write(&path, true);
     let scale = Scale { states: true, actions: false };
-    let options = ReadOptions { environment: None, reward: RewardRule::AsIs, scale };
+    let options = ReadOptions { environment: None, task: None, reward: RewardRule::AsIs, scale };
     assert_eq!(Transitions::read(&path, &options).unwrap().doubts(), [""; 0]);
 }

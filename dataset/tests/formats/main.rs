@@ -6,6 +6,7 @@ use std::process::Command;
 
 use hdf5::H5Type;
 use ndarray::ArrayViewD;
+use quad_dataset::ogbench::maze_task;
 use quad_dataset::{Batch, DatasetError, EnvironmentSpec, ReadOptions, RewardRule, Scale, Transitions, environment};
 use tempfile::{TempDir, tempdir};
 
@@ -34,13 +35,19 @@ fn shared(path: &str) -> Option<PathBuf> {
     exists.then_some(path)
 }
 
+/// A task of OGBench's is the environment's.
+fn options(environment: Option<&'static EnvironmentSpec>, reward: RewardRule) -> ReadOptions {
+    let task = environment.and_then(|environment| maze_task(&environment.name));
+    ReadOptions { environment, task, reward, scale: Scale::default() }
+}
+
 fn read(path: &Path, environment: Option<&'static EnvironmentSpec>, reward: RewardRule) -> Transitions {
-    Transitions::read(path, &ReadOptions { environment, reward, scale: Scale::default() }).unwrap()
+    Transitions::read(path, &options(environment, reward)).unwrap()
 }
 
 /// Reads a source, with its rewards as they are.
 fn try_read(path: &Path, environment: Option<&'static EnvironmentSpec>) -> Result<Transitions, DatasetError> {
-    Transitions::read(path, &ReadOptions { environment, reward: RewardRule::AsIs, scale: Scale::default() })
+    Transitions::read(path, &options(environment, RewardRule::AsIs))
 }
 
 /// Writes an array.

@@ -1,11 +1,12 @@
 //! Files of OGBench's layout, against OGBench's own reader.
 
+use std::collections::BTreeSet;
 use std::path::{Path, PathBuf};
 
-use quad_dataset::{DatasetError, environment};
+use quad_dataset::{DatasetError, ReadOptions, RewardRule, Scale, Transitions, environment, ogbench};
 use tempfile::{TempDir, tempdir};
 
-use crate::{compare, hopper, peers, try_read};
+use crate::{all, compare, hopper, peers, try_read};
 
 fn written(variant: &str) -> Option<(TempDir, PathBuf)> {
     let folder = tempdir().unwrap();
@@ -35,6 +36,32 @@ fn without_rewards_there_is_nothing_to_learn() {
     let error = error(&path);
     assert!(error.to_string().ends_with("array `rewards` is missing"), "{error}");
     assert!(error.hint().contains("quad-convert ogbench:NAME"), "{}", error.hint());
+}
+
+#[test]
+fn a_task_in_a_maze_has_ogbenchs_start_rewards_and_masks() {
+    let folder = tempdir().unwrap();
+    if !peers(&["ogbench-mazes", folder.path().to_str().unwrap()]) {
+        return;
+    }
+    let environments: BTreeSet<String> =
+        ogbench::tasks().filter(|task| task.dataset.is_some()).map(|task| task.environment).collect();
+    assert_eq!(environments.len(), 8 * 6);
+    for name in environments {
+        let place = name.split("-singletask").next().unwrap();
+        let file = hdf5::File::open(folder.path().join(format!("{name}.hdf5"))).unwrap();
+        let array = |array: &str| file.dataset(array).unwrap().read_raw::<f32>().unwrap();
+        let task = ogbench::maze_task(&name);
+        assert_eq!(task.unwrap().start.map(|x| x as f32).to_vec(), array("start"), "{name}");
+        let environment = environment::find(&name).ok();
+        let options = ReadOptions { environment, task, reward: RewardRule::Subtract1, scale: Scale::default() };
+        let transitions = Transitions::read(folder.path().join(format!("{place}.npz")), &options).unwrap();
+        let batch = all(&transitions);
+        assert_eq!((batch.rewards, &batch.masks), (array("rewards"), &array("masks")), "{name}");
+        assert!((10..150).contains(&batch.masks.iter().filter(|mask| **mask == 0.0).count()), "{name}");
+        // One trajectory in six is around one of five goals; its return is 1.
+        assert!((0.1..0.7).contains(&transitions.statistics().return_mean), "{name}");
+    }
 }
 
 #[test]

@@ -275,6 +275,36 @@ def ogbench_reference(path, out):
     )
 
 
+def ogbench_mazes(folder):
+    """A file for each of OGBench's mazes, with places around all goals, and for each of its tasks what OGBench makes of them."""
+    import gymnasium
+    import ogbench.relabel_utils
+
+    rng = np.random.default_rng(11)
+    places = [f"{robot}maze-{size}" for robot in ("ant", "humanoid") for size in ("medium", "large", "giant")]
+    for place in [*places, "antsoccer-arena", "antsoccer-medium"]:
+        env = gymnasium.make(f"{place}-singletask-v0").unwrapped
+        goals = np.array([task["goal_xy"] for task in env.task_infos])
+        xy = np.repeat(goals, 60, axis=0) + rng.uniform(-0.8, 0.8, (300, 2))
+        column = 15 if "soccer" in place else 0
+        arrays = {"qpos": rng.normal(size=(300, 30)).astype(np.float32)}
+        arrays["observations"] = np.zeros((300, env.observation_space.shape[0]), np.float32)
+        for array in arrays.values():
+            array[:, column : column + 2] = xy
+        terminals = np.arange(300) % 50 == 49
+        actions = np.zeros((300, env.action_space.shape[0]), np.float32)
+        np.savez(f"{folder}/{place}.npz", **arrays, actions=actions, terminals=terminals)
+        default = env._reward_task_id
+        for ending, task in [("", default), *((f"-task{task}", task) for task in range(1, 6))]:
+            env._reward_task_id, name = task, f"{place}-singletask{ending}-v0"
+            data = dict(arrays)
+            ogbench.relabel_utils.relabel_dataset(name, env, data)
+            with h5py.File(f"{folder}/{name}.hdf5", "w") as file:
+                file["rewards"], file["masks"] = data["rewards"][~terminals], data["masks"][~terminals]
+                info = env.task_infos[task - 1]
+                file["start"] = np.array(info["agent_init_xy" if "soccer" in place else "init_xy"])
+
+
 def write_log(out):
     """A user's log: 12 steps of a robot in episodes of 4 (it fell), 6 (stopped) and 2 (still going) steps."""
     i = np.arange(12)

@@ -31,7 +31,7 @@ fn file() -> (TempDir, PathBuf) {
 }
 
 fn scaled(actions: bool, states: bool) -> Transitions {
-    let options = ReadOptions { environment: None, reward: RewardRule::AsIs, scale: Scale { actions, states } };
+    let options = ReadOptions { environment: None, task: None, reward: RewardRule::AsIs, scale: Scale { actions, states } };
     Transitions::read(file().1, &options).unwrap()
 }
 
@@ -74,7 +74,7 @@ fn actions_reach_from_least_to_largest() {
 #[test]
 fn states_alone_leave_the_range_of_actions_to_be_checked() {
     let scale = Scale { actions: false, states: true };
-    let options = ReadOptions { environment: None, reward: RewardRule::AsIs, scale };
+    let options = ReadOptions { environment: None, task: None, reward: RewardRule::AsIs, scale };
     let (_folder, path) = file();
     let error = Transitions::read(path, &options).err().unwrap();
     assert!(error.to_string().contains("the action -30 is outside [-1, 1]"), "{error}");

@@ -11,9 +11,14 @@
 //!   continues.
 //! - The goal lies around the corner of cell `G`: on each axis max(0, the cell's centre + U(0, 1) + U(0, 0.5)), drawn when
 //!   the table says ([`Goal`]).
+//!
+//! OGBench's antmaze-*-singletask-* differ in three things: the episode begins within 1 m, on each axis, of the centre of the
+//! task's own cell; the goal is the centre of another; and a step is judged where it begins, so that an episode ends one step after
+//! the ant has come there. Rewards are 1 more than OGBench's, so that a return is 0 or 1, too.
 
-use quad_dataset::Noise;
 use quad_dataset::environment::Goal;
+use quad_dataset::ogbench::{self, MazeTask, REACH};
+use quad_dataset::{EnvironmentSpec, Noise};
 use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 
@@ -22,12 +27,14 @@ use super::simulation::{Body, Task};
 
 /// The stream that a goal is drawn from, among those of an episode's or an environment's seed.
 const GOAL_STREAM: u64 = 4;
+/// The stream that a start is drawn from, likewise.
+const START_STREAM: u64 = 5;
 /// Where the model of the ant on its floor has the walls.
 const WALLS: &str = "<!-- walls -->";
 /// Side of a maze's cell, metres.
 const CELL: f64 = 4.0;
-/// Distance in the plane from the torso's centre to the goal at which it is reached, metres.
-const REACH: f64 = 0.5;
+/// How far from its cell's centre, on each axis, an episode of OGBench's begins, metres.
+const START_NOISE: f64 = 1.0;
 /// Steps of the model that a control is held for, of 0.02 s each.
 pub(super) const FRAME_SKIP: usize = 5;
 /// The ant.
@@ -67,27 +74,37 @@ impl Maze {
 pub(super) struct AntMaze {
     maze: Maze,
     goal: [f64; 2],
-    goal_drawn: Goal,
+    is_redrawn: bool,
+    task: Option<MazeTask>,
 }
 
 impl AntMaze {
     /// `environment_seed` is the seed of a goal that all episodes share.
-    pub fn new(maze: Maze, goal_drawn: Goal, environment_seed: u64) -> Self {
-        Self { maze, goal: maze.draw_goal(environment_seed), goal_drawn }
+    pub fn new(maze: Maze, spec: &EnvironmentSpec, environment_seed: u64) -> Self {
+        let task = ogbench::maze_task(&spec.name);
+        let goal = task.map_or_else(|| maze.draw_goal(environment_seed), |task| task.goal);
+        Self { maze, goal, is_redrawn: spec.goal == Some(Goal::EachEpisode), task }
     }
 }
 
 impl Task for AntMaze {
-    fn judge(&self, _x: f64, physics: &Physics) -> (f64, bool) {
-        let [dx, dy] = [0, 1].map(|axis| physics.qpos()[axis] - self.goal[axis]);
+    fn judge(&self, from: [f64; 2], physics: &Physics) -> (f64, bool) {
+        let place = if self.task.is_some() { from } else { [0, 1].map(|axis| physics.qpos()[axis]) };
+        let [dx, dy] = [0, 1].map(|axis| place[axis] - self.goal[axis]);
         let reached = (dx * dx + dy * dy).sqrt() <= REACH;
         (f64::from(u8::from(reached)), reached)
     }
 
     fn begin(&mut self, seed: u64) {
-        if self.goal_drawn == Goal::EachEpisode {
+        if self.is_redrawn {
             self.goal = self.maze.draw_goal(seed);
         }
+    }
+
+    fn start(&self, seed: u64) -> Option<[f64; 2]> {
+        let mut random = ChaCha8Rng::seed_from_u64(seed);
+        random.set_stream(START_STREAM);
+        self.task.map(|task| task.start.map(|x| x + random.random_range(-START_NOISE..START_NOISE)))
     }
 
     fn set_goal(&mut self, goal: &[f64]) {
@@ -129,6 +146,32 @@ mod tests {
             two.reverse();
             assert_eq!(goals(&drawn, 6, &[2, 1]), two);
         }
+    }
+
+    #[test]
+    fn a_task_of_ogbench_has_its_start_and_its_goal_and_ends_a_step_after() {
+        let spec = find("antmaze-giant-singletask-task3-v0").unwrap();
+        let mut ant = make(spec, 0).unwrap();
+        let mut starts = [[f64::INFINITY, f64::NEG_INFINITY]; 2];
+        for seed in 0..200 {
+            ant.reset(seed);
+            assert_eq!(ant.goal(), Some(&[0.0, 0.0][..]));
+            for ([least, most], (x, centre)) in starts.iter_mut().zip(ant.qpos().iter().zip([52.0, 28.0])) {
+                (*least, *most) = (least.min(x - centre), most.max(x - centre));
+            }
+        }
+        assert!(starts.iter().all(|[least, most]| (-1.0..-0.95).contains(least) && (0.95..1.0).contains(most)));
+        let [mut qpos, qvel] = [ant.qpos().to_vec(), vec![0.0; 14]];
+        qpos[..2].copy_from_slice(&[0.0, 0.51]);
+        let mut step = |velocity: f64| {
+            let mut qvel = qvel.clone();
+            qvel[1] = velocity;
+            ant.set_state(&qpos, &qvel);
+            let [first, second] = [ant.step(&[0.0; 8]), ant.step(&[0.0; 8])];
+            [(first.reward, first.terminated), (second.reward, second.terminated)]
+        };
+        assert_eq!(step(-1.0), [(0.0, false), (1.0, true)], "it comes there");
+        assert_eq!(step(1.0), [(0.0, false), (0.0, false)], "it leaves");
     }
 
     #[test]

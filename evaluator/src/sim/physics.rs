@@ -68,24 +68,29 @@ impl Physics {
         self.data.ctrl()
     }
 
-    /// Restarts from the model's initial state with noise drawn from `seed`.
-    pub(super) fn reset(&mut self, seed: u64, noise: Noise) {
+    /// Restarts from the model's initial state with noise drawn from `seed`; the first two positions may be given.
+    pub(super) fn reset(&mut self, seed: u64, noise: Noise, place: Option<[f64; 2]>) {
         let mut random = ChaCha8Rng::seed_from_u64(seed);
         random.set_stream(RESET_STREAM);
-        self.start(|qpos, qvel| match noise {
-            Noise::Uniform(bound) => {
-                for value in qpos.iter_mut().chain(qvel) {
-                    *value += random.random_range(-bound..bound);
+        self.start(|qpos, qvel| {
+            match noise {
+                Noise::Uniform(bound) => {
+                    for value in qpos.iter_mut().chain(qvel) {
+                        *value += random.random_range(-bound..bound);
+                    }
+                }
+                Noise::NormalVelocities(scale) => {
+                    for value in qpos.iter_mut() {
+                        *value += random.random_range(-scale..scale);
+                    }
+                    for value in qvel {
+                        let normal: f64 = StandardNormal.sample(&mut random);
+                        *value += scale * normal;
+                    }
                 }
             }
-            Noise::NormalVelocities(scale) => {
-                for value in qpos {
-                    *value += random.random_range(-scale..scale);
-                }
-                for value in qvel {
-                    let normal: f64 = StandardNormal.sample(&mut random);
-                    *value += scale * normal;
-                }
+            if let Some(place) = place {
+                qpos[..2].copy_from_slice(&place);
             }
         });
     }

@@ -23,7 +23,7 @@ pub(super) fn body(robot: &Planar) -> Body {
 }
 
 impl Task for &'static Planar {
-    fn judge(&self, x: f64, physics: &Physics) -> (f64, bool) {
+    fn judge(&self, [x, _]: [f64; 2], physics: &Physics) -> (f64, bool) {
         let velocity = (physics.qpos()[0] - x) / physics.dt();
         let cost = self.control_cost * physics.controls().iter().map(|control| control * control).sum::<f64>();
         let terminated = self.healthy.as_ref().is_some_and(|healthy| !healthy.contains(physics.qpos(), physics.qvel()));

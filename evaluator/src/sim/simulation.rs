@@ -10,11 +10,17 @@ use super::physics::Physics;
 
 /// The rules of a task.
 pub(super) trait Task: Send {
-    /// The reward of the step that has just been taken from `x`, the first position, and whether it terminated the episode.
-    fn judge(&self, x: f64, physics: &Physics) -> (f64, bool);
+    /// The reward of the step that has just been taken from where the first two positions were `from`, and whether it terminated
+    /// the episode.
+    fn judge(&self, from: [f64; 2], physics: &Physics) -> (f64, bool);
 
     /// Draws what an episode of this seed has of its own.
     fn begin(&mut self, _seed: u64) {}
+
+    /// The first two positions of an episode of this seed, where it does not begin at the model's.
+    fn start(&self, _seed: u64) -> Option<[f64; 2]> {
+        None
+    }
 
     /// Moves the goal.
     fn set_goal(&mut self, _goal: &[f64]) {}
@@ -58,7 +64,7 @@ impl Simulation {
     /// seed and its actions only.
     pub fn reset(&mut self, seed: u64) {
         self.task.begin(seed);
-        self.physics.reset(seed, self.body.noise);
+        self.physics.reset(seed, self.body.noise, self.task.start(seed));
         self.start();
     }
 
@@ -82,10 +88,10 @@ impl Simulation {
     pub fn step(&mut self, action: &[f32]) -> Step {
         self.steps += 1;
         let truncated = self.steps >= self.spec.max_episode_steps;
-        let x = self.physics.qpos()[0];
+        let from = [0, 1].map(|position| self.physics.qpos()[position]);
         let went_on = self.physics.step(action);
         self.observe();
-        let (reward, terminated) = if went_on { self.task.judge(x, &self.physics) } else { (0.0, true) };
+        let (reward, terminated) = if went_on { self.task.judge(from, &self.physics) } else { (0.0, true) };
         Step { reward, terminated, truncated }
     }
 

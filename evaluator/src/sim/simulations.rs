@@ -1,7 +1,7 @@
 //! Makes environments by their rows in the dataset crate's table ([`EnvironmentSpec`]).
 
 use quad_dataset::Planar;
-use quad_dataset::environment::{self, EnvironmentSpec, Goal};
+use quad_dataset::environment::{self, EnvironmentSpec};
 
 use super::antmaze::{self, AntMaze, Maze};
 use super::environment::{Environment, EnvironmentError, Environments};
@@ -60,7 +60,7 @@ pub fn make(spec: &'static EnvironmentSpec, environment_seed: u64) -> Result<Sim
             Simulation::new(Physics::new(model, robot.frame_skip)?, planar::body(robot), Box::new(robot), spec)
         }
         Rules::Maze(maze) => {
-            let task = AntMaze::new(maze, spec.goal.unwrap_or(Goal::EachEpisode), environment_seed);
+            let task = AntMaze::new(maze, spec, environment_seed);
             Simulation::new(Physics::new(model, antmaze::FRAME_SKIP)?, antmaze::BODY, Box::new(task), spec)
         }
     })

@@ -18,7 +18,7 @@ pub fn examine(args: &DoctorArgs) -> anyhow::Result<Findings> {
     findings.ok("precision", format!("this CPU is fastest in {fastest}"));
     hdf5(&mut findings);
     doctor::folder(&mut findings, "run folder", &args.run_dir, "another folder is chosen by --run-dir");
-    match data::cache::folder() {
+    match data::cache::d4rl() {
         Ok(folder) => doctor::folder(&mut findings, "datasets", &folder, "D4RL_DATASET_DIR chooses another folder"),
         Err(error) => findings.warn("datasets", format!("{error:#}"), "name a folder in D4RL_DATASET_DIR"),
     }

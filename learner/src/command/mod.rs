@@ -72,7 +72,7 @@ fn list_presets(args: &PresetsArgs) -> anyhow::Result<()> {
     }
     let header = ["task", "environment", "dataset", "what it is"];
     let mut of_tasks = Table::new(&header.map(|name| (name, Left)));
-    for task in tasks::all() {
+    for task in tasks::all().iter().filter(|task| task.is_listed) {
         let word = |key| task.word(key).unwrap_or("-");
         of_tasks.push([&*task.name, word("environment"), word("dataset"), &task.about].map(str::to_owned));
     }
@@ -171,11 +171,14 @@ fn examine(args: &DoctorArgs) -> anyhow::Result<()> {
 fn datasets(command: &DatasetsCommand) -> anyhow::Result<()> {
     match command {
         DatasetsCommand::List => {
-            let folder = cache::folder()?;
             let header = [("dataset", Left), ("environment", Left), ("size", Right), ("in the cache", Left)];
             let mut table = Table::new(&header);
-            cache::list(&folder).for_each(|dataset| table.push(dataset));
-            print(&format!("{}\ncache folder: {}", table.render(Style::Text), folder.display()))
+            for dataset in cache::list() {
+                table.push(dataset?);
+            }
+            let (d4rl, ogbench) = (cache::d4rl()?, cache::ogbench()?);
+            let folders = format!("cache folders: {}, and of OGBench {}", d4rl.display(), ogbench.display());
+            print(&format!("{}\n{folders}", table.render(Style::Text)))
         }
         DatasetsCommand::Fetch { name } => print(&Source::named(name)?.obtain()?.path.display().to_string()),
         DatasetsCommand::Inspect(args) => inspect(args),

@@ -33,7 +33,14 @@ pub fn train(args: &TrainArgs) -> anyhow::Result<()> {
     let preset = Preset::read(args.preset())?;
     let experiment = preset.resolve(&args.changes())?;
     let named = experiment.dataset.clone().ok_or_else(|| anyhow!("preset {} names no dataset", preset.label));
-    let source = Source::parse(&named.hint(record_hint(&experiment))?)?;
+    let missing = match preset.task_name() {
+        name if name.contains("-singletask") => format!(
+            "its rewards come from OGBench's simulator: with quad_rl and ogbench installed, `quad-convert ogbench:{name} --out \
+             FILE` makes a file for --dataset FILE"
+        ),
+        _ => record_hint(&experiment),
+    };
+    let source = Source::parse(&named.hint(missing)?)?;
     source.check_environment(&experiment.environment)?;
     let path = match &args.run_dir {
         Some(path) => path.clone(),

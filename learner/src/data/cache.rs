@@ -1,4 +1,4 @@
-//! The folder in which D4RL keeps its files, shared with everything else that uses D4RL.
+//! The folders in which D4RL and OGBench keep their files, shared with everything else that uses these.
 
 use std::path::{Path, PathBuf};
 
@@ -13,21 +13,34 @@ use super::partial::left_of;
 const VARIABLE: &str = "D4RL_DATASET_DIR";
 
 /// Where D4RL keeps its files.
-pub fn folder() -> anyhow::Result<PathBuf> {
-    if let Some(folder) = std::env::var_os(VARIABLE).filter(|folder| !folder.is_empty()) {
-        return Ok(folder.into());
+pub fn d4rl() -> anyhow::Result<PathBuf> {
+    match std::env::var_os(VARIABLE).filter(|folder| !folder.is_empty()) {
+        Some(folder) => Ok(folder.into()),
+        None => in_home(".d4rl/datasets").hint(format!("name a folder in {VARIABLE}")),
     }
-    let home = std::env::home_dir().filter(|home| !home.as_os_str().is_empty());
-    home.map(|home| home.join(".d4rl/datasets"))
-        .ok_or_else(|| anyhow!("there is no home folder to keep datasets in"))
-        .hint(format!("name a folder in {VARIABLE}"))
 }
 
-/// The catalogue: name, environment, size, and what of it is in a folder already. Checksums are not computed for this.
-pub fn list(folder: &Path) -> impl Iterator<Item = [String; 4]> {
+/// Where OGBench keeps its files.
+pub fn ogbench() -> anyhow::Result<PathBuf> {
+    in_home(".ogbench/data").hint("name a home folder in HOME")
+}
+
+/// Where a dataset belongs.
+pub fn of(dataset: &NamedDataset) -> anyhow::Result<PathBuf> {
+    if dataset.is_ogbench() { ogbench() } else { d4rl() }
+}
+
+fn in_home(folder: &str) -> anyhow::Result<PathBuf> {
+    let home = std::env::home_dir().filter(|home| !home.as_os_str().is_empty());
+    home.map(|home| home.join(folder)).ok_or_else(|| anyhow!("there is no home folder to keep datasets in"))
+}
+
+/// The catalogue: name, environment, size, and what of it is in its folder already. Checksums are not computed for this.
+pub fn list() -> impl Iterator<Item = anyhow::Result<[String; 4]>> {
     catalogue::all().iter().map(|dataset| {
         let size = dataset.bytes.map_or("unknown".to_owned(), |bytes| HumanBytes(bytes).to_string());
-        [dataset.name.clone(), dataset.environment.clone(), size, state(dataset, &folder.join(&dataset.file))]
+        let path = of(dataset)?.join(&dataset.file);
+        Ok([dataset.name.clone(), dataset.environment.clone(), size, state(dataset, &path)])
     })
 }
 

@@ -133,6 +133,7 @@ fn check(dataset: &NamedDataset, partial: &mut Partial) -> Result<String, Failur
 /// The file cannot be read or written here.
 fn local(error: io::Error, dataset: &NamedDataset, folder: &Path) -> Error {
     let hint = match error.kind() {
+        _ if dataset.is_ogbench() => "make the folder a link to one that you may write to and that has room",
         ErrorKind::StorageFull => {
             "make room, or name a folder on another disk in D4RL_DATASET_DIR; what has arrived is kept and will be \
              continued"

@@ -3,7 +3,7 @@
 use std::path::Path;
 
 use anyhow::{Context, anyhow};
-use quad_dataset::{DatasetError, HoldOut, ReadOptions, Split, Transitions, environment};
+use quad_dataset::{DatasetError, HoldOut, ReadOptions, Split, Transitions, environment, ogbench};
 use quad_run::config::Experiment;
 use quad_runtime::Hint;
 
@@ -15,6 +15,7 @@ use quad_runtime::Hint;
 pub fn load(path: &Path, experiment: &Experiment) -> anyhow::Result<Split> {
     let options = ReadOptions {
         environment: environment::find(&experiment.environment).ok(),
+        task: ogbench::maze_task(&experiment.environment),
         reward: experiment.reward,
         scale: experiment.scale,
     };

@@ -3,7 +3,8 @@
 use std::path::{Path, PathBuf};
 
 use anyhow::{Context, anyhow};
-use quad_dataset::{DatasetError, NamedDataset, catalogue, environment};
+use quad_dataset::environment::simulation_of;
+use quad_dataset::{DatasetError, NamedDataset, catalogue};
 use quad_run::config::did_you_mean;
 use quad_runtime::Hint;
 
@@ -19,7 +20,7 @@ const MINARI: &str = "minari:";
 /// Where a run's data comes from.
 #[derive(Clone, Debug, PartialEq)]
 pub enum Source {
-    /// A file of the catalogue, in D4RL's cache folder or fetched into it.
+    /// A file of the catalogue, in its benchmark's cache folder or fetched into it.
     Named(&'static NamedDataset),
     /// A dataset that Minari's own client has fetched, by its ID.
     Minari(String),
@@ -61,10 +62,8 @@ impl Source {
 
     /// Refuses data that the catalogue says is from another simulation than that of `environment`.
     pub fn check_environment(&self, environment: &str) -> anyhow::Result<()> {
-        let simulation =
-            |name: &'_ str| environment::find(name).map_or(name.to_owned(), |spec| spec.simulation().to_owned());
         match self.entry() {
-            Some(entry) if simulation(&entry.environment) != simulation(environment) => Err(anyhow!(
+            Some(entry) if simulation_of(&entry.environment) != simulation_of(environment) => Err(anyhow!(
                 "{} is a dataset of {}, but the policy is for {environment}",
                 entry.name,
                 entry.environment
@@ -79,7 +78,7 @@ impl Source {
         match self {
             Self::Named(dataset) => {
                 let mirror = std::env::var(MIRROR).ok().filter(|mirror| !mirror.is_empty());
-                Fetcher::new(mirror).fetch(dataset, &cache::folder()?)
+                Fetcher::new(mirror).fetch(dataset, &cache::of(dataset)?)
             }
             Self::Minari(id) => {
                 let path = quad_dataset::minari_folder(id);

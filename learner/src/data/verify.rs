@@ -4,7 +4,7 @@ use std::fs::File;
 use std::io::{self, Read};
 use std::path::Path;
 
-use quad_dataset::{HDF5_SIGNATURE, NamedDataset};
+use quad_dataset::NamedDataset;
 use sha2::{Digest, Sha256};
 
 /// SHA-256 of a file in lower-case hexadecimal if the file is what `dataset` says, as far as that is known; else what is wrong.
@@ -15,10 +15,11 @@ pub fn verify(dataset: &NamedDataset, path: &Path) -> io::Result<Result<String, 
         return Ok(Err(format!("it has {found} bytes, but must have {expected}")));
     }
     let mut start = Vec::new();
-    file.by_ref().take(HDF5_SIGNATURE.len() as u64).read_to_end(&mut start)?;
+    let (signature, format) = dataset.format();
+    file.by_ref().take(signature.len() as u64).read_to_end(&mut start)?;
     // Some servers send a page for people in place of an error.
-    if start != HDF5_SIGNATURE {
-        return Ok(Err("it is not an HDF5 file".to_owned()));
+    if start != signature {
+        return Ok(Err(format!("it is not an {format}")));
     }
     let found = sha256(path)?;
     match &dataset.sha256 {

@@ -6,7 +6,7 @@ use std::sync::Arc;
 use anyhow::{Context as _, anyhow};
 use candle_core::Device;
 use quad_algorithms::{Context, Fqe};
-use quad_dataset::{Batch, DatasetError, HoldOut, ReadOptions, RewardRule, Scale, Transitions, environment};
+use quad_dataset::{Batch, DatasetError, HoldOut, ReadOptions, RewardRule, Scale, Transitions, environment, ogbench};
 use quad_policy::Precision;
 use quad_runtime::Hint;
 use tracing::warn;
@@ -69,6 +69,7 @@ impl Data {
         };
         let options = ReadOptions {
             environment: environment::find(&first.config.experiment.environment).ok(),
+            task: ogbench::maze_task(&first.config.experiment.environment),
             reward: RewardRule::AsIs,
             scale: Scale { actions: true, states: true },
         };

@@ -46,7 +46,7 @@ fn transitions() -> Transitions {
     write_hopper(&path, 2, 50);
     Transitions::read(
         &path,
-        &ReadOptions { environment: Some(hopper), reward: RewardRule::Locomotion, scale: Scale::default() },
+        &ReadOptions { environment: Some(hopper), task: None, reward: RewardRule::Locomotion, scale: Scale::default() },
     )
     .unwrap()
 }

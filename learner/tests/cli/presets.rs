@@ -9,6 +9,10 @@ fn preset(name: &str) -> Table {
     printed(&["presets", name]).parse().unwrap()
 }
 
+fn preset_of(name: &str, algorithm: &str) -> Table {
+    printed(&["presets", name, "--algorithm", algorithm]).parse().unwrap()
+}
+
 fn value(preset: &Table, key: &str) -> Option<Value> {
     key.split('.').try_fold(Value::Table(preset.clone()), |value, key| value.get(key).cloned())
 }
@@ -91,14 +95,54 @@ fn quad_has_the_values_of_tables_3_and_4_for_each_row() {
 }
 
 #[test]
+fn tasks_beside_the_papers_have_values_that_suit_them() {
+    let of = |task: &str, algorithm: &str| -> Table {
+        let text = printed(&["presets", task, "--algorithm", algorithm]);
+        assert_eq!(text.contains("authors give no values"), algorithm != "idql" || task.contains("-singletask"), "{text}");
+        text.parse().unwrap()
+    };
+    for algorithm in ["quad", "td3-bc", "idql"] {
+        let (mut new, old) = (of("antmaze-large-play-v2", algorithm), preset_of("antmaze-large-play-v0", algorithm));
+        for key in ["environment", "dataset"] {
+            new.insert(key.to_owned(), old[key].clone());
+        }
+        assert_eq!(new, old, "{algorithm}");
+    }
+    let giant = "antmaze-giant-navigate-singletask-task2-v0";
+    for (algorithm, key, expected) in [
+        ("quad", "agent.tau", 1.0),
+        ("quad", "agent.eta.initial", 0.01),
+        ("quad", "agent.critic_learning_rate", 1e-3),
+        ("quad", "steps", 1e6),
+        ("iql", "agent.gamma", 0.995),
+        ("iql", "agent.expectile", 0.9),
+        ("iql", "agent.temperature", 10.0),
+        ("idql", "agent.expectile", 0.9),
+    ] {
+        assert_eq!(number(&of(giant, algorithm), key), Some(expected), "{algorithm}: {key}");
+    }
+    assert_eq!(value(&of(giant, "quad"), "agent.eta.threshold"), None);
+    let wide = Value::from(vec![512; 4]);
+    assert_eq!(value(&of(giant, "iql"), "agent.actor.hidden"), Some(wide));
+    for (task, rule) in [(giant, "subtract-1"), ("antsoccer-arena-stitch-singletask-v0", "subtract-1")] {
+        assert_eq!(value(&of(task, "iql"), "reward"), Some(rule.into()), "{task}");
+    }
+    let error = learner(&["train", "--task", "cube-single-play-singletask-task3-v0"]);
+    let error = String::from_utf8(error.stderr).unwrap();
+    assert!(error.contains("`quad-convert ogbench:cube-single-play-singletask-task3-v0 --out FILE`"), "{error}");
+}
+
+#[test]
 fn tasks_and_algorithms_are_listed_with_what_their_authors_give() {
     let list = printed(&["presets"]);
     let (tasks, algorithms) = list.split_once("\n\n").unwrap();
     let tasks: Vec<&str> = tasks.lines().skip(1).collect();
-    assert_eq!(tasks.len(), 21, "{list}");
+    assert_eq!(tasks.len(), 21 + 6 + 36, "{list}");
     for row in [
         "antmaze-large-play-v0 antmaze-large-v0 antmaze-large-play-v0",
         "own-data own - data of your own, without evaluation",
+        "antmaze-medium-play-v2 antmaze-medium antmaze-medium-play-v2",
+        "antmaze-giant-stitch-singletask-v0 antmaze-giant-singletask-v0 antmaze-giant-stitch-v0 the default of -task1 to -task5",
     ] {
         let words = |line: &str| line.split_whitespace().map(str::to_owned).collect::<Vec<_>>();
         assert!(tasks.iter().any(|line| words(line) == words(row)), "{row} is missing in\n{list}");
@@ -110,7 +154,7 @@ fn tasks_and_algorithms_are_listed_with_what_their_authors_give() {
         let file: Table = std::fs::read_to_string(file).unwrap().parse().unwrap();
         assert!(row.contains(file["about"].as_str().unwrap()), "{row}");
     }
-    assert!(algorithms[0].starts_with("quad ") && algorithms[0].contains(" *-v0, *-v2 "), "{list}");
+    assert!(algorithms[0].starts_with("quad ") && algorithms[0].contains(" walker2d-*-v2, antmaze-*-v0 "), "{list}");
 }
 
 #[test]

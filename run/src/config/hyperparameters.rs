@@ -9,7 +9,10 @@ use super::tasks::Task;
 
 /// Whether a benchmark of others, a task with a dataset of its own, has no values by the algorithm's authors.
 fn lacks(values: &Values, task: &Task) -> bool {
-    task.word("dataset").is_some() && !values.given.iter().any(|pattern| fits(pattern, &task.name))
+    // OGBench numbers its tasks apart from D4RL: a pattern like `*-v0` is not about them unless it says so.
+    let is_of_ogbench = |name: &str| name.contains("-singletask");
+    let is_about = |pattern: &String| is_of_ogbench(pattern) == is_of_ogbench(&task.name) && fits(pattern, &task.name);
+    task.word("dataset").is_some() && !values.given.iter().any(is_about)
 }
 
 /// A sentence about a task for which an algorithm's authors give no values; none of others.
@@ -18,8 +21,12 @@ fn lacks(values: &Values, task: &Task) -> bool {
 /// As [`Values::of`].
 pub fn not_given(definition: &Definition, task: &Task) -> anyhow::Result<Option<String>> {
     let lacking = lacks(&Values::of(definition)?, task);
+    let instead = match task.valued_as() {
+        own if own == task.name => "its general values are used".to_owned(),
+        other => format!("those for {other} are used"),
+    };
     let (algorithm, task) = (definition.name, &task.name);
-    Ok(lacking.then(|| format!("{algorithm}'s authors give no values for {task}; its general values are used")))
+    Ok(lacking.then(|| format!("{algorithm}'s authors give no values for {task}; {instead}")))
 }
 
 /// The algorithm of that name.

@@ -7,7 +7,7 @@ use std::path::Path;
 
 use anyhow::{Context, anyhow};
 use quad_algorithms::{ALGORITHMS, Definition, Values};
-use quad_dataset::{RewardRule, environment};
+use quad_dataset::{RewardRule, environment, ogbench};
 use quad_runtime::Hint;
 use toml::{Table, Value};
 
@@ -62,8 +62,7 @@ impl Preset {
     pub fn resolve(&self, changes: &Table) -> anyhow::Result<Experiment> {
         let label = &self.label;
         let definition = self.algorithm(changes)?;
-        let task = self.task.map(|task| &*task.name);
-        let mut table = Values::of(&definition)?.for_task(task);
+        let mut table = Values::of(&definition)?.for_task(self.task.map(Task::valued_as));
         for keys in self.task.map(|task| &task.keys).into_iter().chain([&self.own, changes]) {
             merge(&mut table, keys.clone());
         }
@@ -73,8 +72,11 @@ impl Preset {
                 .hint("begin the file with a line like task = \"own-data\"; `learner presets` lists all tasks");
         };
         if !table.contains_key("reward") {
-            let known = named.as_str().and_then(|name| environment::find(name).ok());
-            let rule = known.map_or(RewardRule::AsIs, |spec| spec.reward);
+            let rule = named.as_str().map_or(RewardRule::AsIs, |name| match environment::find(name) {
+                Ok(spec) => spec.reward,
+                Err(_) if ogbench::maze_task(name).is_some() => RewardRule::Subtract1,
+                Err(_) => RewardRule::AsIs,
+            });
             table.insert("reward".to_owned(), Value::try_from(rule)?);
         }
         let experiment: Experiment =

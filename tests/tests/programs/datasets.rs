@@ -68,6 +68,49 @@ fn a_run_by_name_fetches_its_dataset_once_and_records_its_checksum() {
     assert_eq!(requests(), 1);
 }
 
+/// Writes a file as OGBench has it: an ant that stands at the goal of the second task in a medium maze, or 2 m beside it.
+const STANDING: &str = "
+import sys, numpy
+observations = numpy.zeros((120, 29), 'f4')
+observations[:, :2] = [20, 0]
+observations[60:, 1] = 2
+observations[:, 2:4] = [0.75, 1]
+actions, terminals = numpy.zeros((120, 8), 'f4'), numpy.arange(120) % 20 == 19
+numpy.savez(sys.argv[1], observations=observations, actions=actions, terminals=terminals)
+";
+
+#[test]
+fn a_task_of_ogbench_is_learnt_by_its_name_and_evaluated_here() {
+    let scratch = Scratch::new();
+    let Some(python) = peers::python(&["numpy", "http.server"]) else { return };
+    let (mirror, port) = (scratch.path().join("mirror"), free_port());
+    fs::create_dir(&mirror).unwrap();
+    let file = "antmaze-medium-navigate-v0.npz";
+    let written = Command::new(&python).args(["-c", STANDING]).arg(mirror.join(file)).status().unwrap();
+    assert!(written.success());
+    let mut serve = Command::new(python);
+    serve.args(["-m", "http.server", "--bind", "127.0.0.1", &port.to_string()]).current_dir(mirror);
+    let _server = Process::start("mirror", scratch.path(), serve);
+    eventually("the mirror listens", PATIENCE, || TcpStream::connect(("127.0.0.1", port)).ok());
+    let run = scratch.path().join("run");
+    let mut train = Command::new(binary("learner"));
+    train.env("HOME", scratch.path()).env("QUAD_DATASETS_URL", format!("http://127.0.0.1:{port}"));
+    train.args(["train", "--task", "antmaze-medium-navigate-singletask-task2-v0", "--algorithm", "iql", "--evaluators", "1"]);
+    train.args(["--listen", &format!("tcp/127.0.0.1:{}", free_port())]);
+    train.args(["--steps", "20", "--eval-interval", "20", "--episodes", "2", "--set", "batch_size=32", "--run-dir"]);
+    let output = train.arg(&run).output().unwrap();
+    assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
+    let config: toml::Table = fs::read_to_string(run.join("config.toml")).unwrap().parse().unwrap();
+    let (dataset, experiment) = (&config["dataset"], &config["experiment"]);
+    assert_eq!(experiment["environment"].as_str(), Some("antmaze-medium-singletask-task2-v0"));
+    let path = scratch.path().join(".ogbench/data").join(file);
+    assert_eq!(dataset["path"].as_str(), path.to_str());
+    // Three of six trajectories have the reward.
+    assert_eq!((dataset["transitions"].as_integer(), dataset["mean_score"].as_float()), (Some(114), Some(50.0)));
+    let scores = fs::read_to_string(run.join("scores.jsonl")).unwrap();
+    assert_eq!(scores.lines().filter(|line| line.contains("\"length\":1000")).count(), 2, "{scores}");
+}
+
 #[test]
 fn a_file_that_another_program_writes_is_not_called_damaged() {
     let scratch = Scratch::new();
@@ -98,7 +141,7 @@ fn the_list_says_what_there_is_and_what_is_here() {
     ] {
         assert!(text.lines().any(|line| line.starts_with(name) && line.ends_with(state)), "{name}:\n{text}");
     }
-    assert!(text.ends_with(&format!("cache folder: {}\n", folder.path().display())), "{text}");
+    assert!(text.contains(&format!("\ncache folders: {}, and of OGBench ", folder.path().display())), "{text}");
 }
 
 #[test]

@@ -20,7 +20,7 @@ fn a_word_is_a_name_a_path_or_neither() {
 fn the_tasks_datasets_are_known_and_of_their_environments() {
     let resolved = tasks::all().iter().map(|task| resolve(&task.name, &toml::Table::new()).unwrap());
     let named: Vec<_> = resolved.filter(|experiment| experiment.dataset.is_some()).collect();
-    assert_eq!(named.len(), 15, "the rows of the paper's table");
+    assert_eq!(named.len(), 15 + 6 + 18 * 6, "the rows of the paper's table, version 2's mazes, OGBench's");
     for experiment in named {
         let source = Source::parse(&experiment.dataset.unwrap()).unwrap();
         assert!(matches!(source, Source::Named(_)), "{source:?}");
@@ -37,6 +37,11 @@ fn data_of_another_simulation_is_refused() {
         // The goal of v0 and v2 is another one, not the maze.
         ("antmaze-umaze-v2", "antmaze-umaze-v0", true),
         ("antmaze-medium-play-v0", "antmaze-umaze", false),
+        ("antmaze-giant-stitch-v0", "antmaze-giant-singletask-task3-v0", true),
+        ("antmaze-giant-stitch-v0", "antmaze-large-singletask-task3-v0", false),
+        ("antmaze-medium-stitch-v0", "antmaze-medium", false),
+        ("antmaze-medium-play-v2", "antmaze-medium-singletask-v0", false),
+        ("humanoidmaze-large-stitch-v0", "humanoidmaze-large-singletask-task3-v0", true),
         // By the name of the file alone.
         ("data/hopper_medium-v2.hdf5", "walker2d", false),
         ("data/mine.hdf5", "walker2d", true),

@@ -13,7 +13,15 @@ fn only_benchmarks_of_others_can_lack_their_authors_values() {
     for (task, expected) in [("hopper-medium-v2", false), ("antmaze-umaze-v0", false), ("hopper-demo", false)] {
         assert_eq!(lacks(&values(&["*-v2", "antmaze-*"]), tasks::named(task).unwrap()), expected, "{task}");
     }
-    assert!(lacks(&values(&["*-v2"]), tasks::named("antmaze-umaze-v0").unwrap()));
+    let of_ogbench = "antmaze-giant-stitch-singletask-task5-v0";
+    for (given, task, expected) in [
+        ("*-v2", "antmaze-umaze-v0", true),
+        ("*-v0", of_ogbench, true),
+        ("antmaze-*-singletask-*", of_ogbench, false),
+        ("antmaze-*-singletask-*", "antmaze-umaze-v0", true),
+    ] {
+        assert_eq!(lacks(&values(&[given]), tasks::named(task).unwrap()), expected, "{given} for {task}");
+    }
 }
 
 #[test]
