@@ -123,12 +123,11 @@ def act(config, state, inputs):
     return {"select.candidates": drawn, "select.q": q}
 
 
-def draw(config, variant, size, rng):
-    """A state, inputs and what comes out; None where what is clipped is so close to ±1 that rounding could turn a gradient on or
-    off, or is never beyond it.
-    """
-    agent, b, n = config["agent"], config["batch_size"], SIZES[size]["select"]
-    o, a = config["observation_dim"], config["action_dim"]
+# Random states and inputs.
+
+
+def random_state(config, rng):
+    agent, o, a = config["agent"], config["observation_dim"], config["action_dim"]
     state = {
         "actor": random_network(rng, o + a, agent["actor"], a, 1),
         "flow": random_network(rng, o + a + 1, agent["actor"], a, 1),
@@ -139,15 +138,27 @@ def draw(config, variant, size, rng):
     state["actor"][last] = single(1.5 * state["actor"][last])
     for name in list(state):
         state |= random_moments(rng, name, state[name])
-    state["target_critic"] = near(rng, state["critic"])
+    return state | {"target_critic": near(rng, state["critic"])}
+
+
+def random_inputs(config, rng, size):
+    b, n = config["batch_size"], SIZES[size]["select"]
+    o, a = config["observation_dim"], config["action_dim"]
     inputs = random_batch(rng, config) | {
         name: single(rng.normal(size=(b, a))) for name in ("start_noise", "policy_noise", "next_noise")
     }
-    inputs |= {
+    return inputs | {
         "times": single(rng.uniform(size=b)),
         "select_observations": single(rng.normal(size=(n, o))),
-        "select_noise": single(rng.normal(size=(1, n, agent["candidates"], a))),
+        "select_noise": single(rng.normal(size=(1, n, config["agent"]["candidates"], a))),
     }
+
+
+def draw(config, variant, size, rng):
+    """A state, inputs and what comes out; None where what is clipped is so close to ±1 that rounding could turn a gradient on or
+    off, or is never beyond it.
+    """
+    state, inputs = random_state(config, rng), random_inputs(config, rng, size)
     expected, bounded = update(config, state, inputs)
     room = 1e-4 if size != "hopper" else 0
     if np.any(abs(abs(bounded) - 1) < room) or not np.any(abs(bounded) > 1):

@@ -90,9 +90,8 @@ def update(config, state, inputs):
 act = implicit.act
 
 
-def draw(config, variant, size, rng):
-    """A state, inputs and what comes out; None where noise and actions are not clipped, or come close to it."""
-    agent, o, a, b = config["agent"], config["observation_dim"], config["action_dim"], config["batch_size"]
+def random_state(config, rng, size):
+    agent, o, a = config["agent"], config["observation_dim"], config["action_dim"]
     state = {
         "actor": widened(random_network(rng, o, agent["actor"], a, 1), 2),
         "critic": widened(random_network(rng, o + a, agent["critic"], 1, CRITICS), SIZES[size]["spread"]),
@@ -101,9 +100,20 @@ def draw(config, variant, size, rng):
     state["of_actor"] = single([0.7, 0.3])
     for name in "actor", "critic":
         state |= random_moments(rng, name, state[name])
-    inputs = implicit.random_inputs(config, rng, size) | {"target_noise": single(rng.normal(size=(b, a)))}
+    return state
+
+
+def random_inputs(config, rng, size):
+    shape = config["batch_size"], config["action_dim"]
+    inputs = implicit.random_inputs(config, rng, size) | {"target_noise": single(rng.normal(size=shape))}
     if config["algorithm"] == "rebrac":
-        inputs["next_actions"] = single(rng.uniform(-0.99999, 0.99999, (b, a)))
+        inputs["next_actions"] = single(rng.uniform(-0.99999, 0.99999, shape))
+    return inputs
+
+
+def draw(config, variant, size, rng):
+    """A state, inputs and what comes out; None where noise and actions are not clipped, or come close to it."""
+    agent, state, inputs = config["agent"], random_state(config, rng, size), random_inputs(config, rng, size)
     noise = agent["target_noise"] * inputs["target_noise"]
     for clipped, limit in (noise, agent["target_noise_limit"]), (noisy_actions(config, state, inputs), 1):
         beyond = np.abs(clipped) - limit

@@ -57,10 +57,11 @@ fn a_star_stands_for_any_letters() {
     }
 }
 
-/// The tasks of `presets/tasks.toml`.
+/// The tasks of `presets/tasks.toml`, and OGBench's.
 fn tasks() -> Vec<String> {
     let tasks: Table = include_str!("../../../presets/tasks.toml").parse().unwrap();
-    tasks["task"].as_array().unwrap().iter().map(|task| task["name"].as_str().unwrap().to_owned()).collect()
+    let named = tasks["task"].as_array().unwrap().iter().map(|task| task["name"].as_str().unwrap().to_owned());
+    named.chain(quad_dataset::ogbench::tasks().map(|names| names.task)).collect()
 }
 
 /// The keys of a group, those of its tables with a dot.

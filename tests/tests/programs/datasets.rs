@@ -95,7 +95,15 @@ fn a_task_of_ogbench_is_learnt_by_its_name_and_evaluated_here() {
     let run = scratch.path().join("run");
     let mut train = Command::new(binary("learner"));
     train.env("HOME", scratch.path()).env("QUAD_DATASETS_URL", format!("http://127.0.0.1:{port}"));
-    train.args(["train", "--task", "antmaze-medium-navigate-singletask-task2-v0", "--algorithm", "iql", "--evaluators", "1"]);
+    train.args([
+        "train",
+        "--task",
+        "antmaze-medium-navigate-singletask-task2-v0",
+        "--algorithm",
+        "iql",
+        "--evaluators",
+        "1",
+    ]);
     train.args(["--listen", &format!("tcp/127.0.0.1:{}", free_port())]);
     train.args(["--steps", "20", "--eval-interval", "20", "--episodes", "2", "--set", "batch_size=32", "--run-dir"]);
     let output = train.arg(&run).output().unwrap();
