@@ -153,8 +153,9 @@ def configure(algorithm, task, changes, phase):
 
 
 def prepare(name):
-    """The step `(state, inputs) -> (state, measured)`, and both of them."""
+    """The steps `(state, inputs) -> (state, measured)` in which all networks move, and both of them, inputs for each step."""
     config = configure(*names()[name])
+    count = config["agent"].get("actor_every", 1)
     module, rng = ALGORITHMS[config["algorithm"]], np.random.default_rng(0)
     given = {"config": config | {"agent": config["agent"] | {"candidates": 2}}, "rng": rng, "size": "hopper", "spread": 1.0}
 
@@ -164,14 +165,20 @@ def prepare(name):
 
     given["state"] = drawn("random_state")
     inputs = drawn("random_inputs")
-    return functools.partial(step, config), single(given["state"]), single(inputs)
+
+    def steps(state, inputs):
+        for i, of_step in enumerate(inputs):
+            state, measured = step(config | {"step": config["step"] + i}, state, of_step)
+        return state, measured
+
+    return steps, single(given["state"]), [single(inputs)] * count
 
 
 # Timing.
 
 
 def called(step, state, inputs):
-    """A function that makes five steps by five calls."""
+    """A function that makes the steps five times, by five calls."""
     compiled = jax.jit(step, donate_argnums=0)
     state = jax.tree.map(jnp.copy, state)
 
@@ -185,7 +192,7 @@ def called(step, state, inputs):
 
 
 def scanned(step, state, inputs):
-    """A function that makes five steps by one call."""
+    """A function that makes the steps five times, by one call."""
 
     @functools.partial(jax.jit, donate_argnums=0)
     def steps(state, inputs):
@@ -203,24 +210,25 @@ def scanned(step, state, inputs):
 
 
 def seconds_per_step(run, budget):
-    """Median over calls of `run`, which makes five steps."""
+    """Median over calls of `run`, which makes so many steps."""
+    run, steps = run
     times = []
     deadline = time.perf_counter() + budget
     while len(times) < 3 or time.perf_counter() < deadline:
         start = time.perf_counter()
         run()
-        times.append((time.perf_counter() - start) / 5)
+        times.append((time.perf_counter() - start) / steps)
     return statistics.median(times)
 
 
 @functools.cache
 def ways(name):
-    """{way: function that makes five steps}, compiled."""
+    """{way: function that makes steps, and how many}, compiled."""
     prepared = prepare(name)
     runs = {way.__name__: way(*prepared) for way in (called, scanned)}
     for run in runs.values():
         run()
-    return runs
+    return {way: (run, 5 * len(prepared[2])) for way, run in runs.items()}
 
 
 def check(folders):
