@@ -1,8 +1,11 @@
 """Tables of any kind, quad-convert, and the names that go from a table into the policy."""
 
 import json
+import re
 import subprocess
 import sys
+import tomllib
+from pathlib import Path
 
 import h5py
 import numpy as np
@@ -13,6 +16,7 @@ from conftest import train
 from lerobot_folder import episodes, write
 
 from quad_rl import Dataset, Policy, _convert
+from quad_rl._extras import EXTRAS
 
 COLUMNS = {"observations": ["x", "v"], "actions": ["torque"], "episode": "run"}
 
@@ -113,20 +117,44 @@ def test_quad_convert_reads_what_python_reads(tmp_path, capsys):
             file[f"data/demo_0/{name}"] = np.random.default_rng(0).uniform(-1, 1, (9, width))
         file["data/demo_0/rewards"] = file["data/demo_0/dones"] = np.arange(9) == 8
     assert convert(tmp_path / "demo.hdf5", "--observations", "object")[0] == 0
+    (tmp_path / "none-huge-v0.npz").touch()
     for message, words in {
         "needs --actions and --reward": [tmp_path / "log.csv", "--observations", "x", "--episode", "run"],
         "--task says nothing of this source": [*log, "--reward", "gain", "--task", "pick"],
         "nothing says what is rewarded": [folder, "--observations", "observation.state"],
         "there is no nothing.csv": ["nothing.csv"],
         "has no rewards": ["ogbench:cube-double-play-v0"],
+        "hint: put it and antmaze-huge-navigate-v0-val.npz there": ["ogbench:antmaze-huge-navigate-singletask-v0", "--folder", tmp_path],
+        "cannot be read: NameNotFound: ": ["ogbench:none-huge-singletask-v0", "--folder", tmp_path],
     }.items():
         status, said = convert(*words)
         assert status == 1 and said.startswith("quad-convert: ") and message in said, said
 
 
-def test_a_library_that_is_missing_is_named(tmp_path):
+MISSING = {
+    "pyarrow.parquet": ("lerobot", "Dataset.from_lerobot('lerobot', observations=['observation.state'], reward='step-cost', success='all')"),
+    "pyarrow": ("table", "Dataset.from_frame('log.csv', observations=['x'], actions=['x'], reward='x', episode='run')"),
+    "h5py": ("robomimic", "Dataset.from_robomimic('demo.hdf5', observations=['object'])"),
+    "minari": ("minari", "Dataset.from_minari('mujoco/hopper/medium-v0')"),
+    "PIL": ("minari", "Dataset.from_minari('mujoco/hopper/medium-v0')"),
+    "ogbench": ("ogbench", "Dataset.from_ogbench('cube-single-play-singletask-v0', folder='.')"),
+    "gymnasium": ("gymnasium", "_evaluate._Gymnasium('Hopper-v5')(0)"),
+    "onnx": ("onnx", "export_onnx('policy.safetensors', 'policy.onnx')"),
+}
+
+
+@pytest.mark.parametrize("module", MISSING)
+def test_a_library_that_is_missing_is_named_with_its_extra(module, tmp_path):
+    write(tmp_path / "lerobot", episodes())
     (tmp_path / "log.csv").write_text("x,run\n1,2\n")
-    code = f"import sys; sys.modules['pyarrow'] = None; import quad_rl; quad_rl.Dataset.from_frame({str(tmp_path / 'log.csv')!r}, " \
-           "observations=['x'], actions=['x'], reward='x', episode='run')"
-    said = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60).stderr
-    assert "ImportError: reading this needs pyarrow" in said and "hint: pip install pyarrow" in said
+    extra, call = MISSING[module]
+    code = f"import sys; sys.modules[{module!r}] = None; import quad_rl; quad_rl.{call}"
+    said = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60, cwd=tmp_path).stderr
+    assert "ImportError: " in said and "hint: pip install " in said and f"which the extra '{extra}' of quad-rl names" in said, said
+
+
+def test_extras_are_what_the_hints_say():
+    project = tomllib.loads((Path(__file__).parents[1] / "pyproject.toml").read_text())["project"]
+    of_project = {extra: [re.split("[>=]", package)[0] for package in packages]
+                  for extra, packages in project["optional-dependencies"].items()}
+    assert of_project == EXTRAS

@@ -45,6 +45,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except (ValueError, ImportError, OSError) as error:
         print(f"quad-convert: {error}", file=sys.stderr)
         return 1
+    except Exception as error:  # A source's own library raises what it will, such as httpx's where there is no network.
+        print(f"quad-convert: {source} cannot be read: {type(error).__name__}: {error}", file=sys.stderr)
+        return 1
     print(dataset)
     print(f"\nwritten to {out}: learner train --task own-data --env my-robot --dataset {out} --scale actions,states")
     return 0

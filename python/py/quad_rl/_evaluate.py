@@ -16,6 +16,7 @@ from typing import Any
 import cloudpickle  # type: ignore[import-untyped]
 
 from quad_rl import _quad_rl
+from quad_rl._extras import library
 from quad_rl._process import Worker
 
 # Between two looks for workers that were killed, seconds.
@@ -150,9 +151,7 @@ class _Gymnasium:
         self.name = name
 
     def __call__(self, _seed: int) -> Any:
-        import gymnasium
-
-        return gymnasium.make(self.name)
+        return library("gymnasium", "gymnasium").make(self.name)
 
 
 def _score(score: str | tuple[float, float]) -> str | tuple[float, float]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from os import PathLike
 
+from quad_rl._extras import library
 from quad_rl._quad_rl import Policy
 
 
@@ -30,13 +31,9 @@ def export_onnx(
     Raises ImportError without the package onnx, ValueError for a choice that the policy cannot make, OSError if the file
     cannot be written.
     """
-    try:
-        from quad_rl.onnx.export import model
-    except ImportError as error:
-        if error.name != "onnx":
-            raise
-        message = "export_onnx takes the package onnx\nhint: pip install onnx"
-        raise ImportError(message, name="onnx") from error
+    library("onnx", "onnx")
+    from quad_rl.onnx.export import model
+
     if not isinstance(policy, Policy):
         policy = Policy.load(policy)
     written = model(policy, candidates=candidates, rule=rule, value=value).SerializeToString()

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from quad_rl.readers.episodes import library
+from quad_rl._extras import library
 
 
 def array_of(column: Any, name: str, place: str) -> NDArray[Any]:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple, Union
 
@@ -40,16 +39,6 @@ class Log(NamedTuple):
     success: str = ""
     done: str = ""
     end: str = "terminate"  # What the reader calls `terminate`.
-
-
-def library(module: str, extra: str) -> Any:
-    """An optional library."""
-    try:
-        return importlib.import_module(module)
-    except ImportError as error:
-        package = module.split(".")[0]
-        hint = f"hint: pip install {package}, which the extra {extra!r} of quad-rl names"
-        raise ImportError(f"reading this needs {package}: {error}\n{hint}") from None
 
 
 def columns_of(*rules: Any) -> set[str] | None:

@@ -11,8 +11,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from quad_rl import _dataset
+from quad_rl._extras import library
 from quad_rl.readers.arrow import array_of
-from quad_rl.readers.episodes import Episode, Log, Rule, Success, columns_of, dataset, library
+from quad_rl.readers.episodes import Episode, Log, Rule, Success, columns_of, dataset
 
 
 def from_frame(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 from collections.abc import Mapping
 from os import PathLike
 from pathlib import Path
@@ -11,7 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from quad_rl import _dataset
-from quad_rl.readers.episodes import Episode, Log, dataset, library
+from quad_rl._extras import needing
+from quad_rl.readers.episodes import Episode, Log, dataset
 
 _ACTIONS, _REWARDS, _TERMINATIONS = "actions", "rewards", "terminations"
 
@@ -26,10 +28,16 @@ def from_minari(id_or_folder: str | PathLike[str]) -> _dataset.Dataset:
     `terminations` are. Where an episode has no observation after its last step, as older ones have not, that step is
     dropped unless it is terminal. Raises ValueError for images, texts and discrete actions, ImportError without minari.
     """
-    minari = library("minari", "minari")
-    folders = [Path(id_or_folder, "data"), Path(id_or_folder)]
+    with needing("minari"):  # Also while it reads: it imports a storage's libraries then.
+        return _read(Path(id_or_folder))
+
+
+def _read(place: Path) -> _dataset.Dataset:
+    minari: Any = importlib.import_module("minari")
+
+    folders = [place / "data", place]
     folder = next((folder for folder in folders if (folder / "metadata.json").is_file()), None)
-    data = minari.MinariDataset(folder) if folder else minari.load_dataset(str(id_or_folder), download=True)
+    data = minari.MinariDataset(folder) if folder else minari.load_dataset(str(place), download=True)
     episodes, seen, done = [], {}, {}
     for episode in data.iterate_episodes():
         steps = len(episode.rewards)
