@@ -27,7 +27,7 @@ pub struct GroupReport {
     pub method: String,
     /// The hyper-parameters that matter most.
     pub agent: String,
-    /// What the paper calls this variant of the algorithm, if it has a row of it.
+    /// What sources of published figures call this variant of the algorithm, if they have a row of it.
     pub methods: Vec<&'static str>,
     /// Gradient steps that were asked for.
     pub steps: u64,
@@ -66,7 +66,7 @@ pub struct GroupReport {
     pub left_out: Vec<String>,
     /// The settings in which other runs of the task and algorithm differ from these.
     pub differs: Vec<String>,
-    /// How these runs depart from the paper's protocol; empty where the task is none of the paper's.
+    /// How these runs depart from their authors' protocol; empty where nothing is published for the task.
     pub departures: Vec<String>,
     /// What is published for the task.
     pub published: Vec<Published>,
@@ -177,7 +177,7 @@ fn group(runs: &[&RunReport], method: String, differs: Vec<String>, select: Sele
         Spread::of(&values?)
     };
     let score = |run: &&RunReport| match select {
-        Select::Last => run.mean_last_5,
+        Select::Last => run.score(),
         Select::Best => run.best().map(|best| best.score.mean),
     };
     let scores: Option<Vec<f64>> = counted.iter().map(score).collect();

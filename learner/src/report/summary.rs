@@ -1,17 +1,17 @@
-//! The whole report: a table of each run, summaries over seeds, methods and tasks, and the paper's tables with ours beside them.
+//! The whole report: a table of each run, summaries over seeds, methods and tasks, and published tables with ours beside them.
 
 use std::collections::BTreeSet;
 use std::fmt::Alignment::{Left, Right};
 use std::io;
 use std::path::{Path, PathBuf};
 
-use quad_run::results::{Ranking, RunReport, Select, Spread};
+use quad_run::results::{Ranking, RunReport, Select, Spread, published};
 use quad_run::run::walk;
 use quad_run::table::{Part, Style, Table};
 use serde::Serialize;
 use tracing::warn;
 
-use super::paper;
+use super::beside;
 use super::seeds::{self, GroupReport};
 use super::study::{self, Comparison, MethodReport};
 
@@ -69,7 +69,7 @@ impl Report {
     }
 
     /// Every part: a table of each run that was named itself, the summaries over seeds, methods and tasks if there are several
-    /// runs, and the paper's tables where they have these tasks. Other styles than text leave out the single runs.
+    /// runs, and published tables where they have these tasks. Other styles than text leave out the single runs.
     pub fn render(&self, style: Style) -> String {
         let mut parts = Vec::new();
         if style == Style::Text {
@@ -93,7 +93,9 @@ impl Report {
         parts.extend((!self.unreadable.is_empty()).then(|| Part::Words(unreadable.collect())));
         let judgements = self.runs.iter().flat_map(|run| run.judgements.iter().cloned());
         parts.extend(Ranking::of(judgements).iter().flat_map(Ranking::parts));
-        parts.extend([1, 2].into_iter().flat_map(|number| paper::table(number, &self.groups, self.select)));
+        parts.extend(
+            published::all_tables().into_iter().flat_map(|name| beside::table(name, &self.groups, self.select)),
+        );
         parts
     }
 

@@ -1,11 +1,11 @@
-//! Where runs of one of the paper's tasks differ from what the authors of their algorithm ran.
+//! Where runs of a task with published scores differ from what the authors of their algorithm ran.
 
 use std::collections::BTreeSet;
 
 use quad_algorithms::Variant;
 use quad_dataset::catalogue;
 
-use super::published::{self, SEEDS};
+use super::published;
 use super::run::RunReport;
 use super::selection::Select;
 use crate::config::settings::{self, Settings, differences};
@@ -20,7 +20,8 @@ pub fn departures(runs: &[&RunReport], scored_in: &str, select: Select) -> Vec<S
     let Ok(paper) = as_published(run) else { return Vec::new() };
     let mut departures = Vec::new();
     if select == Select::Best {
-        departures.push("the best evaluation of each run, not the mean of its last five".to_owned());
+        let last = published::last(&run.task);
+        departures.push(format!("the best evaluation of each run, not the mean of its last {last}"));
     }
     departures.extend(ours.definition().and_then(|known| hyperparameters::not_given(&known, task)).ok().flatten());
     if !is_trained_on(run, paper.dataset.as_deref()) {
@@ -39,8 +40,9 @@ pub fn departures(runs: &[&RunReport], scored_in: &str, select: Select) -> Vec<S
     if let Some(least) = runs.iter().filter(|run| !run.is_complete()).min_by_key(|run| run.evaluations_complete()) {
         departures.push(least.how_complete());
     }
-    if runs.len() < SEEDS {
-        departures.push(format!("{} of {SEEDS} seeds", runs.len()));
+    let seeds = published::seeds(&run.task);
+    if runs.len() < seeds {
+        departures.push(format!("{} of {seeds} seeds", runs.len()));
     }
     departures
 }

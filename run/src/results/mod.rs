@@ -1,7 +1,7 @@
-//! The results of a run: its scores, summarised; the statistics of many runs; and the paper's own figures.
+//! The results of a run: its scores, summarised; the statistics of many runs; and published figures.
 //!
-//! In reading order: `run` reads a run, `evaluation` summarises one of its evaluations; `statistics` has the definitions; `published` has the paper's figures, `departures` the
-//! differences between a run and the paper's; `judgement` what is known of policies without a simulator. `selection` and `spread` are small parts of these.
+//! In reading order: `run` reads a run, `evaluation` summarises one of its evaluations; `statistics` has the definitions; `published` has others' figures, `departures` the
+//! differences between a run and its authors'; `judgement` what is known of policies without a simulator. `selection` and `spread` are small parts of these.
 
 pub mod departures;
 pub mod evaluation;

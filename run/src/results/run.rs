@@ -13,6 +13,7 @@ use serde::Serialize;
 
 use super::evaluation::EvaluationReport;
 use super::judgement::Judgement;
+use super::published;
 use super::spread::Spread;
 use crate::config::RunConfig;
 use crate::run::{RunDir, ScoreLine, open_file};
@@ -162,6 +163,11 @@ impl RunReport {
             precisions,
             config,
         }
+    }
+
+    /// Mean score of as many of the last complete evaluations as its task's published figures are of; absent if they are fewer.
+    pub fn score(&self) -> Option<f64> {
+        if published::last(&self.task) == 3 { self.mean_last_3 } else { self.mean_last_5 }
     }
 
     /// Whether every episode of every evaluation has its score.

@@ -16,7 +16,7 @@ pub enum Select {
 impl Select {
     /// What a reader has to know before the figures, if they are not the paper's protocol.
     pub fn warning(self) -> Option<&'static str> {
-        const SELECTED: &str = "Selected: of each run its best complete evaluation counts, in place of the mean of its last five. It is chosen by the very \
+        const SELECTED: &str = "Selected: of each run its best complete evaluation counts, in place of the mean of its last ones. It is chosen by the very \
              scores that are reported, so it is optimistic, and the more so the more evaluations there are.\n";
         (self == Self::Best).then_some(SELECTED)
     }

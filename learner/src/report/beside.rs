@@ -1,23 +1,20 @@
-//! Tables 1 and 2 of the paper, with our runs beside its figures.
+//! Tables of published figures, with our runs beside them.
 
 use std::fmt::Alignment::{Left, Right};
 
-use quad_run::results::published::{self, Published, Remark};
+use quad_run::results::published::{self, Published, Remark, once_each};
 use quad_run::results::{Select, Spread};
 use quad_run::table::{Part, Table};
 
 use super::seeds::GroupReport;
 
-/// What the paper prints for a task.
+/// What is published for a task.
 type Figure<'a> = (&'a str, &'a Published);
 
-/// A table of the paper, in its rows the tasks that some of these runs have learnt, with what stands behind each figure below
-/// it; nothing without such runs.
-pub fn table(number: u8, groups: &[GroupReport], select: Select) -> Vec<Part> {
-    let is_in = |group: &&GroupReport| {
-        let is_of_table = group.published.iter().any(|published| published.tables == [number]);
-        is_of_table && published::is_in(number, &group.algorithm)
-    };
+/// A table, in its rows the tasks that some of these runs have learnt, with what stands behind each figure below it; nothing
+/// without such runs.
+pub fn table(name: &str, groups: &[GroupReport], select: Select) -> Vec<Part> {
+    let is_in = |group: &&GroupReport| published::tables(&group.task, &group.algorithm).contains(&name);
     let groups: Vec<&GroupReport> = groups.iter().filter(is_in).collect();
     if groups.is_empty() {
         return Vec::new();
@@ -27,7 +24,7 @@ pub fn table(number: u8, groups: &[GroupReport], select: Select) -> Vec<Part> {
     let of_task = |task: &&str| groups.iter().find(|group| group.task == *task).map(|group| (group, &group.published));
     let figures =
         tasks.iter().filter_map(of_task).flat_map(|(group, all)| all.iter().map(|figure| (&*group.task, figure)));
-    let figures: Vec<Figure> = figures.filter(|(_, figure)| figure.tables.contains(&number)).collect();
+    let figures: Vec<Figure> = figures.filter(|(_, figure)| figure.tables.iter().any(|table| table == name)).collect();
     let theirs = once_each(figures.iter().map(|(_, figure)| figure.method));
     let mut notes = Notes::of(&figures);
 
@@ -49,28 +46,18 @@ pub fn table(number: u8, groups: &[GroupReport], select: Select) -> Vec<Part> {
         table.push(row);
     }
     let score = match select {
-        Select::Last => "the mean of its last 5 evaluations",
-        Select::Best => "its best evaluation",
+        Select::Last => format!("the mean of its last {} evaluations", published::last(&groups[0].task)),
+        Select::Best => "its best evaluation".to_owned(),
     };
+    let protocol = figures.first().map(|(_, figure)| figure.protocol).unwrap_or_default();
     let title = format!(
-        "Table {number} of the paper. Ours: mean ± standard deviation over seeds, divided by n - 1 (in parentheses: by n); a run's \
-         score is {score}. The paper does not say how its ± is computed; DAC's code, on which its own is built, divides by \
-         the number of seeds n.\n"
+        "{name}. Ours: mean ± standard deviation over seeds, divided by n - 1 (in parentheses: by n); a run's score is {score}. \
+         {protocol}\n"
     );
     vec![Part::Words(title), Part::Table(table), Part::Words(notes.text(&figures, select))]
 }
 
-fn once_each<'a>(names: impl Iterator<Item = &'a str>) -> Vec<&'a str> {
-    let mut known = Vec::new();
-    for name in names {
-        if !known.contains(&name) {
-            known.push(name);
-        }
-    }
-    known
-}
-
-/// What stands behind figures: of ours numbered, of the paper's with letters.
+/// What stands behind figures: of ours numbered, of others' with letters.
 struct Notes {
     ours: Vec<String>,
     theirs: Vec<&'static str>,
@@ -86,7 +73,7 @@ impl Notes {
     fn ours(&mut self, group: &GroupReport) -> String {
         let mut note = group.behind();
         if !group.departures.is_empty() {
-            note += &format!(". Not the paper's protocol: {}", group.departures.join("; "));
+            note += &format!(". Not its authors' protocol: {}", group.departures.join("; "));
         }
         if let Some(goals) = group.goals {
             note += &format!(
@@ -102,7 +89,7 @@ impl Notes {
         format!("{score} [{}]", index + 1)
     }
 
-    /// A figure as the paper prints it, with the letters of its remarks.
+    /// A figure as it is printed, with the letters of its remarks.
     fn theirs(&self, figure: &Published) -> String {
         let is_on = |reason: &str| figure.remarks.iter().any(|remark| remark.reason == reason);
         let letters = self.theirs.iter().zip('a'..='z').filter(|(reason, _)| is_on(reason)).map(|(_, letter)| letter);
@@ -128,12 +115,11 @@ impl Notes {
             let instead = Vec::from_iter(instead).join(",");
             text += &format!("- {letter} ({methods}): {selected}{reason}{instead}\n");
         }
+        let selected = figures.iter().filter(|(_, figure)| figure.remarks.iter().any(|remark| remark.selected));
+        let selected = once_each(selected.map(|(_, figure)| figure.method)).join(", ");
         if select == Select::Best {
-            let selected = figures.iter().filter(|(_, figure)| figure.remarks.iter().any(|remark| remark.selected));
-            let selected = once_each(selected.map(|(_, figure)| figure.method)).join(", ");
-            text += &format!(
-                "- Of the paper's figures, such selection stands behind those of {selected}, as far as is known.\n"
-            );
+            text +=
+                &format!("- Of these figures, such selection stands behind those of {selected}, as far as is known.\n");
         }
         text
     }
