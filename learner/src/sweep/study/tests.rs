@@ -121,11 +121,18 @@ fn the_command_line_keeps_to_some_runs_and_changes_all_of_them() {
     assert!(error.contains("seed is an axis, and --set has it, too"), "{error}");
 }
 
-/// How many runs the paper's studies have: Table 1 without two methods in mazes, Table 2's two on seven tasks, five values of τ.
+/// How many runs studies have: Table 1 without two methods in mazes, Table 2's two on seven tasks, five values of τ, and what is
+/// compared today: seven methods with eight seeds in six mazes and with five tables of an arm.
 #[test]
-fn the_paper_s_studies_are_what_it_trains() {
+fn studies_are_what_papers_train() {
     let folder = Path::new(env!("CARGO_MANIFEST_DIR")).join("../studies");
-    for (name, runs) in [("table1", (15 * 12 - 6 * 2) * 4), ("table2", 7 * 2 * 4), ("tau", 15 * 5 * 4)] {
+    for (name, runs) in [
+        ("table1", (15 * 12 - 6 * 2) * 4),
+        ("table2", 7 * 2 * 4),
+        ("tau", 15 * 5 * 4),
+        ("today", 6 * 7 * 8),
+        ("today-arm", 5 * 7 * 8),
+    ] {
         let study = Study::read(&folder.join(name).with_extension("toml"), &[], &[]).unwrap();
         assert_eq!(study.runs.len(), runs, "{name}");
         // Each begins from the paper's own settings of its task.
