@@ -102,9 +102,12 @@ impl Notes {
     fn text(&self, figures: &[Figure], select: Select) -> String {
         let numbered = self.ours.iter().zip(1..).map(|(note, number)| format!("- [{number}] {note}.\n"));
         let mut text = String::from_iter(numbered);
-        let sources = figures.iter().map(|(_, figure)| format!("{}: {}", figure.method, figure.source));
-        let sources: Vec<String> = sources.collect();
-        text += &format!("- Sources: {}.\n", once_each(sources.iter().map(|source| &**source)).join("; "));
+        let of_source = |source: &str| {
+            let figures = figures.iter().filter(|(_, figure)| figure.source == source);
+            format!("{}: {source}", once_each(figures.map(|(_, figure)| figure.method)).join(", "))
+        };
+        let sources = once_each(figures.iter().map(|(_, figure)| figure.source));
+        text += &format!("- Sources: {}.\n", sources.into_iter().map(of_source).collect::<Vec<_>>().join("; "));
         for (reason, letter) in self.theirs.iter().zip('a'..='z') {
             let remark = |figure: &Published| figure.remarks.iter().find(|remark| remark.reason == *reason).cloned();
             let on: Vec<(&Figure, Remark)> = figures.iter().filter_map(|one| Some((one, remark(one.1)?))).collect();

@@ -136,6 +136,7 @@ fn what_others_publish_stands_beside_runs_of_their_tasks() {
     reported.has_row(&["task", "ours: fql", "BC", "IQL", "ReBRAC", "IDQL", "IFQL", "FQL"]);
     reported.has_row(&[task, " 9.00 ", " 5.0 a ", " 85.0 b ", " 92.0 bc ", " 97.0 b"]);
     reported.has_row(&["- [1] 1 seed, ", "Not its authors' protocol: episodes is 1, not 50; 1 of 8 seeds"]);
+    reported.has_row(&["- Sources: BC, IQL, ReBRAC, IDQL, IFQL, FQL: Park, Li and Levine 2025."]);
     reported.says(&["- b (IQL, ReBRAC, IFQL, FQL): selected by test returns: weights such as"]);
 
     let reported = report(&[Run::by("td3-bc", "hopper-medium-v2", 0)]);

@@ -24,9 +24,9 @@ pub fn departures(runs: &[&RunReport], scored_in: &str, select: Select) -> Vec<S
         departures.push(format!("the best evaluation of each run, not the mean of its last {last}"));
     }
     departures.extend(ours.definition().and_then(|known| hyperparameters::not_given(&known, task)).ok().flatten());
-    if !is_trained_on(run, paper.dataset.as_deref()) {
-        let name = |dataset: &Option<String>| dataset.clone().unwrap_or_else(|| "not named".to_owned());
-        departures.push(format!("dataset is {}, not {}", name(&ours.dataset), name(&paper.dataset)));
+    if let Some(theirs) = paper.dataset.as_deref().filter(|theirs| !is_trained_on(run, theirs)) {
+        let name = ours.dataset.as_deref().unwrap_or("not named");
+        departures.push(format!("dataset is {name}, not {theirs}"));
     }
     let (ours, paper) = (without_seed(ours), without_seed(&paper));
     let keys: BTreeSet<&String> = differences(&ours, &paper).collect();
@@ -70,8 +70,8 @@ fn without_seed(experiment: &Experiment) -> Settings {
 }
 
 /// Whether a run learnt from the dataset of that name, whatever it was called on the command line.
-fn is_trained_on(run: &RunReport, dataset: Option<&str>) -> bool {
-    let known = dataset.and_then(catalogue::find).and_then(|known| known.sha256.as_ref());
+fn is_trained_on(run: &RunReport, dataset: &str) -> bool {
+    let known = catalogue::find(dataset).and_then(|known| known.sha256.as_ref());
     let same_file = known.is_some() && run.config.dataset.sha256.as_ref() == known;
-    same_file || run.config.experiment.dataset.as_deref() == dataset
+    same_file || run.config.experiment.dataset.as_deref() == Some(dataset)
 }
