@@ -112,7 +112,7 @@ impl Update for AlignIql {
 
     fn begin(&mut self, networks: &mut Networks, step: u64) -> Result<()> {
         let (config, decay) = (&self.config, cosine_decay(step, networks.context.total_steps));
-        let adam = |rate: f32| AdamStep { rate, clip: None, count: step + 1 };
+        let adam = |rate: f32| AdamStep::after(step, rate);
         networks.actor.adam.set(adam(*config.actor_learning_rate * decay))?;
         self.value.adam.set(adam(*config.value_learning_rate))?;
         networks.critics.adam.set(adam(*config.critic_learning_rate))

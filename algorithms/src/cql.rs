@@ -176,7 +176,7 @@ impl Cql {
 
     /// Update number `step`, from 0. All losses are of the networks as they are before it.
     fn step(&mut self, step: u64, batch: &Minibatch, noise: &Noise) -> Result<Measured> {
-        let adam = |rate: f32| AdamStep { rate, clip: None, count: step + 1 };
+        let adam = |rate: f32| AdamStep::after(step, rate);
         let (slow, fast) = (adam(*self.config.actor_learning_rate), adam(*self.config.critic_learning_rate));
         let current = self.actor.distribution(&batch.observations)?;
         let next = self.actor.constant_distribution(&batch.next_observations)?;

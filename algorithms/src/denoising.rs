@@ -2,7 +2,7 @@
 
 use super::replay::Inputs;
 use candle_core::{Device, Result, Shape, Tensor};
-use quad_policy::Schedule;
+use quad_policy::{ContinuousNoise, Schedule};
 use rand::Rng;
 use rand_distr::{Distribution, StandardNormal};
 
@@ -42,5 +42,25 @@ impl Denoising {
     /// √ᾱ_t·a + √(1 − ᾱ_t)·ε of actions a, all `[B, a]`.
     pub fn noisy(&self, actions: &Tensor) -> Result<Tensor> {
         (actions * &self.signal)? + (&self.epsilon * &self.deviation)?
+    }
+}
+
+/// How the actions of a batch are made noisy in continuous time.
+pub(super) struct NoiseInTime {
+    /// Time of each, within [0, 1], `[B]`.
+    pub t: Vec<f64>,
+    /// The noise ε that is to be predicted, `[B, a]`.
+    pub epsilon: Tensor,
+}
+
+impl NoiseInTime {
+    /// α_t·a + σ_t·ε of actions a, all `[B, a]`.
+    pub fn noisy(&self, actions: &Tensor) -> Result<Tensor> {
+        let column = |of: fn(ContinuousNoise) -> f64| {
+            let numbers = self.t.iter().map(|t| of(ContinuousNoise::at(*t)) as f32).collect::<Vec<_>>();
+            Tensor::from_vec(numbers, (self.t.len(), 1), actions.device())
+        };
+        let signal = actions.broadcast_mul(&column(|noise| noise.signal)?)?;
+        signal + self.epsilon.broadcast_mul(&column(|noise| noise.deviation)?)?
     }
 }

@@ -170,7 +170,7 @@ impl Diffuser {
 
     /// Update number `step`, from 0: both networks on the same noisy windows.
     fn step(&mut self, step: u64, batch: &Batch, noise: &Noise) -> Result<Measured> {
-        let adam = AdamStep { rate: *self.config.learning_rate, clip: None, count: step + 1 };
+        let adam = AdamStep::after(step, *self.config.learning_rate);
         let noisy = self.noisy(&batch.windows, noise)?;
         let follow = step.is_multiple_of(*self.config.ema_every);
         let rate = if step < self.config.ema_start { 1.0 } else { *self.config.ema_rate };

@@ -167,7 +167,7 @@ impl Dtql {
             false => 1.0,
         };
         let rate = *self.config.learning_rate * decay;
-        let adam = AdamStep { rate, clip: None, count: step + 1 };
+        let adam = AdamStep::after(step, rate);
         let mut measured =
             self.learn_values(batch, AdamStep { rate: *self.config.critic_learning_rate * decay, ..adam })?;
         measured.extend(self.clone_data(batch, &noise.cloning, adam)?);

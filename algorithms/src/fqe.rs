@@ -170,7 +170,7 @@ impl Fqe {
         let targets = self.targets(&batch, &next_actions)?;
         let of_network = targets.affine(1.0 / self.units.scale, -self.units.offset / self.units.scale)?;
         let loss = self.critic.network.squared_error(&batch.observations, &batch.actions, &of_network)?;
-        self.critic.descend(&loss, AdamStep { rate: *self.config.learning_rate, clip: None, count: step + 1 })?;
+        self.critic.descend(&loss, AdamStep::after(step, *self.config.learning_rate))?;
         self.target_critic.follow(&self.critic.network, *self.config.ema_rate)?;
         measured([("q_mean", &targets.mean_all()?), ("critic_loss", &loss)])
     }

@@ -108,7 +108,7 @@ impl Fql {
 
     /// Update number `step`. All losses are those of the networks before it, and the targets follow these.
     fn step(&mut self, step: u64, batch: &Minibatch, noise: &Noise) -> Result<Measured> {
-        let adam = AdamStep { rate: *self.config.learning_rate, clip: None, count: step + 1 };
+        let adam = AdamStep::after(step, *self.config.learning_rate);
         let targets = self.targets(batch, &noise.of_targets)?;
         let critic_loss = self.critics.network.squared_error(&batch.observations, &batch.actions, &targets)?;
         let bc_loss = self.flow_loss(batch, noise)?;

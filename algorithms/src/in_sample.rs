@@ -135,8 +135,7 @@ impl<L: Losses> InSample<L> {
 
     /// Update number `step`; `pairs` are what [`Losses::pairs`] gives.
     pub fn step(&mut self, step: u64, batch: &Minibatch, pairs: Option<(Tensor, Tensor)>) -> Result<Measured> {
-        let (common, count) = (self.losses.common(), step + 1);
-        let adam = |rate: f32, count: u64| AdamStep { rate, clip: None, count };
+        let common = self.losses.common();
 
         // V(s) towards the smaller Q̂(s, a).
         let q = smaller(&self.target_critics.values(&batch.observations, &batch.actions)?)?;
@@ -146,9 +145,9 @@ impl<L: Losses> InSample<L> {
         };
         let mut value_loss = q.mean_all()?;
         let steps = self.losses.value_steps();
-        for i in 1..=steps {
+        for i in 0..steps {
             value_loss = self.losses.value_loss(&fitted, &self.value.network.state_values(states)?.squeeze(0)?)?;
-            let adam = adam(*common.value_learning_rate, step * steps + i);
+            let adam = AdamStep::after(step * steps + i, *common.value_learning_rate);
             self.value.descend(&value_loss, adam)?;
         }
 
@@ -163,14 +162,14 @@ impl<L: Losses> InSample<L> {
         let actor_loss = (&weight * log_probability)?.mean_all()?.neg()?;
         let decay = if self.losses.actor_rate_decays() { cosine_decay(step, self.context.total_steps) } else { 1.0 };
         let rate = *common.actor_learning_rate * decay;
-        self.actor.descend(&actor_loss, adam(rate, count))?;
+        self.actor.descend(&actor_loss, AdamStep::after(step, rate))?;
 
         // Q(s, a) towards r + γ·V(s').
         let next = value.state_values(&batch.next_observations)?.squeeze(0)?;
         let targets = batch.target(*common.gamma, &next)?;
         let values = self.critics.network.values(&batch.observations, &batch.actions)?;
         let critic_loss = self.losses.critic_loss(&values, &targets)?;
-        self.critics.descend(&critic_loss, adam(*common.critic_learning_rate, count))?;
+        self.critics.descend(&critic_loss, AdamStep::after(step, *common.critic_learning_rate))?;
         self.target_critics.follow(&self.critics.network, *common.ema_rate)?;
 
         let mut measured = measured([

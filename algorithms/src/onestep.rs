@@ -135,7 +135,7 @@ impl Onestep {
 
     /// Adam's step after so many others of its phase.
     fn adam(&self, steps: u64) -> AdamStep {
-        AdamStep { rate: *self.config.learning_rate, clip: None, count: steps + 1 }
+        AdamStep::after(steps, *self.config.learning_rate)
     }
 
     /// First phase: β towards the data's actions, and π with it.

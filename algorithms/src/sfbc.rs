@@ -10,7 +10,7 @@ mod golden;
 use super::algorithm::{AgentError, Algorithm, AlgorithmError, Measured, check, measured};
 use super::context::{Context, Minibatch};
 use super::definition::{Definition, Metric, Reporting, metrics, read};
-use super::denoising::normal;
+use super::denoising::{NoiseInTime, normal};
 use super::hyperparameters::{Candidates, Count, Positive, Share, Steps};
 use super::parts::Parts;
 use super::phases;
@@ -20,8 +20,8 @@ use super::trained::{Trained, ensemble, initial};
 use candle_core::{Device, Result, Tensor};
 use quad_dataset::Batch;
 use quad_policy::{
-    AdamStep, Choice, ContinuousNoise, DpmSolver, Ensemble, MlpConfig, PolicyConfig, Reduce, Rule, ScoreNetwork,
-    ScorePolicy, ScorePolicyShape, ScoreShape, Tensors,
+    AdamStep, Choice, DpmSolver, Ensemble, MlpConfig, PolicyConfig, Reduce, Rule, ScoreNetwork, ScorePolicy,
+    ScorePolicyShape, ScoreShape, Tensors,
 };
 use rand::Rng;
 use rand_distr::{Distribution, StandardNormal};
@@ -103,14 +103,6 @@ enum Phase {
     Planning(Range<usize>),
 }
 
-/// How a batch of actions is made noisy.
-struct Noise {
-    /// `[B]`.
-    t: Vec<f64>,
-    /// `[B, a]`.
-    epsilon: Tensor,
-}
-
 /// SfBC in the middle of a run.
 struct Sfbc {
     config: Config,
@@ -190,12 +182,11 @@ impl Sfbc {
     }
 
     /// ε_θ towards the noise in the data's actions.
-    fn clone_behavior(&mut self, batch: &Minibatch, noise: &Noise, steps: u64) -> Result<Measured> {
+    fn clone_behavior(&mut self, batch: &Minibatch, noise: &NoiseInTime, steps: u64) -> Result<Measured> {
         let noisy = noise.noisy(&batch.actions)?;
         let predicted = self.actor.network.predict(&batch.observations, &noisy, &noise.t)?;
         let loss = (predicted - &noise.epsilon)?.sqr()?.sum(1)?.mean_all()?;
-        let rate = *self.config.actor_learning_rate;
-        self.actor.descend(&loss, AdamStep { rate, clip: None, count: steps + 1 })?;
+        self.actor.descend(&loss, AdamStep::after(steps, *self.config.actor_learning_rate))?;
         measured([("bc_loss", &loss)])
     }
 
@@ -207,8 +198,7 @@ impl Sfbc {
         let items = Tensor::from_slice(items, items.len(), &Device::Cpu)?;
         let targets = self.returns.targets.index_select(&items, 0)?.to_device(&self.context.device)?;
         let loss = self.critic.network.squared_error(&batch.observations, &batch.actions, &targets)?;
-        let rate = *self.config.critic_learning_rate;
-        self.critic.descend(&loss, AdamStep { rate, clip: None, count: steps + 1 })?;
+        self.critic.descend(&loss, AdamStep::after(steps, *self.config.critic_learning_rate))?;
         measured([("critic_loss", &loss), ("q_mean", &targets.mean_all()?)])
     }
 
@@ -234,11 +224,11 @@ impl Sfbc {
     }
 
     /// The noise of a cloning step.
-    fn noise(&self, step: u64) -> Result<Noise> {
+    fn noise(&self, step: u64) -> Result<NoiseInTime> {
         let (context, generator) = (&self.context, &mut stream(self.context.seed, Purpose::Noise, step));
         let epsilon = normal((context.batch_size, context.action_dim()), generator, &context.device)?;
         let t = (0..context.batch_size).map(|_| generator.random_range(FIRST_TIME..1.0)).collect();
-        Ok(Noise { t, epsilon })
+        Ok(NoiseInTime { t, epsilon })
     }
 
     /// The noise of the clone's actions in some states.
@@ -255,18 +245,6 @@ impl Sfbc {
 /// A critic at its beginning.
 fn first_critic(shape: &ScorePolicyShape, context: &Context) -> Result<Trained<Ensemble>> {
     ensemble(shape.critic(), context, 1)
-}
-
-impl Noise {
-    /// a_t = α_t·a + σ_t·ε, `[B, a]`.
-    fn noisy(&self, actions: &Tensor) -> Result<Tensor> {
-        let column = |of: fn(ContinuousNoise) -> f64| {
-            let numbers = self.t.iter().map(|t| of(ContinuousNoise::at(*t)) as f32).collect::<Vec<_>>();
-            Tensor::from_vec(numbers, (self.t.len(), 1), actions.device())
-        };
-        let signal = actions.broadcast_mul(&column(|noise| noise.signal)?)?;
-        signal + self.epsilon.broadcast_mul(&column(|noise| noise.deviation)?)?
-    }
 }
 
 impl Algorithm for Sfbc {

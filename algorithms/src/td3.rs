@@ -114,7 +114,7 @@ impl<N: Near> Td3<N> {
         let Common { actor_every, ema_rate, actor_learning_rate, critic_learning_rate, .. } = self.near.common();
         let q = self.critics.network.values(&batch.observations, &batch.actions)?;
         let critic_loss = (q.broadcast_sub(&targets)?.sqr()?.mean_all()? * CRITICS as f64)?;
-        self.critics.descend(&critic_loss, adam(**critic_learning_rate, step))?;
+        self.critics.descend(&critic_loss, AdamStep::after(step, **critic_learning_rate))?;
         if step % **actor_every == N::FIRST % **actor_every {
             let actions = gaussian_mean(&self.actor.network, &batch.observations)?;
             let q = self.critics.network.detach().values(&batch.observations, &actions)?;
@@ -122,7 +122,7 @@ impl<N: Near> Td3<N> {
             if N::LAGS {
                 self.target_actor.follow(&self.actor.network, **ema_rate)?;
             }
-            self.actor.descend(&actor_loss, adam(**actor_learning_rate, step / **actor_every))?;
+            self.actor.descend(&actor_loss, AdamStep::after(step / **actor_every, **actor_learning_rate))?;
             if !N::LAGS {
                 self.target_actor.follow(&self.actor.network, **ema_rate)?;
             }
@@ -149,11 +149,6 @@ impl<N: Near> Td3<N> {
         }
         batch.target(**gamma, &q)
     }
-}
-
-/// Adam's step after so many others.
-fn adam(rate: f32, steps: u64) -> AdamStep {
-    AdamStep { rate, clip: None, count: steps + 1 }
 }
 
 fn actor_shape(common: &Common, context: &Context) -> GaussianShape {

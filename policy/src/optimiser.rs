@@ -30,6 +30,13 @@ pub struct AdamStep {
     pub count: u64,
 }
 
+impl AdamStep {
+    /// The step after so many others, of gradients that are not clipped.
+    pub fn after(steps: u64, rate: f32) -> Self {
+        Self { rate, clip: None, count: steps + 1 }
+    }
+}
+
 impl Adam {
     /// For weights that have not moved yet, with a weight decay, if it is not 0.
     pub fn new(weights: &Weights, decay: f32) -> Result<Self> {

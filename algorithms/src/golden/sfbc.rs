@@ -27,7 +27,7 @@ fn check(golden: &Golden, device: &Device) {
     let measured = match sfbc.phase(step) {
         (Phase::Behavior, steps) => {
             let t = golden.inputs["t"].to_vec1::<f32>().unwrap().into_iter().map(f64::from).collect();
-            let noise = Noise { t, epsilon: golden.input("epsilon", device) };
+            let noise = NoiseInTime { t, epsilon: golden.input("epsilon", device) };
             golden.close("noisy_actions", &noise.noisy(&batch.actions).unwrap());
             sfbc.clone_behavior(&batch, &noise, steps)
         }
