@@ -110,7 +110,12 @@ pub fn tasks() -> impl Iterator<Item = TaskNames> {
     let of = |(place, kind, ending): (&str, &str, String)| {
         let environment = format!("{place}{ending}");
         let dataset = maze_task(&environment).map(|_| format!("{place}-{kind}-v0"));
-        TaskNames { task: format!("{place}-{kind}{ending}"), environment, dataset, is_default: !ending.contains("-task") }
+        TaskNames {
+            task: format!("{place}-{kind}{ending}"),
+            environment,
+            dataset,
+            is_default: !ending.contains("-task"),
+        }
     };
     kinds().flat_map(|(place, kind)| endings().map(move |ending| (place, kind, ending))).map(of)
 }

@@ -226,7 +226,12 @@ fn returns_without_any_spread() {
     let subject = Subject::new();
     subject.replace("rewards", &[ROWS], &[0f32; ROWS]);
     assert!(subject.read().is_ok());
-    let options = ReadOptions { environment: Some(hopper()), task: None, reward: RewardRule::Locomotion, scale: Scale::default() };
+    let options = ReadOptions {
+        environment: Some(hopper()),
+        task: None,
+        reward: RewardRule::Locomotion,
+        scale: Scale::default(),
+    };
     let error = Transitions::read(subject.path(), &options).err().unwrap();
     assert!(matches!(error.problem, Problem::SameReturns), "{error}");
 }

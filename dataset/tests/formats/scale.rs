@@ -31,7 +31,8 @@ fn file() -> (TempDir, PathBuf) {
 }
 
 fn scaled(actions: bool, states: bool) -> Transitions {
-    let options = ReadOptions { environment: None, task: None, reward: RewardRule::AsIs, scale: Scale { actions, states } };
+    let options =
+        ReadOptions { environment: None, task: None, reward: RewardRule::AsIs, scale: Scale { actions, states } };
     Transitions::read(file().1, &options).unwrap()
 }
 

@@ -98,7 +98,11 @@ fn quad_has_the_values_of_tables_3_and_4_for_each_row() {
 fn tasks_beside_the_papers_have_values_that_suit_them() {
     let of = |task: &str, algorithm: &str| -> Table {
         let text = printed(&["presets", task, "--algorithm", algorithm]);
-        assert_eq!(text.contains("authors give no values"), algorithm != "idql" || task.contains("-singletask"), "{text}");
+        assert_eq!(
+            text.contains("authors give no values"),
+            algorithm != "idql" || task.contains("-singletask"),
+            "{text}"
+        );
         text.parse().unwrap()
     };
     for algorithm in ["quad", "td3-bc", "idql"] {
