@@ -165,8 +165,8 @@ impl Problem {
             Self::Metadata(_) => "fetch the Minari dataset again; metadata.json is what Minari writes beside the data",
             Self::UnknownLayout { .. } | Self::Names { .. } => "see docs/data.md for what the attribute means",
             Self::Missing { array } if array == "rewards" => {
-                "learning needs a reward for each step; with quad_rl installed, `quad-convert ogbench:NAME --out FILE` adds those of \
-                 OGBench, for a NAME such as antmaze-large-navigate-singletask-task1-v0"
+                "learning needs a reward for each step; a task such as antmaze-large-navigate-singletask-task1-v0 has those of OGBench's \
+                 mazes, and with quad_rl installed, `quad-convert ogbench:NAME --out FILE` adds others"
             }
             Self::Missing { .. } => "docs/data.md says which arrays each kind of file must have",
             Self::Numbers { .. } => "all arrays need the same number of rows, which is that of `rewards`",
@@ -207,8 +207,15 @@ const REWRITE: &str = "pip install h5py hdf5plugin; then write it again, with yo
     hdf5plugin; a, b = h5py.File('OLD'), h5py.File('NEW', 'w'); b.attrs.update(a.attrs); a.visititems(lambda name, x: \
     b.update({name: x[()]}) if isinstance(x, h5py.Dataset) else None)\"";
 
+/// What a file of OGBench's says that it was recorded in, for want of a name.
+pub(crate) const OGBENCH: &str = "OGBench";
+
 fn other_environment(claimed: &str, expected: &str) -> String {
     match environment::find(claimed) {
+        _ if claimed == OGBENCH => {
+            "choose one of its own tasks, such as antmaze-large-navigate-singletask-task1-v0, or another dataset"
+                .to_owned()
+        }
         Ok(_) => format!("choose a task in {claimed}, or another dataset"),
         Err(_) => format!(
             "it is another simulation, so a policy that learns from it cannot be scored in {expected}; train under a name of \

@@ -10,7 +10,7 @@ use std::io::Read;
 use std::path::{Path, PathBuf};
 
 use crate::environment::{self, EnvironmentSpec, Goal};
-use crate::error::{DatasetError, Problem};
+use crate::error::{DatasetError, OGBENCH, Problem};
 use crate::foreign;
 use crate::hdf5_file::{self, Hdf5File};
 use crate::npz_file::{self, NpzFile};
@@ -97,7 +97,7 @@ impl Source {
     /// not name theirs, but its mazes, whose sizes are those of D4RL's, have other starts and goals.
     pub(crate) fn check_environment(&self, asked: &EnvironmentSpec) -> Result<(), Problem> {
         let has_other_goals = asked.goal.is_some_and(|goal| goal != Goal::OfTask);
-        let maze_of_ogbench = (matches!(self, Self::OgBench(_)) && has_other_goals).then(|| "OGBench".to_owned());
+        let maze_of_ogbench = (matches!(self, Self::OgBench(_)) && has_other_goals).then(|| OGBENCH.to_owned());
         let Some(claimed) = self.environment().or(maze_of_ogbench) else { return Ok(()) };
         let simulation = environment::find(&claimed).map(EnvironmentSpec::simulation);
         match simulation == Ok(asked.simulation()) {
