@@ -52,7 +52,8 @@ impl ActorCriticShape {
     /// and critics.
     pub(crate) fn load<A: Actor + 'static>(
         &self,
-        (of_actor, actor): (fn(&Self) -> EnsembleShape, fn(Ensemble) -> A),
+        of_actor: EnsembleShape,
+        actor: fn(Ensemble) -> A,
         choice: Choice,
         tensors: &mut Tensors,
         precision: Precision,
@@ -60,7 +61,7 @@ impl ActorCriticShape {
         check_range("observation_dim", self.observation_dim, MOST)?;
         check_range("action_dim", self.action_dim, MOST)?;
         check_range("critics", self.critics, MOST)?;
-        let actor = Box::new(actor(Ensemble::take(of_actor(self), tensors, ACTOR, precision)?));
+        let actor = Box::new(actor(Ensemble::take(of_actor, tensors, ACTOR, precision)?));
         let critics = Ensemble::take(self.critics(), tensors, CRITIC, precision)?;
         CandidatePolicy::new(Networks { actor, critics, value: None }, choice, precision)
     }

@@ -200,12 +200,12 @@ pub fn load_policy(file: &[u8], precision: Precision) -> Result<Box<dyn Policy>,
             Box::new(DiffusionPolicy::load(shape, choice, &mut tensors, precision)?)
         }
         PolicyConfig::Squashed { shape, choice } => {
-            let actor = (SquashedActor::shape as fn(&_) -> _, SquashedActor::new as fn(_) -> _);
-            Box::new(shape.load(actor, choice, &mut tensors, precision)?)
+            let of_actor = SquashedActor::shape(&shape);
+            Box::new(shape.load(of_actor, SquashedActor::new, choice, &mut tensors, precision)?)
         }
         PolicyConfig::OneStep { shape, choice } => {
-            let actor = (OneStepActor::shape as fn(&_) -> _, OneStepActor::new as fn(_) -> _);
-            Box::new(shape.load(actor, choice, &mut tensors, precision)?)
+            let of_actor = OneStepActor::shape(&shape);
+            Box::new(shape.load(of_actor, OneStepActor::new, choice, &mut tensors, precision)?)
         }
         PolicyConfig::Gaussian { shape } => Box::new(GaussianPolicy::load(shape, &mut tensors)?),
         PolicyConfig::Score { shape, choice } => Box::new(ScorePolicy::load(shape, choice, &mut tensors, precision)?),

@@ -63,7 +63,7 @@ pub fn of_run(run: &RunReport) -> Picture {
     };
     let points = run.evaluations.iter().map(|e| point(e.step, e.score.mean, e.score.std)).collect();
     let episodes = run.evaluations.iter().map(|e| e.episodes).max().unwrap_or(0);
-    let measure = if run.normalised { "D4RL-normalised score" } else { run.measure() };
+    let measure = run.measure_with_unit();
     Picture {
         title: format!("{}: {measure} over {episodes} episodes", run.run),
         x: "gradient steps",

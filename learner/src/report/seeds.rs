@@ -84,7 +84,7 @@ impl GroupReport {
 
     /// What its numbers are.
     pub fn measure(&self) -> &'static str {
-        if self.normalised { "D4RL-normalised score" } else { self.runs.first().map_or("return", RunReport::measure) }
+        self.runs.first().map_or("return", RunReport::measure_with_unit)
     }
 
     /// Each seed with its run's score.

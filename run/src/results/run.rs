@@ -3,11 +3,10 @@
 use std::collections::{BTreeMap, BTreeSet};
 use std::fmt::Alignment::Right;
 use std::fmt::Write;
-use std::io::{self, ErrorKind};
 use std::path::{Path, PathBuf};
 
 use anyhow::Context;
-use quad_algorithms::{MetricsLine, Summary};
+use quad_algorithms::Summary;
 use quad_dataset::environment;
 use serde::Serialize;
 
@@ -16,7 +15,7 @@ use super::judgement::Judgement;
 use super::published;
 use super::spread::Spread;
 use crate::config::RunConfig;
-use crate::run::{RunDir, ScoreLine, open_file};
+use crate::run::{RunDir, ScoreLine, read_metrics};
 use crate::table::{Style, Table};
 
 /// Gradient steps at the end of a run over which the paper's appendix B takes the mean.
@@ -85,7 +84,7 @@ impl RunReport {
     pub fn read(path: &Path) -> anyhow::Result<Self> {
         let scored = Self::scored(path)?;
         let summary = match scored.config.experiment.definition()?.report.summary {
-            Some(summary) => summary(&metrics(path)?, &scored.variant),
+            Some(summary) => summary(&read_metrics(path)?, &scored.variant),
             None => None,
         };
         Ok(Self { summary, ..scored })
@@ -221,6 +220,15 @@ impl RunReport {
         if self.normalised || self.own_score { "score" } else { "return" }
     }
 
+    /// The same with its unit: in a maze, the share of episodes that reach the goal.
+    pub fn measure_with_unit(&self) -> &'static str {
+        match environment::find(&self.config.experiment.environment) {
+            Ok(known) if known.goal.is_some() => "success rate in %",
+            Ok(_) => "D4RL-normalised score",
+            Err(_) => self.measure(),
+        }
+    }
+
     /// The evaluations as a table for people.
     pub fn table(&self) -> String {
         let mut header = vec!["step", "episodes", self.measure(), "length"];
@@ -239,8 +247,14 @@ impl RunReport {
             table.push(row);
         }
         let mut text = format!(
-            "{}: task {}, {}, {} steps, seed {}, scored in {}\n\n",
-            self.run, self.task, self.agent, self.steps, self.seed, self.scored_in
+            "{}: task {}, {}, {} steps, seed {}; {}, scored in {}\n\n",
+            self.run,
+            self.task,
+            self.agent,
+            self.steps,
+            self.seed,
+            self.measure_with_unit(),
+            self.scored_in
         ) + &table.render(Style::Text);
         if self.evaluations.is_empty() {
             text.push_str("(no evaluation has a score yet)\n");
@@ -261,16 +275,6 @@ impl RunReport {
             }
         }
         text + &self.summary.as_ref().map(|summary| format!("\n{}", summary.text)).unwrap_or_default()
-    }
-}
-
-/// The lines of `metrics.jsonl` in a run folder; none if there is no such file. The last one may not be complete.
-fn metrics(folder: &Path) -> anyhow::Result<Vec<MetricsLine>> {
-    let path = folder.join("metrics.jsonl");
-    match open_file(&path).and_then(io::read_to_string) {
-        Ok(text) => Ok(text.lines().filter_map(|line| serde_json::from_str(line).ok()).collect()),
-        Err(error) if error.kind() == ErrorKind::NotFound => Ok(Vec::new()),
-        Err(error) => Err(error).with_context(|| format!("cannot read {}", path.display())),
     }
 }
 

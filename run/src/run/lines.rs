@@ -1,7 +1,14 @@
 //! What the files of a run say: a line of each log, and where the learner is.
 
+use std::io::{self, ErrorKind};
+use std::path::Path;
+
+use anyhow::Context;
+use quad_algorithms::MetricsLine;
 use quad_protocol::{EpisodeScore, ScoreReport};
 use serde::{Deserialize, Serialize};
+
+use super::open_file;
 
 /// Where a learner can be reached: `endpoints.json`.
 #[derive(Clone, Debug, Serialize, Deserialize)]
@@ -57,6 +64,19 @@ impl ScoreLine {
     pub fn episode(&self) -> EpisodeScore {
         let Self { seed, episode_return, length, score, .. } = *self;
         EpisodeScore { seed, episode_return, length, score }
+    }
+}
+
+/// The lines of `metrics.jsonl` in a run folder; none if there is no such file. The last one may not be complete.
+///
+/// # Errors
+/// The file cannot be read.
+pub fn read_metrics(folder: &Path) -> anyhow::Result<Vec<MetricsLine>> {
+    let path = folder.join("metrics.jsonl");
+    match open_file(&path).and_then(io::read_to_string) {
+        Ok(text) => Ok(text.lines().filter_map(|line| serde_json::from_str(line).ok()).collect()),
+        Err(error) if error.kind() == ErrorKind::NotFound => Ok(Vec::new()),
+        Err(error) => Err(error).with_context(|| format!("cannot read {}", path.display())),
     }
 }
 

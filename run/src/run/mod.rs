@@ -25,7 +25,7 @@ pub(crate) use durable::open_file;
 pub use error::RunDirError;
 pub use find::walk;
 pub use folder::RunDir;
-pub use lines::{RunEndpoints, ScoreLine};
+pub use lines::{RunEndpoints, ScoreLine, read_metrics};
 pub use lock::Lock;
 pub use log::{Log, new_lines};
 pub use resume::{Begun, Earlier, Past, open};
