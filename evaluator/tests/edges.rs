@@ -123,7 +123,8 @@ fn endless(spec: &EnvironmentSpec) -> Option<Vec<f64>> {
 
 #[test]
 fn the_time_limit_truncates_and_does_not_terminate() {
-    for spec in all() {
+    // Of OGBench's tasks in one maze only the default.
+    for spec in all().iter().filter(|spec| !spec.name.contains("-task")) {
         let Some(qpos) = endless(spec) else { continue };
         let mut simulation = make(spec, 0).unwrap();
         simulation.reset(0);
