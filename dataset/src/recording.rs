@@ -65,6 +65,17 @@ impl Recording {
         kinds.filter(|(kind, _)| **kind == RowKind::Transition).map(|(_, row)| row)
     }
 
+    /// Whether each row's episode has reached its goal before: a recording of a task with one continues there.
+    pub(crate) fn past_goal(&self) -> Vec<bool> {
+        let mut is_past = false;
+        let of_row = |row: usize| {
+            let was_past = is_past;
+            is_past = self.goal && !self.ends[row] && (is_past || self.terminals[row]);
+            was_past
+        };
+        (0..self.rows()).map(of_row).collect()
+    }
+
     /// All episodes, every recorded step included.
     pub(crate) fn episodes(&self) -> Vec<Episode> {
         let mut episodes = Vec::new();

@@ -86,6 +86,8 @@ pub struct Transitions {
     rows: Vec<u32>,
     /// Whether the next row is the next step of the episode; N.
     goes_on: Vec<bool>,
+    /// Whether the goal was reached earlier in the recorded episode; N.
+    past_goal: Vec<bool>,
     statistics: Statistics,
     doubts: Vec<String>,
     scaling: Scaling,
@@ -159,6 +161,7 @@ impl Transitions {
         let rows: Vec<u32> = recording.transitions().collect();
         let statistics = Statistics::new(environment, rows.len(), &recording.episodes());
         let goes_on = (0..recording.rows()).map(|row| recording.goes_on(row)).collect();
+        let past_goal = recording.past_goal();
         let mut doubts = doubts::doubts(&recording, scaling.observations.is_some());
         doubts.extend(resets::out_of_step(&recording));
         scale::apply(&scaling, &mut recording);
@@ -175,6 +178,7 @@ impl Transitions {
             terminals: recording.terminals,
             rows,
             goes_on,
+            past_goal,
             statistics,
             doubts,
             scaling,
@@ -254,6 +258,13 @@ impl Transitions {
             }
         }
         episodes
+    }
+
+    /// Those of [`Self::episodes`] that begin with an episode of the recording: after a goal, where that continues, each step is an
+    /// episode of its own.
+    pub fn recorded_episodes(&self) -> Vec<Range<u32>> {
+        let is_past = |episode: &Range<u32>| self.past_goal[self.rows[episode.start as usize] as usize];
+        self.episodes().into_iter().filter(|episode| !is_past(episode)).collect()
     }
 
     /// The first transition of each window of `length` transitions that follow one another: the window of i is i, i + 1, …,

@@ -23,6 +23,7 @@ fn d4rl() -> Recording {
 fn episodes_end_at_timeouts_terminals_and_the_end_of_the_file() {
     let transitions = transitions(d4rl());
     assert_eq!(transitions.episodes(), [0..2, 2..4, 4..5]);
+    assert_eq!(transitions.recorded_episodes(), transitions.episodes());
     let next: Vec<_> = (0..5).map(|index| transitions.next(index)).collect();
     assert_eq!(next, [Some(1), None, Some(3), None, None]);
 }
@@ -52,6 +53,7 @@ fn an_episode_ends_at_the_goal_although_the_recording_goes_on() {
     recording.ends[3] = true;
     let transitions = transitions(recording);
     assert_eq!(transitions.episodes(), [0..2, 2..3]);
+    assert_eq!(transitions.recorded_episodes(), [0..2]);
     assert!(transitions.next_action(1).is_none());
 }
 

@@ -78,7 +78,7 @@ impl Data {
         let held_out = split.held_out.context("no episode is held out")?;
         Ok(Self {
             sha256: dataset.sha256,
-            first: gather(&held_out, &Vec::from_iter(held_out.episodes().iter().map(|episode| episode.start))),
+            first: gather(&held_out, &Vec::from_iter(held_out.recorded_episodes().iter().map(|episode| episode.start))),
             compared: gather(&held_out, &spread(held_out.len(), COMPARED)),
             training: Arc::new(split.training),
             episodes: split.episodes,
@@ -101,7 +101,7 @@ impl Data {
     /// The mean over the judged episodes of the discounted return, where the last step of one that was cut off counts what these
     /// evaluations of the behaviour say of it.
     pub fn recorded_value(&self, behavior: &[&Fqe], gamma: f32) -> anyhow::Result<f64> {
-        let (mut sum, episodes) = (0.0, self.held_out.episodes());
+        let (mut sum, episodes) = (0.0, self.held_out.recorded_episodes());
         for episode in &episodes {
             let steps = gather(&self.held_out, &Vec::from_iter(episode.clone()));
             let (o, a, last) = (self.held_out.observation_dim(), self.held_out.action_dim(), steps.rewards.len() - 1);
