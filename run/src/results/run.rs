@@ -220,7 +220,7 @@ impl RunReport {
         if self.normalised || self.own_score { "score" } else { "return" }
     }
 
-    /// The same with its unit: in a maze, the share of episodes that reach the goal.
+    /// [`Self::measure`] with its unit: in a maze, the share of episodes that reach the goal.
     pub fn measure_with_unit(&self) -> &'static str {
         match environment::find(&self.config.experiment.environment) {
             Ok(known) if known.goal.is_some() => "success rate in %",
