@@ -26,6 +26,7 @@ fn where_files_have_no_locks_a_folder_is_still_one_learners() {
     first.process.kill();
     let mut next = start(&scratch);
     next.process.wait_for_log("continues after step", PATIENCE);
+    next.process.wait_for_log("steps/s", PATIENCE); // A signal that comes before it trains ends it at once.
     next.assert_scores_are_distinct();
     assert_eq!(next.process.terminate(PATIENCE).code(), Some(75), "{}", next.process.log());
 
