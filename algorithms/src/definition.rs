@@ -114,6 +114,13 @@ pub(super) fn read<T: DeserializeOwned>(table: &toml::Table) -> Result<T, AgentE
     Ok(T::deserialize(table.clone())?)
 }
 
+/// Reads hyper-parameters into which those of `C` are flattened. Serde does not say which key of a flattened struct is refused, so
+/// these are read by themselves first.
+pub(super) fn read_with<C: DeserializeOwned, T: DeserializeOwned>(table: &toml::Table) -> Result<T, AgentError> {
+    readable::<C>(table)?;
+    read(table)
+}
+
 /// The check of hyper-parameters whose types say their ranges.
 pub(super) fn readable<T: DeserializeOwned>(table: &toml::Table) -> Result<(), AgentError> {
     read::<T>(table).map(drop)

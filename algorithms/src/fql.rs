@@ -132,16 +132,13 @@ impl Fql {
 
     /// y = r + γ·mask·Q̂(s', π(s', z)), `[B]`.
     fn targets(&self, batch: &Minibatch, noise: &Tensor) -> Result<Tensor> {
-        let actions = self.actor.network.detach().outputs(&batch.next_observations, noise)?;
-        let actions = actions.squeeze(0)?.clamp(-1f32, 1f32)?;
-        let q = self.target_critics.values(&batch.next_observations, &actions)?;
-        batch.target(
-            *self.config.gamma,
-            &match self.config.target {
-                Reduce::Mean => q.mean(0)?,
-                Reduce::Min => smaller(&q)?,
-            },
-        )
+        let actions = OneStepActor::new(self.actor.network.detach()).sample(&batch.next_observations, noise)?;
+        let values = self.target_critics.values(&batch.next_observations, &actions)?;
+        let q = match self.config.target {
+            Reduce::Mean => values.mean(0)?,
+            Reduce::Min => smaller(&values)?,
+        };
+        batch.target(*self.config.gamma, &q)
     }
 
     /// Mean of (v(s, x_t, t) − (a − x_0))², `[]`, on the straight way x_t from x_0 to a.

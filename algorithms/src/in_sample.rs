@@ -61,11 +61,9 @@ pub(super) struct Common {
     ema_rate: Rate,
 }
 
-/// Reads a table of hyper-parameters with [`Common`]'s among them. Serde does not say which key of a flattened struct is refused,
-/// so these are read by themselves first.
+/// Reads a table of hyper-parameters with [`Common`]'s among them.
 pub(super) fn read<T: DeserializeOwned>(table: &toml::Table) -> std::result::Result<T, AgentError> {
-    definition::readable::<Common>(table)?;
-    definition::read(table)
+    definition::read_with::<Common, T>(table)
 }
 
 /// The equations of one algorithm; its hyper-parameters hold them.

@@ -39,11 +39,9 @@ pub(super) struct Common {
     actor_every: Steps,
 }
 
-/// Reads a table of hyper-parameters with [`Common`]'s among them. Serde does not say which key of a flattened struct is refused,
-/// so these are read by themselves first.
+/// Reads a table of hyper-parameters with [`Common`]'s among them.
 pub(super) fn read<T: DeserializeOwned>(table: &toml::Table) -> std::result::Result<T, AgentError> {
-    definition::readable::<Common>(table)?;
-    definition::read(table)
+    definition::read_with::<Common, T>(table)
 }
 
 /// How one algorithm keeps its policy near the data's actions; its hyper-parameters hold it.
@@ -112,8 +110,8 @@ impl<N: Near> Td3<N> {
     pub fn step(&mut self, step: u64, batch: &Minibatch, noise: &Tensor, next: Option<&Tensor>) -> Result<Measured> {
         let targets = self.targets(batch, noise, next)?;
         let Common { actor_every, ema_rate, actor_learning_rate, critic_learning_rate, .. } = self.near.common();
-        let q = self.critics.network.values(&batch.observations, &batch.actions)?;
-        let critic_loss = (q.broadcast_sub(&targets)?.sqr()?.mean_all()? * CRITICS as f64)?;
+        let critic_loss = self.critics.network.squared_error(&batch.observations, &batch.actions, &targets)?;
+        let critic_loss = (critic_loss * CRITICS as f64)?;
         self.critics.descend(&critic_loss, AdamStep::after(step, **critic_learning_rate))?;
         if step % **actor_every == N::FIRST % **actor_every {
             let actions = gaussian_mean(&self.actor.network, &batch.observations)?;

@@ -48,10 +48,15 @@ const TASKS: [(&str, [(Cell, Cell); 5]); 5] = [
 ];
 /// The ball's x in an observation of soccer, after the ant's own positions.
 const BALL: usize = 15;
-/// Side of a maze's cell, metres.
-const CELL: f64 = 4.0;
+/// Side of a maze's cell, metres; D4RL's mazes have the same.
+pub const CELL: f64 = 4.0;
 /// Distance in the plane from the goal at which it is reached, metres.
 pub const REACH: f64 = 0.5;
+
+/// Whether a task's name, or a pattern of such names, is OGBench's.
+pub fn is_ogbench(name: &str) -> bool {
+    name.contains("-singletask")
+}
 
 /// What a task in a maze is: to come from somewhere to somewhere else.
 #[derive(Clone, Copy, Debug, PartialEq)]

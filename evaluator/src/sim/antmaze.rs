@@ -17,7 +17,7 @@
 //! the ant has come there. Rewards are 1 more than OGBench's, so that a return is 0 or 1, too.
 
 use quad_dataset::environment::Goal;
-use quad_dataset::ogbench::{self, MazeTask, REACH};
+use quad_dataset::ogbench::{self, CELL, MazeTask, REACH};
 use quad_dataset::{EnvironmentSpec, Noise};
 use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
@@ -31,8 +31,6 @@ const GOAL_STREAM: u64 = 4;
 const START_STREAM: u64 = 5;
 /// Where the model of the ant on its floor has the walls.
 const WALLS: &str = "<!-- walls -->";
-/// Side of a maze's cell, metres.
-const CELL: f64 = 4.0;
 /// How far from its cell's centre, on each axis, an episode of OGBench's begins, metres.
 const START_NOISE: f64 = 1.0;
 /// Steps of the model that a control is held for, of 0.02 s each.

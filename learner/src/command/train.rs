@@ -6,7 +6,7 @@ use std::sync::Arc;
 use std::time::{Duration, SystemTime, UNIX_EPOCH};
 
 use anyhow::{Context, anyhow};
-use quad_dataset::{Split, Task, environment};
+use quad_dataset::{Split, Task, environment, ogbench};
 use quad_policy::Precision;
 use quad_protocol::Name;
 use quad_run::config::{DatasetInfo, Experiment, Preset, RunConfig, RunInfo, hyperparameters};
@@ -34,7 +34,7 @@ pub fn train(args: &TrainArgs) -> anyhow::Result<()> {
     let experiment = preset.resolve(&args.changes())?;
     let named = experiment.dataset.clone().ok_or_else(|| anyhow!("preset {} names no dataset", preset.label));
     let missing = match preset.task_name() {
-        name if name.contains("-singletask") => format!(
+        name if ogbench::is_ogbench(name) => format!(
             "its rewards come from OGBench's simulator: with quad_rl and ogbench installed, `quad-convert ogbench:{name} --out \
              FILE` makes a file for --dataset FILE"
         ),

@@ -2,6 +2,7 @@
 
 use anyhow::anyhow;
 use quad_algorithms::{ALGORITHMS, Definition, Values, fits};
+use quad_dataset::ogbench::is_ogbench;
 use quad_runtime::hinted;
 
 use super::nearest::did_you_mean;
@@ -10,8 +11,7 @@ use super::tasks::Task;
 /// Whether a benchmark of others, a task with a dataset of its own, has no values by the algorithm's authors.
 fn lacks(values: &Values, task: &Task) -> bool {
     // OGBench numbers its tasks apart from D4RL: a pattern like `*-v0` is not about them unless it says so.
-    let is_of_ogbench = |name: &str| name.contains("-singletask");
-    let is_about = |pattern: &String| is_of_ogbench(pattern) == is_of_ogbench(&task.name) && fits(pattern, &task.name);
+    let is_about = |pattern: &String| is_ogbench(pattern) == is_ogbench(&task.name) && fits(pattern, &task.name);
     task.word("dataset").is_some() && !values.given.iter().any(is_about)
 }
 
