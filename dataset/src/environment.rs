@@ -39,7 +39,7 @@ pub struct EnvironmentSpec {
     /// The robot, if it is one in a vertical plane.
     #[serde(default)]
     pub planar: Option<Planar>,
-    /// The maze, if it is an ant in one: rows of cells along +y, in them cells along +x (1 wall, 0 free, R start, G goal).
+    /// The maze, if it is an ant or a ball in one: rows of cells along +y, in them cells along +x (1 wall, 0 free, R start, G goal).
     #[serde(default)]
     pub maze: Option<Vec<String>>,
     /// How a dataset is recorded in it, or why none can be.

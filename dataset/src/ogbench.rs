@@ -15,7 +15,10 @@ const EXPLORE: &[&str] = &["navigate", "stitch", "explore"];
 const PLAY: &[&str] = &["play", "noisy"];
 
 /// Robots and places, and the kinds of data of each.
-const DATASETS: [(&str, &[&str]); 17] = [
+const DATASETS: [(&str, &[&str]); 20] = [
+    ("pointmaze-medium", NAVIGATE),
+    ("pointmaze-large", NAVIGATE),
+    ("pointmaze-giant", NAVIGATE),
     ("antmaze-medium", EXPLORE),
     ("antmaze-large", EXPLORE),
     ("antmaze-giant", NAVIGATE),
@@ -50,8 +53,10 @@ const TASKS: [(&str, [(Cell, Cell); 5]); 5] = [
 const BALL: usize = 15;
 /// Side of a maze's cell, metres; D4RL's mazes have the same.
 pub const CELL: f64 = 4.0;
-/// Distance in the plane from the goal at which it is reached, metres.
-pub const REACH: f64 = 0.5;
+/// Distance in the plane from the goal at which the ant is there, metres; D4RL's, too.
+pub const ANT_REACH: f64 = 0.5;
+/// And OGBench's ball.
+const POINT_REACH: f64 = 1.0;
 
 /// Whether a task's name, or a pattern of such names, is OGBench's.
 pub fn is_ogbench(name: &str) -> bool {
@@ -65,6 +70,8 @@ pub struct MazeTask {
     pub start: [f64; 2],
     /// Where it must come: x and y, metres.
     pub goal: [f64; 2],
+    /// Distance from there, in the plane, at which it counts as there, metres.
+    pub reach: f64,
     /// Which of an observation's numbers is the x of what must come there; y is the next one.
     column: usize,
 }
@@ -77,7 +84,8 @@ pub fn maze_task(environment: &str) -> Option<MazeTask> {
     let default = if is_soccer { 4 } else { 1 };
     let (start, goal) = *tasks.get(number.unwrap_or(default).checked_sub(1)?)?;
     let centre = |(row, column): Cell| [column, row].map(|cell| (f64::from(cell) - 1.0) * CELL);
-    Some(MazeTask { start: centre(start), goal: centre(goal), column: if is_soccer { BALL } else { 0 } })
+    let reach = if place.starts_with("pointmaze") { POINT_REACH } else { ANT_REACH };
+    Some(MazeTask { start: centre(start), goal: centre(goal), reach, column: if is_soccer { BALL } else { 0 } })
 }
 
 /// Robot and place of an environment's name, and the number of its task, if it says one.
@@ -146,7 +154,7 @@ impl MazeTask {
             let place = recording.observation(row).get(self.column..self.column + 2);
             let is_reached = place.is_some_and(|place| {
                 let apart = [0, 1].map(|axis| f64::from(place[axis]) - self.goal[axis]);
-                (apart[0] * apart[0] + apart[1] * apart[1]).sqrt() <= REACH
+                (apart[0] * apart[0] + apart[1] * apart[1]).sqrt() <= self.reach
             });
             recording.rewards[row] = f32::from(u8::from(is_reached));
             recording.terminals[row] = is_reached && recording.kinds[row] != RowKind::LastState;
@@ -163,17 +171,19 @@ mod tests {
     #[test]
     fn names_say_where_a_task_is() {
         for (environment, expected) in [
-            ("antmaze-large-singletask-v0", Some(([0.0, 0.0], [36.0, 24.0], 0))),
-            ("antmaze-giant-singletask-task4-v0", Some(([8.0, 28.0], [44.0, 16.0], 0))),
-            ("humanoidmaze-medium-singletask-task3-v0", Some(([8.0, 16.0], [4.0, 12.0], 0))),
-            ("antsoccer-arena-singletask-v0", Some(([20.0, 20.0], [0.0, 20.0], 15))),
+            ("antmaze-large-singletask-v0", Some(([0.0, 0.0], [36.0, 24.0], 0.5, 0))),
+            ("antmaze-giant-singletask-task4-v0", Some(([8.0, 28.0], [44.0, 16.0], 0.5, 0))),
+            ("pointmaze-large-singletask-task4-v0", Some(([28.0, 8.0], [12.0, 16.0], 1.0, 0))),
+            ("humanoidmaze-medium-singletask-task3-v0", Some(([8.0, 16.0], [4.0, 12.0], 0.5, 0))),
+            ("antsoccer-arena-singletask-v0", Some(([20.0, 20.0], [0.0, 20.0], 0.5, 15))),
             ("antmaze-large-singletask-task6-v0", None),
             ("antmaze-large-singletask-task0-v0", None),
             ("antmaze-large-singletaskmaster-v0", None),
             ("antmaze-large-v0", None),
             ("cube-single-singletask-v0", None),
         ] {
-            let found = maze_task(environment).map(|MazeTask { start, goal, column }| (start, goal, column));
+            let found =
+                maze_task(environment).map(|MazeTask { start, goal, reach, column }| (start, goal, reach, column));
             assert_eq!(found, expected, "{environment}");
         }
     }
@@ -181,13 +191,13 @@ mod tests {
     #[test]
     fn tasks_and_files_are_those_that_are_published() {
         let (all, files) = (Vec::from_iter(tasks()), Vec::from_iter(files()));
-        assert_eq!((all.len(), files.len()), (36 * 6, 18));
+        assert_eq!((all.len(), files.len()), (42 * 6, 24));
         let names = |at: usize| (&*all[at].task, &*all[at].environment, all[at].dataset.as_deref());
         let (task, environment) = ("antmaze-medium-navigate-singletask-task1-v0", "antmaze-medium-singletask-task1-v0");
-        assert_eq!(names(1), (task, environment, Some("antmaze-medium-navigate-v0")));
-        assert_eq!(names(36 * 6 - 1), ("puzzle-4x6-noisy-singletask-task5-v0", "puzzle-4x6-singletask-task5-v0", None));
+        assert_eq!(names(36 + 1), (task, environment, Some("antmaze-medium-navigate-v0")));
+        assert_eq!(names(42 * 6 - 1), ("puzzle-4x6-noisy-singletask-task5-v0", "puzzle-4x6-singletask-task5-v0", None));
         assert!(all.iter().all(|task| task.task != "antmaze-giant-explore-singletask-v0"));
         let address = "https://rail.eecs.berkeley.edu/datasets/ogbench/antsoccer-medium-stitch-v0.npz";
-        assert_eq!(files[17].addresses, [address]);
+        assert_eq!(files[23].addresses, [address]);
     }
 }

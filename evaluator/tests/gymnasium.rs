@@ -131,9 +131,11 @@ fn the_ant_in_a_maze_is_gymnasiums_among_walls() {
 }
 
 #[test]
-fn the_ant_in_a_maze_of_ogbench_moves_as_there() {
-    for name in ["antmaze-medium-singletask-v0", "antmaze-large-singletask-v0", "antmaze-giant-singletask-v0"] {
+fn the_ant_and_the_ball_in_a_maze_of_ogbench_move_as_there() {
+    for (robot, maze) in
+        ["antmaze", "pointmaze"].iter().flat_map(|robot| ["medium", "large", "giant"].map(|maze| (robot, maze)))
+    {
         // Their models differ in what nothing depends on: the unit of controls, a mark at the goal, where the floor's centre is.
-        assert_steps(name, 0.1..=0.9);
+        assert_steps(&format!("{robot}-{maze}-singletask-v0"), 0.1..=0.9);
     }
 }

@@ -122,6 +122,17 @@ class OgBench:
         return observation, reward + 1, terminated
 
 
+class PointMaze(OgBench):
+    """A task of OGBench's ball, which is often in a wall: an action puts it there."""
+
+    def random_state(self, random):
+        place = self.free[random.integers(len(self.free))] + random.uniform(-1.9, 1.9, 2)
+        return place, random.normal(0, 1, 2)
+
+    def step(self, action):
+        return super().step(np.clip(action, -1, 1))
+
+
 def halve_margins(model):
     model.geom_margin[:] *= 0.5
     model.body_margin[:] *= 0.5  # The largest of a body's geoms', for the broad phase.
@@ -137,10 +148,10 @@ TASKS = {
     "antmaze-large": lambda: AntMaze(
         "111111111111 1R0001000001 101101010101 100000010001 101111011101 100101000001 110101010111 100100010G01 111111111111"
     ),
-    "antmaze-medium-singletask-v0": lambda: OgBench("antmaze-medium-singletask-v0"),
-    "antmaze-large-singletask-v0": lambda: OgBench("antmaze-large-singletask-v0"),
-    "antmaze-giant-singletask-v0": lambda: OgBench("antmaze-giant-singletask-v0"),
 }
+for place in ["medium", "large", "giant"]:
+    TASKS[f"antmaze-{place}-singletask-v0"] = lambda place=place: OgBench(f"antmaze-{place}-singletask-v0")
+    TASKS[f"pointmaze-{place}-singletask-v0"] = lambda place=place: PointMaze(f"pointmaze-{place}-singletask-v0")
 
 
 def numbers(struct):

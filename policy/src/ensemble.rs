@@ -53,7 +53,7 @@ impl Ensemble {
     /// Makes constants of the weights; they share the memory of these networks.
     pub fn detach(&self) -> Self {
         let (shape, networks) = (self.shape.clone(), self.networks.clone());
-        Self { shape, networks, weights: self.weights.detach(), packing: Packing::new(Precision::F32) }
+        Self { shape, networks, weights: self.weights.detach(), packing: Packing::new(self.packing.precision) }
     }
 
     /// What comes out, `[K, rows, outputs]`, a row for each action.

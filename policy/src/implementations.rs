@@ -281,6 +281,7 @@ fn rounding_changes_little_and_follows_the_weights() {
     let rounds = Precision::Bf16.is_available() && has_fast_implementation(&Device::Cpu);
     assert_eq!(difference > 0.0, rounds, "rounding is seen where there is any");
     assert!(difference < 0.02, "values differ by {difference}");
+    assert_eq!(values(&rounded.detach()), b, "constant weights are rounded alike");
     rounded.weights_mut().change(|values| modify(values, |x| x.fill(0.0))).unwrap();
     assert!(values(&rounded).iter().all(|q| *q == 0.0), "kernels rounded before the change were used");
 }

@@ -81,7 +81,7 @@ impl NoisePredictor {
     /// Makes constants of the weights; they share the memory of this network.
     pub fn detach(&self) -> Self {
         let (parts, weights) = (self.parts.clone(), self.weights.detach());
-        Self { parts, weights, packing: Packing::new(Precision::F32) }
+        Self { parts, weights, packing: Packing::new(self.packing.precision) }
     }
 
     /// Draws actions by the whole reverse process (DDPM).

@@ -77,7 +77,7 @@ def test_it_says_what_is_in_it_as_the_learner_does(data):
     dataset = Dataset.from_arrays(**arrays())
     ours = dataset.inspect()
     theirs = subprocess.run(["learner", "datasets", "inspect", "--json", str(data)], check=True, capture_output=True).stdout
-    assert ours == {**json.loads(theirs), "path": "from arrays"}
+    assert ours == {**json.loads(theirs), "path": "in memory"}
     assert repr(dataset) == f"Dataset({ours['transitions']} transitions, observations of 11 numbers, actions of 3)"
     assert "no problems found" in str(dataset) and "transitions   " + str(len(dataset)) in str(dataset)
 

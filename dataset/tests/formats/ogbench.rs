@@ -46,7 +46,7 @@ fn a_task_in_a_maze_has_ogbenchs_start_rewards_and_masks() {
     }
     let environments: BTreeSet<String> =
         ogbench::tasks().filter(|task| task.dataset.is_some()).map(|task| task.environment).collect();
-    assert_eq!(environments.len(), 8 * 6);
+    assert_eq!(environments.len(), 11 * 6);
     for name in environments {
         let place = name.split("-singletask").next().unwrap();
         let file = hdf5::File::open(folder.path().join(format!("{name}.hdf5"))).unwrap();

@@ -281,11 +281,11 @@ def ogbench_mazes(folder):
     import ogbench.relabel_utils
 
     rng = np.random.default_rng(11)
-    places = [f"{robot}maze-{size}" for robot in ("ant", "humanoid") for size in ("medium", "large", "giant")]
+    places = [f"{robot}maze-{size}" for robot in ("point", "ant", "humanoid") for size in ("medium", "large", "giant")]
     for place in [*places, "antsoccer-arena", "antsoccer-medium"]:
         env = gymnasium.make(f"{place}-singletask-v0").unwrapped
         goals = np.array([task["goal_xy"] for task in env.task_infos])
-        xy = np.repeat(goals, 60, axis=0) + rng.uniform(-0.8, 0.8, (300, 2))
+        xy = np.repeat(goals, 60, axis=0) + env._goal_tol * rng.uniform(-1.6, 1.6, (300, 2))
         column = 15 if "soccer" in place else 0
         arrays = {"qpos": rng.normal(size=(300, 30)).astype(np.float32)}
         arrays["observations"] = np.zeros((300, env.observation_space.shape[0]), np.float32)

@@ -9,12 +9,12 @@
 //!
 //! - `environment`: the traits of an environment; `simulation`: an environment that this program simulates; `physics`: drives
 //!   MuJoCo for it.
-//! - `planar` (Hopper, HalfCheetah, Walker2d), `antmaze`: the tasks, with the rules that D4RL's scores are defined by.
+//! - `planar` (Hopper, HalfCheetah, Walker2d), `maze`: the tasks, with the rules that D4RL's scores are defined by.
 //! - `simulations`: makes an environment by its row in the dataset crate's table.
 //! - `rollout`: many episodes as one batch, one policy call for each step.
 
-mod antmaze;
 mod environment;
+mod maze;
 mod physics;
 mod planar;
 mod rollout;

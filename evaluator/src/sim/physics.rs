@@ -37,17 +37,27 @@ fn log(message: &MjLogMessage) {
     tracing::debug!(target: "mujoco", "{}", message.subject());
 }
 
+/// What an action does.
+#[derive(Clone, Copy)]
+pub(super) enum Drive {
+    /// Its numbers are torques, as fractions of each motor's strongest.
+    Motors,
+    /// Before a step they are added to the positions, as fractions of so many metres, and velocities become 0.
+    Displacement(f64),
+}
+
 /// The state of one simulation; many share a model.
 pub(super) struct Physics {
     data: MjData<Arc<MjModel>>,
     frame_skip: usize,
+    drive: Drive,
 }
 
 impl Physics {
     /// A simulation that holds each control for `frame_skip` of the model's time steps.
-    pub(super) fn new(model: Arc<MjModel>, frame_skip: usize) -> Result<Self, EnvironmentError> {
+    pub(super) fn new(model: Arc<MjModel>, frame_skip: usize, drive: Drive) -> Result<Self, EnvironmentError> {
         let data = MjData::try_new(model).map_err(|error| EnvironmentError::Allocation(error.to_string()))?;
-        Ok(Self { data, frame_skip })
+        Ok(Self { data, frame_skip, drive })
     }
 
     /// Control period, seconds.
@@ -119,7 +129,7 @@ impl Physics {
         self.data.forward();
     }
 
-    /// Holds `action` for one control period. It is clipped to ±1, the ends of each motor's control range.
+    /// Applies `action`, clipped to ±1, for one control period.
     ///
     /// False if the step failed: an action that is not a number is not applied; when a simulation diverges, MuJoCo replaces
     /// the state by the initial one.
@@ -128,9 +138,18 @@ impl Physics {
         if action.iter().any(|value| value.is_nan()) {
             return false;
         }
-        for (motor, &value) in action.iter().enumerate() {
-            let [_, strongest] = self.data.model().actuator_ctrlrange()[motor];
-            self.data.ctrl_mut()[motor] = strongest * f64::from(value).clamp(-1.0, 1.0);
+        for (at, &value) in action.iter().enumerate() {
+            let value = f64::from(value).clamp(-1.0, 1.0);
+            match self.drive {
+                Drive::Motors => {
+                    let [_, strongest] = self.data.model().actuator_ctrlrange()[at];
+                    self.data.ctrl_mut()[at] = strongest * value;
+                }
+                Drive::Displacement(furthest) => {
+                    self.data.qpos_mut()[at] += furthest * value;
+                    self.data.qvel_mut()[at] = 0.0;
+                }
+            }
         }
         for _ in 0..self.frame_skip {
             self.data.step();

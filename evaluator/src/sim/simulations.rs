@@ -3,9 +3,9 @@
 use quad_dataset::Planar;
 use quad_dataset::environment::{self, EnvironmentSpec};
 
-use super::antmaze::{self, AntMaze, Maze};
 use super::environment::{Environment, EnvironmentError, Environments};
-use super::physics::{self, Physics};
+use super::maze::{self, Maze, Navigation, Robot};
+use super::physics::{self, Drive, Physics};
 use super::planar;
 use super::simulation::Simulation;
 
@@ -40,7 +40,7 @@ impl Kind {
         };
         match self.rules {
             Rules::Planar(_) => file(self.name).to_owned(),
-            Rules::Maze(maze) => maze.mjcf(file("ant")),
+            Rules::Maze(maze) => maze.mjcf(file(Robot::of(self.name).model)),
         }
     }
 }
@@ -56,12 +56,15 @@ pub fn make(spec: &'static EnvironmentSpec, environment_seed: u64) -> Result<Sim
     let kind = Kind::of(spec);
     let model = physics::model(kind.name, || kind.mjcf())?;
     Ok(match kind.rules {
-        Rules::Planar(robot) => {
-            Simulation::new(Physics::new(model, robot.frame_skip)?, planar::body(robot), Box::new(robot), spec)
-        }
+        Rules::Planar(robot) => Simulation::new(
+            Physics::new(model, robot.frame_skip, Drive::Motors)?,
+            planar::body(robot),
+            Box::new(robot),
+            spec,
+        ),
         Rules::Maze(maze) => {
-            let task = AntMaze::new(maze, spec, environment_seed);
-            Simulation::new(Physics::new(model, antmaze::FRAME_SKIP)?, antmaze::BODY, Box::new(task), spec)
+            let (task, drive) = (Navigation::new(maze, spec, environment_seed), Robot::of(kind.name).drive);
+            Simulation::new(Physics::new(model, maze::FRAME_SKIP, drive)?, maze::BODY, Box::new(task), spec)
         }
     })
 }

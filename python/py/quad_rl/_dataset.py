@@ -102,7 +102,7 @@ class Dataset:
             path = Path(folder, "dataset.hdf5")
             self.save(path)
             json_text, page = _quad_rl.inspect_dataset(path)
-        return json_text.replace(str(path), "from arrays"), page.replace(str(path), "from arrays")
+        return json_text.replace(str(path), "in memory"), page.replace(str(path), "in memory")
 
     @property
     def notes(self) -> list[str]:

@@ -1,4 +1,4 @@
-//! AntMaze: a four-legged ant walks through a maze to a goal that it does not observe.
+//! Mazes: a four-legged ant, or a ball, comes through a maze to a goal that it does not observe.
 //!
 //! The mazes, the ant and the rules are those of D4RL's antmaze-*-v0 and antmaze-*-v2:
 //!
@@ -15,29 +15,51 @@
 //! OGBench's antmaze-*-singletask-* differ in three things: the episode begins within 1 m, on each axis, of the centre of the
 //! task's own cell; the goal is the centre of another; and a step is judged where it begins, so that an episode ends one step after
 //! the ant has come there. Rewards are 1 more than OGBench's, so that a return is 0 or 1, too.
+//!
+//! OGBench's pointmaze-*-singletask-* have a ball in place of the ant. It observes x and y. An action (2) puts it at once as much
+//! further, as fractions of 0.2 m on each axis, without any velocity; then walls push it back for 0.1 s. It is at the goal within 1 m.
 
 use quad_dataset::environment::Goal;
-use quad_dataset::ogbench::{self, CELL, MazeTask, REACH};
+use quad_dataset::ogbench::{self, ANT_REACH, CELL, MazeTask};
 use quad_dataset::{EnvironmentSpec, Noise};
 use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 
-use super::physics::Physics;
+use super::physics::{Drive, Physics};
 use super::simulation::{Body, Task};
 
 /// The stream that a goal is drawn from, among those of an episode's or an environment's seed.
 const GOAL_STREAM: u64 = 4;
 /// The stream that a start is drawn from, likewise.
 const START_STREAM: u64 = 5;
-/// Where the model of the ant on its floor has the walls.
+/// Where the model of a robot on its floor has the walls.
 const WALLS: &str = "<!-- walls -->";
 /// How far from its cell's centre, on each axis, an episode of OGBench's begins, metres.
 const START_NOISE: f64 = 1.0;
 /// Steps of the model that a control is held for, of 0.02 s each.
 pub(super) const FRAME_SKIP: usize = 5;
-/// The ant.
+/// How both robots begin. The ball's observation has no room for velocities.
 pub(super) const BODY: Body =
     Body { noise: Noise::NormalVelocities(0.1), hidden_positions: 0, observed_velocity: f64::INFINITY };
+
+/// What moves through a maze.
+#[derive(Clone, Copy)]
+pub(super) struct Robot {
+    /// The name of its model, on a floor without walls.
+    pub model: &'static str,
+    /// How its actions move it.
+    pub drive: Drive,
+}
+
+impl Robot {
+    /// The robot of an environment in a maze, by the environment's name.
+    pub fn of(environment: &str) -> Self {
+        match environment.starts_with("pointmaze-") {
+            true => Self { model: "point", drive: Drive::Displacement(0.2) },
+            false => Self { model: "ant", drive: Drive::Motors },
+        }
+    }
+}
 
 /// A maze's map, as its row in the table has it. The world's origin is the centre of the cell (1, 1), which is the start.
 #[derive(Clone, Copy)]
@@ -52,11 +74,11 @@ impl Maze {
         })
     }
 
-    /// The model: `ant`, which has a floor, and a box for each wall, half a cell high.
-    pub fn mjcf(self, ant: &str) -> String {
+    /// The model: `robot`, which has a floor, and a box for each wall, half a cell high.
+    pub fn mjcf(self, robot: &str) -> String {
         let walls: String =
             self.centres(b'1').map(|[x, y]| format!("<geom class=\"wall\" pos=\"{x} {y} 1\"/>\n    ")).collect();
-        ant.replacen(WALLS, walls.trim_end(), 1)
+        robot.replacen(WALLS, walls.trim_end(), 1)
     }
 
     /// Draws a goal.
@@ -69,14 +91,14 @@ impl Maze {
 }
 
 /// The way to a goal.
-pub(super) struct AntMaze {
+pub(super) struct Navigation {
     maze: Maze,
     goal: [f64; 2],
     is_redrawn: bool,
     task: Option<MazeTask>,
 }
 
-impl AntMaze {
+impl Navigation {
     /// `environment_seed` is the seed of a goal that all episodes share.
     pub fn new(maze: Maze, spec: &EnvironmentSpec, environment_seed: u64) -> Self {
         let task = ogbench::maze_task(&spec.name);
@@ -85,11 +107,11 @@ impl AntMaze {
     }
 }
 
-impl Task for AntMaze {
+impl Task for Navigation {
     fn judge(&self, from: [f64; 2], physics: &Physics) -> (f64, bool) {
         let place = if self.task.is_some() { from } else { [0, 1].map(|axis| physics.qpos()[axis]) };
         let [dx, dy] = [0, 1].map(|axis| place[axis] - self.goal[axis]);
-        let reached = (dx * dx + dy * dy).sqrt() <= REACH;
+        let reached = (dx * dx + dy * dy).sqrt() <= self.task.map_or(ANT_REACH, |task| task.reach);
         (f64::from(u8::from(reached)), reached)
     }
 
