@@ -141,7 +141,7 @@ fn tasks_and_algorithms_are_listed_with_what_their_authors_give() {
     let list = printed(&["presets"]);
     let (tasks, algorithms) = list.split_once("\n\n").unwrap();
     let tasks: Vec<&str> = tasks.lines().skip(1).collect();
-    assert_eq!(tasks.len(), 21 + 6 + 36, "{list}");
+    assert_eq!(tasks.len(), 21 + 6 + 42, "{list}");
     for row in [
         "antmaze-large-play-v0 antmaze-large-v0 antmaze-large-play-v0",
         "own-data own - data of your own, without evaluation",
