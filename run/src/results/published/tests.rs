@@ -99,3 +99,16 @@ fn every_remark_is_on_a_figure_and_says_something_else_than_it() {
         }
     }
 }
+
+#[test]
+fn a_score_is_of_as_many_evaluations_as_its_benchmarks() {
+    for (task, evaluations) in [
+        ("hopper-medium-v2", 5),
+        ("hopper-demo", 5),
+        ("antmaze-umaze-v2", 3),
+        ("antmaze-large-navigate-singletask-v0", 3),
+        ("pointmaze-medium-stitch-singletask-task2-v0", 3),
+    ] {
+        assert_eq!(last(task), evaluations, "{task}");
+    }
+}
