@@ -1,5 +1,6 @@
 //! All that is known of an environment: the table `environments.toml`.
 
+use std::collections::BTreeMap;
 use std::sync::LazyLock;
 
 use serde::Deserialize;
@@ -42,6 +43,9 @@ pub struct EnvironmentSpec {
     /// The maze, if it is an ant or a ball in one: rows of cells along +y, in them cells along +x (1 wall, 0 free, R start, G goal).
     #[serde(default)]
     pub maze: Option<Vec<String>>,
+    /// The environment whose row has its maze, if its own has not.
+    #[serde(default)]
+    maze_of: Option<String>,
     /// How a dataset is recorded in it, or why none can be.
     pub collect: Collect,
 }
@@ -67,7 +71,15 @@ struct Table {
 #[allow(clippy::expect_used)] // The table is part of the program; the first test here reads it.
 static ENVIRONMENTS: LazyLock<Vec<EnvironmentSpec>> = LazyLock::new(|| {
     let table: Table = toml::from_str(include_str!("../environments.toml")).expect("the embedded table is valid");
-    table.environment.into_iter().flat_map(EnvironmentSpec::with_tasks).collect()
+    let mut rows = table.environment;
+    let maze = |row: &EnvironmentSpec| Some((row.name.clone(), row.maze.clone()?));
+    let mazes: BTreeMap<_, _> = rows.iter().filter_map(maze).collect();
+    for row in &mut rows {
+        if let Some(other) = &row.maze_of {
+            row.maze = mazes.get(other).cloned();
+        }
+    }
+    rows.into_iter().flat_map(EnvironmentSpec::with_tasks).collect()
 });
 
 /// All environments of the table.
