@@ -67,7 +67,8 @@ impl PyPolicy {
     /// Acts in each of n states: observations [n, observation_size] -> actions [n, action_size], float32.
     ///
     /// An array of one axis is one state, and gives one action. float32 arrays whose numbers lie side by side are not copied;
-    /// anything else that NumPy takes is converted.
+    /// anything else that NumPy takes is converted. A dictionary, such as of a message's joints, is read by `observation_names`,
+    /// in any order: single numbers are one state, [n] each are n; what else it has is not looked at.
     ///
     /// candidates: how many actions are drawn in each state. rule: which of them is taken, "best", "softmax:TEMPERATURE",
     ///     "average:TEMPERATURE:ACTIONS" (the mean of so many) or "nearest". value: what the critics' values of an action count

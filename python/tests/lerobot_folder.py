@@ -6,6 +6,8 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
+FLAGS = ("next.success", "next.done", "next.terminated", "next.truncated")
+
 
 def episodes(count=6, seed=0, simulated=False):
     """A list of dictionaries: state in degrees, action, and what a simulator adds. Even ones succeed, the others are cut off."""
@@ -27,11 +29,11 @@ def write(root, episodes, version="v3.0", per_file=2, row_group=7, shuffle=None,
         "action": {"dtype": "float32", "shape": [2], "names": ["pan", "lift"]},
         "observation.images.top": {"dtype": "video", "shape": [48, 64, 3], "names": ["height", "width", "channels"]},
         **{name: {"dtype": dtype, "shape": [1], "names": None} for name, dtype in
-           {"next.reward": "float32", "next.success": "bool", "next.done": "bool"}.items() if name in episodes[0]},
+           {"next.reward": "float32", **dict.fromkeys(FLAGS, "bool")}.items() if name in episodes[0]},
         "timestamp": {"dtype": "float32", "shape": [1], "names": None},
         **{name: {"dtype": "int64", "shape": [1], "names": None} for name in ("frame_index", "episode_index", "index", "task_index")},
     }
-    tasks = sorted({one["task"] for one in episodes})
+    tasks = sorted({task for one in episodes for task in np.atleast_1d(one["task"]).tolist()})
     info = {"codebase_version": version, "fps": 30, "total_episodes": len(episodes), "features": features,
             "total_frames": sum(len(one["action"]) for one in episodes)}
     (root / "meta").mkdir(parents=True)
@@ -41,13 +43,13 @@ def write(root, episodes, version="v3.0", per_file=2, row_group=7, shuffle=None,
         steps = len(one["action"])
         columns = {name: pa.array(list(np.asarray(one[name], np.float32)), pa.list_(pa.float32(), 3 if "state" in name else 2))
                    for name in ("observation.state", "action")}
-        columns |= {name: pa.array(one[name]) for name in ("next.reward", "next.success", "next.done") if name in one}
+        columns |= {name: pa.array(one[name]) for name in ("next.reward", *FLAGS) if name in one}
         columns |= {"timestamp": pa.array(np.arange(steps, dtype=np.float32) / 30), "frame_index": pa.array(np.arange(steps)),
                     "episode_index": pa.array(np.full(steps, number)), "index": pa.array(np.arange(start, start + steps)),
-                    "task_index": pa.array(np.full(steps, tasks.index(one["task"])))}
+                    "task_index": pa.array([tasks.index(task) for task in np.broadcast_to(one["task"], steps)])}
         tables.append(pa.table(columns))
         start += steps
-    rows = [{"episode_index": i, "tasks": [one["task"]], "length": (lengths or {}).get(i, len(one["action"])),
+    rows = [{"episode_index": i, "tasks": np.unique(one["task"]).tolist(), "length": (lengths or {}).get(i, len(one["action"])),
              "is_success": i in (0, 3)}
             for i, one in enumerate(episodes)]
     if version == "v3.0":

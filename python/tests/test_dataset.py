@@ -98,7 +98,7 @@ def test_what_cannot_be_is_refused(tmp_path):
     good = arrays(n=200)
 
     def changed(name, row, value):
-        array = good[name].astype(np.float64)
+        array = np.ma.array(good[name].astype(np.float64))
         array[row] = value
         return Dataset.from_arrays(**{**good, name: array})
 
@@ -124,6 +124,12 @@ def test_what_cannot_be_is_refused(tmp_path):
         "same size": lambda: Dataset.from_episodes([episode, {**episode, "actions": np.zeros(5)}]),
         "of which none makes a transition\nhint: ": lambda: Dataset.from_arrays(
             **{name: array[:0] for name, array in good.items()}).save(tmp_path / "none"),
+        r"observations, row 7 is masked \(2 such rows\)\nhint: ": lambda: changed("observations", [[7], [9]], np.ma.masked),
+        r"terminations, row 3: 0.5 is neither 0 nor 1 \(1 such rows\)": lambda: changed("terminations", 3, 0.5),
+        "truncations, row 4: -1.0 is neither": lambda: changed("truncations", 4, -1),
+        "episode 0: terminations, row 4: 0.5 is": lambda: Dataset.from_episodes([{**episode, "terminations": 0.5}]),
+        "episode 0: rewards, row 1 is masked": lambda: Dataset.from_episodes(
+            [{**episode, "rewards": np.ma.masked_equal([0, 9, 0, 0, 0], 9)}]),
         "actions are whole numbers": lambda: Dataset.from_arrays(**{**good, "actions": np.ones((200, 2), int)}),
     }.items():
         with pytest.raises(ValueError, match=message):

@@ -112,8 +112,45 @@ def test_several_tasks_are_told_apart(tmp_path):
     place = Dataset.from_lerobot(folder, **STATE, reward="step-cost", success="all", task="place")
     assert len(place) == 9 + 10 and "4 of 6 episodes dropped: of another task than 'place'" in place.notes
     assert len(Dataset.from_lerobot(folder, **STATE, reward="step-cost", success="all", task="all")) == sum(range(5, 11))
-    with pytest.raises(ValueError, match="no task 'push'"):
+    with pytest.raises(ValueError, match="no episode is of task 'push' alone: 'pick'"):
         Dataset.from_lerobot(folder, **STATE, reward="step-cost", success="all", task="push")
+
+
+def test_the_task_of_each_frame_counts(tmp_path):
+    given = episodes()
+    for one in given[4:]:
+        one["task"] = ["pick"] * (len(one["action"]) - 2) + ["place"] * 2
+    folder, rule = write(tmp_path / "data", given), {**STATE, "reward": "step-cost", "success": "all"}
+    told = r"'pick' \(4 episodes\), 'pick' and 'place' \(2 episodes, each of several\)\nhint: task="
+    for asked in ({}, {"task": "place"}):
+        with pytest.raises(ValueError, match=told):
+            Dataset.from_lerobot(folder, **rule, **asked)
+    pick = Dataset.from_lerobot(folder, **rule, task="pick")
+    assert len(pick) == 5 + 6 + 7 + 8
+    assert "2 of 6 episodes dropped: their frames are of several tasks (episode 4, 5)" in pick.notes
+    assert "0 of 6 episodes dropped: of another task than 'pick'" in pick.notes
+    assert len(Dataset.from_lerobot(folder, **rule, task="all")) == sum(range(5, 11))
+
+
+def test_what_says_that_it_terminated_is_believed(tmp_path):
+    """Of six episodes two are successes, one falls, three are cut off."""
+    given, rule = episodes(simulated=True), {**STATE}
+    for i, one in enumerate(given):
+        end = one["next.done"]
+        one |= {"next.terminated": end & (i in (0, 2, 3)), "next.truncated": end & (i not in (0, 2, 3)), "next.success": end & (i in (0, 2))}
+    read = {}
+    for left_out in [(), ("next.done",), ("next.truncated",), ("next.terminated",), ("next.success",), ("next.success", "next.done"),
+                     ("next.success", "next.terminated")]:
+        folder = tmp_path / "-".join(["without", *left_out])
+        read[left_out] = Dataset.from_lerobot(write(folder, [{k: v for k, v in one.items() if k not in left_out} for one in given]), **rule)
+    for dataset in read.values():
+        found = rows(dataset)
+        for array, by_hand in zip((found[0], found[1], found[3], found[4]), expected(given, {0, 2, 3})):
+            assert np.array_equal(array, by_hand)
+        assert found[5].sum() == 3
+        assert "3 of 6 episodes terminate, as next.terminated says; the others are cut off" in dataset.notes
+    asked = Dataset.from_lerobot(tmp_path / "without", **rule, terminate="success")
+    assert rows(asked)[4].sum() == 2
 
 
 def test_what_is_broken_is_left_out_and_counted(tmp_path):
@@ -126,6 +163,10 @@ def test_what_is_broken_is_left_out_and_counted(tmp_path):
     assert "1 of 6 episodes dropped: frames are missing or there twice (episode 1)" in dataset.notes
     assert any(note.startswith("2 of 6 episodes dropped: unreadable, as files are of recordings") and note.endswith("file-000.parquet")
                for note in dataset.notes)
+    short = Dataset.from_lerobot(write(tmp_path / "short", episodes(), lengths={1: 0, 2: 5}), **rule)
+    assert len(short) == sum(range(5, 11))
+    assert ("2 of 6 episodes: meta/episodes is wrong about their frames, which are all read (episode 1: 0, but data has 6; "
+            "episode 2: 5, but data has 7)") in short.notes
     for file in (folder / "data").glob("**/*.parquet"):
         file.write_bytes(b"PAR1")
     with pytest.raises(ValueError, match="no Parquet file in data has episode_index and frame_index; unreadable"):
@@ -135,7 +176,7 @@ def test_what_is_broken_is_left_out_and_counted(tmp_path):
 def test_what_cannot_be_is_refused(tmp_path):
     folder = write(tmp_path / "data", episodes())
     for message, asked in {
-        "nothing says what is rewarded\nhint: reward=": {},
+        "no rewards were recorded, and nothing says what is rewarded\nhint: reward=.*; success=": {},
         "reward='success-at-end' needs to know which episodes are successes": {"reward": "success-at-end"},
         "there is no column 'observation.speed'\nhint: there are 'observation.state'": {
             "observations": ["observation.speed"], "reward": "step-cost", "success": "all"},

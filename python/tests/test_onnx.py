@@ -12,6 +12,8 @@ from conftest import OBSERVATION, train
 
 import quad_rl
 from quad_rl import Policy, export_onnx
+from quad_rl.onnx.choosing import choose
+from quad_rl.onnx.graph import Graph
 
 PRESETS = Path(__file__).parents[2] / "presets"
 ALGORITHMS = sorted(preset.stem for preset in PRESETS.glob("*.toml") if preset.stem != "tasks")
@@ -74,6 +76,64 @@ def test_every_choice_that_a_call_may_ask_for(snapshots, rule, tmp_path):
         compare(policy, tmp_path / "policy.onnx", candidates=candidates, rule=rule, value=value)
 
 
+BELOW_ONE = np.nextafter(np.float32(1), np.float32(0))
+EDGES = [0.0, float(BELOW_ONE), 1.0]
+
+
+def drawn_by_rule(worth, temperature, uniform):
+    """The native policy's rule, with its own float64; where rounding leaves none, the best."""
+    weights = np.exp((worth - worth.max()).astype(np.float64) / np.float64(np.float32(temperature)))
+    sums = np.cumsum(weights)
+    beyond = sums > np.float64(np.float32(uniform)) * sums[-1]
+    return int(np.argmax(beyond)) if beyond.any() else int(np.argmax(worth))
+
+
+def chosen(worth, rule, uniform):
+    """What a model takes of candidates whose numbers are one-hot: the share of each."""
+    graph, (n, count) = Graph(), worth.shape
+    inputs = {"drawn": np.tile(np.eye(count, dtype=np.float32), (n, 1, 1)), "worth": worth, "uniform": uniform}
+    drawn, of, numbers = (graph.input(name, array.shape[1:]) for name, array in inputs.items())
+    model = graph.model({"taken": (choose(drawn, of, rule, count, numbers), (count,))}, "")
+    return onnxruntime.InferenceSession(model.SerializeToString(), providers=["CPUExecutionProvider"]).run(None, inputs)[0]
+
+
+@pytest.mark.parametrize("edge", [*EDGES, 0.5])
+def test_every_uniform_number_has_its_candidate(edge):
+    rng = np.random.default_rng(0)
+    worth = rng.normal(size=(2000, 10)).astype(np.float32)
+    worth[:500, 0] -= 60  # A float32 sum of the others does not see it.
+    worth[500:600, 0] = worth[500:600].max(1) - 200  # Below float32's exp, not below float64's.
+    worth[600:700] = 1.5
+    for temperature in (1.0, 0.05):
+        taken = chosen(worth, f"softmax:{temperature}", np.full((2000, 1), edge, np.float32))
+        assert np.array_equal(taken.argmax(1), [drawn_by_rule(row, temperature, edge) for row in worth])
+    if edge == BELOW_ONE:
+        assert (chosen(worth[:500], "softmax:1", np.full((500, 1), edge, np.float32)).argmax(1) > 0).all()
+    if edge == 1.0:
+        assert np.array_equal(taken.argmax(1), worth.argmax(1))
+    mean = chosen(worth, "average:1:4", np.full((2000, 4), edge, np.float32))
+    np.testing.assert_allclose(mean.sum(1), 1, rtol=1e-6)
+    assert ((mean > 0).sum(1) == 4).all(), "four are taken, each once"
+
+
+@pytest.mark.parametrize("name", ["dql", "dtql", "align-iql"])
+def test_the_ends_of_uniform_numbers_choose_as_the_policy(snapshots, name, tmp_path):
+    """At 0 the first candidate, at 1 the best, just below 1 the last that counts, of those that the policy itself draws."""
+    policy, states = Policy.load(snapshots[name]), batches()[2]
+    export_onnx(policy, tmp_path / "policy.onnx", rule="softmax:0.1")
+    session = onnxruntime.InferenceSession(tmp_path / "policy.onnx", providers=["CPUExecutionProvider"])
+    drawn, values = policy.sample(states, seed=3)
+    best = policy.act(states, rule="best", seed=3)
+    for edge in EDGES:
+        noise = policy.noise(len(states), rule="softmax:0.1", seed=3)
+        noise["uniform"][:] = edge
+        found = session.run(["actions"], {"observations": states, **noise})[0]
+        place = [drawn_by_rule(row, 0.1, edge) for row in values]
+        expected = best if edge == 1.0 else drawn[np.arange(len(states)), place]
+        assert edge or place == [0] * len(states)
+        close(found, expected, 1e-5)
+
+
 @pytest.mark.parametrize("flags", [
     ["replan_every=1", "guidance={steps=2, scale=3.0, stop=0}", "network={horizon=6, channels=8, multipliers=[1, 4], groups=2, "
      "attention={heads=2, width=3}}"],
@@ -103,3 +163,22 @@ def test_what_cannot_be_is_refused(snapshots, tmp_path):
     without = "import sys; sys.modules['onnx'] = None; import quad_rl; quad_rl.export_onnx(sys.argv[1], 'policy.onnx')"
     ended = subprocess.run([sys.executable, "-c", without, snapshots["quad"]], capture_output=True, text=True, timeout=60)
     assert "hint: pip install" in ended.stderr and "ImportError" in ended.stderr
+
+
+FULL = """
+import resource, sys
+from quad_rl import Policy, export_onnx
+
+policy = Policy.load(sys.argv[1])
+resource.setrlimit(resource.RLIMIT_FSIZE, (5000, 5000))  # As a full disk: a write of more fails.
+export_onnx(policy, sys.argv[2])
+"""
+
+
+def test_a_full_disk_leaves_the_model_that_was_there(snapshots, tmp_path):
+    export_onnx(snapshots["dql"], tmp_path / "policy.onnx")
+    before = (tmp_path / "policy.onnx").read_bytes()
+    command = [sys.executable, "-c", FULL, snapshots["quad"], tmp_path / "policy.onnx"]
+    ended = subprocess.run(command, capture_output=True, text=True, timeout=60)
+    assert ended.returncode == 1 and "OSError" in ended.stderr, ended.stderr
+    assert (tmp_path / "policy.onnx").read_bytes() == before and [path.name for path in tmp_path.iterdir()] == ["policy.onnx"]

@@ -64,6 +64,102 @@ def test_robomimic(demonstrations):
             Dataset.from_robomimic(demonstrations, **{**seen, **asked})
 
 
+def test_robomimic_s_next_observations_are_the_following_rows(demonstrations):
+    """Else what was left out between two rows would be learnt as one step."""
+    seen = {"observations": ["eef_pos", "object"]}
+    right = Dataset.from_robomimic(demonstrations, **seen)
+    with h5py.File(demonstrations, "a") as file:
+        for demo in file["data"].values():
+            rounded = demo["next_obs/object"][()].astype(np.float16)
+            del demo["next_obs/object"], demo["next_obs/agentview_image"]
+            demo["next_obs/object"] = rounded
+    coarse = Dataset.from_robomimic(demonstrations, **seen)
+    assert len(coarse) == len(right) and np.abs(rows(coarse)[3] - rows(right)[3]).max() < 2e-3
+    with h5py.File(demonstrations, "a") as file:
+        demo = file["data/demo_3"]
+        for array in [demo["actions"], demo["rewards"], demo["dones"], *demo["obs"].values(), *demo["next_obs"].values()]:
+            name, kept = array.name, np.delete(array[()], [2, 4], 0)
+            del file[name]
+            file[name] = kept
+    with pytest.raises(ValueError, match=r"demo_3: next_obs, row 1 of 'eef_pos' is not the following row of obs \(2 such rows\)\nhint: "):
+        Dataset.from_robomimic(demonstrations, **seen)
+
+
+def test_robomimic_s_demonstrations_that_lack_something(demonstrations):
+    seen = {"observations": ["eef_pos", "object"]}
+    whole = Dataset.from_robomimic(demonstrations, **seen)
+    with h5py.File(demonstrations, "a") as file:
+        file.create_group("data/demo_12")
+        demo = file.create_group("data/demo_13")
+        for name, width in {"actions": (3,), "rewards": (), "dones": (), "obs/object": (2,), "obs/eef_pos": (3,)}.items():
+            demo[name] = np.zeros((0, *width))
+    dataset = Dataset.from_robomimic(demonstrations, **seen)
+    assert all(map(np.array_equal, rows(dataset), rows(whole)))
+    assert "2 of 14 episodes dropped: without a step" in dataset.notes
+    with h5py.File(demonstrations, "a") as file:
+        del file["data/demo_7/obs/object"], file["data/demo_9/actions"]
+    for message, asked in {r"no column 'object' in episode demo_7 \(1 such episodes\)\nhint: there are 'actions', 'dones',": seen,
+                           r"no column 'actions' in episode demo_9 \(1 such": {"observations": ["eef_pos"]}}.items():
+        with pytest.raises(ValueError, match=message):
+            Dataset.from_robomimic(demonstrations, **asked)
+
+
+def test_isaac_lab_s_recorder(tmp_path):
+    """Neither rewards nor dones; `obs` is one array, and an attribute says which demonstrations succeed."""
+    rng, path, made = np.random.default_rng(0), tmp_path / "dataset.hdf5", []
+    with h5py.File(path, "w") as file:
+        for i in range(4):
+            demo, seen = file.create_group(f"data/demo_{i}"), rng.normal(size=(6, 5)).astype(np.float32)
+            demo["actions"], demo["obs"], demo["states/articulation/robot/joint_position"] = rng.uniform(-1, 1, (6, 2)), seen, seen
+            demo.attrs["num_samples"], demo.attrs["success"] = 6, i != 2
+            made.append(seen if i != 2 else seen[:-1])
+    with pytest.raises(ValueError, match="no rewards were recorded, and nothing says what is rewarded\nhint: reward=.*step-cost.*success="):
+        Dataset.from_robomimic(path, observations=["obs"])
+    dataset = Dataset.from_robomimic(path, observations=["obs"], reward="step-cost")
+    assert np.array_equal(rows(dataset)[0], np.concatenate(made)) and dataset.observation_names[0] == "obs[0]"
+    assert np.flatnonzero(rows(dataset)[4]).tolist() == [5, 11, 22] and (rows(dataset)[2] == 0).sum() == 3
+    assert "3 of 4 episodes are successes" in dataset.notes
+
+
+def elsewhere(file, name, secret):
+    """Ways to write an array whose numbers lie in another file."""
+    with h5py.File(secret.with_suffix(".hdf5"), "w") as other:
+        other["numbers"] = np.arange(20.0).reshape(5, 4)
+    group, last = file[name.rsplit("/", 1)[0]], name.rsplit("/", 1)[1]
+    virtual = h5py.VirtualLayout((5, 4), "f8")
+    virtual[:] = h5py.VirtualSource(str(secret.with_suffix(".hdf5")), "numbers", (5, 4))
+    return {
+        "external storage": lambda: group.create_dataset(last, (5, 4), "u1", external=[(str(secret), 0, 20)]),
+        "external link": lambda: group.__setitem__(last, h5py.ExternalLink(str(secret.with_suffix(".hdf5")), "/numbers")),
+        "virtual": lambda: group.create_virtual_dataset(last, virtual),
+    }
+
+
+@pytest.mark.filterwarnings("ignore::UserWarning")
+@pytest.mark.parametrize("way", ["external storage", "external link", "virtual"])
+def test_hdf5_s_arrays_of_other_files_are_refused(way, tmp_path, monkeypatch):
+    """Else a dataset would be this machine's own files: whoever sends a recording would get them back with a policy."""
+    (tmp_path / "secret").write_bytes(bytes(range(65, 85)))
+    with h5py.File(tmp_path / "demo.hdf5", "w") as file:
+        demo = file.create_group("data/demo_0")
+        demo["actions"], demo["rewards"], demo["dones"] = np.zeros((5, 2)), np.arange(5.0), np.arange(5) == 4
+        demo.create_group("obs")
+        elsewhere(file, "data/demo_0/obs/x", tmp_path / "secret")[way]()
+        demo["obs/soft"] = h5py.SoftLink("/data/demo_0/obs/x")
+        file["itself"] = file["/"]
+    for asked in ("x", "soft"):
+        with pytest.raises(ValueError, match="/data/demo_0/obs/x is not in this file: it leads to numbers that lie elsewhere\nhint: "):
+            Dataset.from_robomimic(tmp_path / "demo.hdf5", observations=[asked])
+    monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path))
+    episodes_of_minari(BOX, lambda rng, count: list(rng.normal(size=(count, 2))), "hdf5", "sent/by-mail-v0")
+    assert len(Dataset.from_minari("sent/by-mail-v0")) == 20
+    with h5py.File(tmp_path / "sent/by-mail-v0/data/main_data.hdf5", "a") as file:
+        del file["episode_1/actions"]
+        elsewhere(file, "episode_1/actions", tmp_path / "secret")[way]()
+    with pytest.raises(ValueError, match="/episode_1/actions is not in this file"):
+        Dataset.from_minari("sent/by-mail-v0")
+
+
 def episodes_of_minari(space, observe, storage, name, short=False):
     """Writes four episodes of five steps, by Minari; every other one terminates. Needs no jax, as its DataCollector does."""
     import minari

@@ -48,9 +48,46 @@ def test_a_table_of_any_kind_makes_the_same_transitions(tmp_path):
         assert all(np.array_equal(array, other) for array, other in zip(rows(dataset), right))
         assert dataset.observation_names == (["both[0]", "both[1]"] if changed else ["x", "v"])
     mixed = frame.iloc[np.argsort(np.arange(60) % 20, kind="stable")]  # Three runs, recorded at once.
-    dataset = Dataset.from_frame(mixed, **COLUMNS, reward="gain", terminal="fell")
+    dataset = Dataset.from_frame(mixed, **COLUMNS, reward="gain", terminal="fell", apart="interleaved")
     assert all(np.array_equal(array, other) for array, other in zip(rows(dataset), right))
     assert dataset.notes[0].startswith("3 of 3 episodes: their rows do not lie together")
+
+
+NAN = float("nan")
+
+
+@pytest.mark.parametrize("ids", [
+    [1, 1, 1, NAN, NAN, 2, 2, 2, NAN, 3, 3, 3], [*"aaa", None, None, *"bbb", None, *"ccc"], [*"aaa", "", "", *"bbb", " ", *"ccc"],
+    pd.array([1, 1, 1, None, None, 2, 2, 2, None, 3, 3, 3], dtype="Int64"),
+    pd.to_datetime(["2026-01-01"] * 3 + [None] * 2 + ["2026-01-02"] * 3 + [None] + ["2026-01-03"] * 3),
+], ids=["numbers", "texts", "empty texts", "nullable", "times"])
+def test_rows_of_no_episode_are_refused(ids, tmp_path):
+    frame = pd.DataFrame({"x": np.arange(12.0), "torque": np.linspace(-1, 1, 12), "gain": 1.0, "run": ids})
+    asked = {"observations": ["x"], "actions": ["torque"], "episode": "run", "reward": "gain", "terminal": "never"}
+    frame.to_csv(tmp_path / "log.csv", index=False)
+    for source in (frame, {name: column.to_numpy() for name, column in frame.items()}, tmp_path / "log.csv"):
+        with pytest.raises(ValueError, match=r"column 'run', row 3 is empty.* \(3 such "):
+            Dataset.from_frame(source, **asked)
+    assert len(Dataset.from_frame(frame[frame["run"].astype(str).str.len() > 0].dropna().replace(" ", pd.NA).dropna(), **asked)) == 6
+
+
+def test_rows_of_an_episode_that_lie_apart_are_asked_about():
+    """Two logs with the same numbers, or two runs at once: the table itself does not tell."""
+    frame = pd.DataFrame({"x": [0.0, 1, 2, 3, 4, 100, 101, 102], "torque": np.linspace(-1, 1, 8), "gain": 1.0,
+                          "run": [1, 1, 1, 2, 2, 1, 1, 1], "won": [0, 0, 1, 0, 0, 0, 0, 0]})
+    asked = {"observations": ["x"], "actions": ["torque"], "episode": "run", "reward": "gain"}
+    with pytest.raises(ValueError, match="1 of 2 episodes: their rows do not lie together, as those of 'run' 1\nhint: apart="):
+        Dataset.from_frame(frame, **asked, terminal="never")
+    with pytest.raises(ValueError, match="apart is 'both'"):
+        Dataset.from_frame(frame, **asked, terminal="never", apart="both")
+    once = Dataset.from_frame(frame, **asked, terminal="never", apart="interleaved")
+    assert (once._rows.observations[:, 0].tolist(), once._rows.next_observations[:, 0].tolist()) == ([0, 1, 2, 100, 101, 3], [1, 2, 100, 101, 102, 4])
+    again = Dataset.from_frame(frame, **asked, success="won", apart="repeated")
+    assert (again._rows.observations[:, 0].tolist(), again._rows.next_observations[:, 0].tolist()) == ([0, 1, 2, 3, 100, 101], [1, 2, 2, 4, 101, 102])
+    assert again._rows.terminals.tolist() == [False, False, True, False, False, False]
+    assert "1 of 2 names are those of several episodes: 3 in all" in again.notes
+    with pytest.raises(ValueError, match="names, of which some are those of several episodes"):
+        Dataset.from_frame(frame, **asked, success=[1], apart="repeated")
 
 
 def test_what_a_table_lacks_is_asked_for(tmp_path):
@@ -69,12 +106,45 @@ def test_what_a_table_lacks_is_asked_for(tmp_path):
         ("\nhint: success= a column", frame, rule),
         ('hint: terminal="success", or rewards', frame, {**rule, "success": "all", "terminal": "never"}),
         ("there is no episode", frame[:0], {**rule, "success": "all"}),
+        (r"the table: x, row 3 is masked \(1 such rows\)\nhint: leave",
+         {**frame, "x": np.ma.masked_array(frame["x"], np.arange(60) == 3)}, {**rule, "success": "all"}),
+        ("episode b: terminations, row 4: 0.5 is neither 0 nor 1", frame.assign(fell=np.arange(60) == 4).assign(fell=lambda f: f["fell"] / 2),
+         {**rule, "reward": "gain", "terminal": "fell"}),
     ]:
         with pytest.raises(ValueError, match=message):
             Dataset.from_frame(source, **asked)
 
 
-def test_names_go_into_the_file_and_the_policy(tmp_path):
+def test_a_table_without_a_line_of_names(tmp_path):
+    table().to_csv(tmp_path / "log.csv", index=False, header=False)
+    with pytest.raises(ValueError, match="log.csv has no line of names: its first line is .*, b, False\nhint: write one above them, such as x,v,torque,run"):
+        Dataset.from_frame(tmp_path / "log.csv", **COLUMNS, reward="gain", terminal="fell")
+    frame = pd.DataFrame(table()[["x", "v", "torque", "gain", "run"]].to_numpy())  # Its own columns are numbers.
+    frame.to_csv(tmp_path / "numbers.csv", index=False)
+    read = Dataset.from_frame(tmp_path / "numbers.csv", observations=["0", "1"], actions=["2"], episode="4", reward="3", terminal="never")
+    assert read.observation_names == ["0", "1"] and len(read) == 57
+    with pytest.raises(ValueError, match="there is no column 'x'"):
+        Dataset.from_frame(tmp_path / "numbers.csv", observations=["x"], actions=["2"], episode="4", reward="3", success="all")
+
+
+def test_whole_numbers_are_actions_if_they_are_said_to_be():
+    frame = table().assign(torque=np.random.default_rng(0).integers(-20, 20, 60))
+    asked = {**COLUMNS, "reward": "gain", "terminal": "fell"}
+    with pytest.raises(ValueError, match=r"actions are whole numbers, .*\nhint: amounts, .*astype\(float\).* continuous=True, quad-convert --continuous"):
+        Dataset.from_frame(frame, **asked)
+    right = Dataset.from_frame(frame.astype({"torque": float}), **asked)
+    assert all(map(np.array_equal, rows(Dataset.from_frame(frame, **asked, continuous=True)), rows(right)))
+
+
+def test_many_rows_after_a_success_are_told():
+    frame = table().assign(won=np.arange(60) % 20 >= 2)
+    told = Dataset.from_frame(frame, **COLUMNS, reward="gain", success="won").notes
+    assert any(note.startswith("51 of 60 rows (85%) come after their episode's first won, as if the task went on: ") for note in told), told
+    frame["won"] = np.arange(60) % 20 >= 18
+    assert not any("come after" in note for note in Dataset.from_frame(frame, **COLUMNS, reward="gain", success="won").notes)
+
+
+def test_names_go_into_the_file_and_the_policy(snapshots, tmp_path):
     frame = table(steps=60)
     Dataset.from_frame(frame, **COLUMNS, reward="gain", terminal="fell").save(tmp_path / "log.hdf5")
     with h5py.File(tmp_path / "log.hdf5") as file:
@@ -87,6 +157,17 @@ def test_names_go_into_the_file_and_the_policy(tmp_path):
     assert (policy.observation_names, policy.action_names) == (["x", "v"], ["torque"])
     seen = frame[["x", "v"]]
     assert np.array_equal(policy.act(seen, seed=1), policy.act(seen.to_numpy(), seed=1))
+    numbers = {"odometer": np.full(180, NAN), **{name: seen[name].to_numpy() for name in ("v", "x")}}
+    assert np.array_equal(policy.act(seen, seed=1), policy.act(numbers, seed=1))
+    one = {"v": float(seen["v"][0]), "x": float(seen["x"][0]), "odometer": NAN}
+    assert np.array_equal(policy.act(one, seed=1), policy.act(seen.to_numpy()[0], seed=1))
+    assert np.array_equal(policy.begin(7).act(one), policy.act(seen.to_numpy()[0], seed=7))
+    assert np.array_equal(policy.value(one, {"torque": 3.0}), policy.value(seen.to_numpy()[0], [3.0]))
+    for message, wrong in {"observations lacks x; it has v": {"v": 1.0}, r"number 1 \(v\) is NaN": {"v": NAN, "x": 1.0}}.items():
+        with pytest.raises(ValueError, match=message):
+            policy.act(wrong)
+    with pytest.raises(ValueError, match="is a dictionary, but the policy's data has no names\nhint: "):
+        Policy.load(snapshots["iql"]).act({"x": 1.0})
     for act in (policy.act, policy.begin(list(range(180))).act, policy.sample):
         with pytest.raises(ValueError, match="has the columns v, x, but the policy takes, in this order, x, v"):
             act(frame[["v", "x"]])
@@ -113,10 +194,24 @@ def test_quad_convert_reads_what_python_reads(tmp_path, capsys):
     assert convert(*log, "--reward", "step-cost", "--success", "a", "b")[0] == 0
     assert "1 of 3 episodes are successes" in convert(*log, "--reward", "step-cost", "--success", "a")[1]
     with h5py.File(tmp_path / "demo.hdf5", "w") as file:
-        for name, width in {"actions": 2, "obs/object": 3, "next_obs/object": 3}.items():
-            file[f"data/demo_0/{name}"] = np.random.default_rng(0).uniform(-1, 1, (9, width))
+        seen = np.random.default_rng(0).uniform(-1, 1, (10, 5))
+        file["data/demo_0/obs/object"], file["data/demo_0/next_obs/object"], file["data/demo_0/actions"] = seen[:-1, 2:], seen[1:, 2:], seen[1:, :2]
         file["data/demo_0/rewards"] = file["data/demo_0/dones"] = np.arange(9) == 8
     assert convert(tmp_path / "demo.hdf5", "--observations", "object")[0] == 0
+    with h5py.File(tmp_path / "demo.hdf5", "a") as file:
+        file["data/demo_0/gripper"] = np.linspace(-1, 1, 9)
+    assert convert(tmp_path / "demo.hdf5", "--observations", "object", "--actions", "actions", "gripper")[0] == 0
+    with h5py.File(tmp_path / "out.hdf5") as file:
+        assert list(file.attrs["action_names"]) == ["actions[0]", "actions[1]", "gripper"]
+        assert np.array_equal(file["actions"][:, 2], np.linspace(-1, 1, 9, dtype=np.float32))
+    whole = table().assign(torque=np.arange(60) % 7 - 3)
+    pd.concat([whole, whole]).to_csv(tmp_path / "log.csv", index=False)
+    for told, words in {"quad-convert --continuous": [], "(quad-convert --apart)": ["--continuous"]}.items():
+        status, said = convert(*log, "--reward", "gain", "--terminal", "fell", *(words or ["--apart", "repeated"]))
+        assert status == 1 and told in said, said
+    status, page = convert(*log, "--reward", "step-cost", "--success", "all", "--continuous", "--apart", "repeated")
+    assert status == 0 and "3 of 3 names are those of several episodes: 6 in all" in page
+    assert "--scale actions" in page and "6 of 6 episodes are successes" in page, "what the inspection doubts is shown, too"
     (tmp_path / "none-huge-v0.npz").touch()
     for message, words in {
         "needs --actions and --reward": [tmp_path / "log.csv", "--observations", "x", "--episode", "run"],

@@ -17,6 +17,7 @@ _WORDS = {
     "terminate": "LeRobot, robomimic: success, never, or a column",
     "terminal": "tables: success, never, or a column",
     "episode": "tables: the column that is the same in all rows of an episode",
+    "apart": "tables: what rows of an episode are that do not lie together, interleaved or repeated",
     "task": "LeRobot: the only task to be read, or all",
     "filter": "robomimic: a filter key such as train",
     "folder": "OGBench: where its files are (~/.ogbench/data)",
@@ -33,8 +34,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("source", help="a folder of LeRobot or Minari, a file of robomimic, a table, minari:ID, ogbench:NAME")
     parser.add_argument("--out", required=True, metavar="FILE", help="the file to write, such as my-robot.hdf5")
     parser.add_argument("--observations", nargs="+", metavar="COLUMN", help="what is seen, in this order")
-    parser.add_argument("--actions", nargs="+", metavar="COLUMN", help="what is done (tables; robomimic: one)")
+    parser.add_argument("--actions", nargs="+", metavar="COLUMN", help="what is done (tables, robomimic)")
     parser.add_argument("--success", nargs="+", help="all, a column, or the successful episodes' numbers or names")
+    parser.add_argument("--continuous", action="store_true", default=None, help="whole numbers are actions, too: amounts, no choices")
     for name, text in _WORDS.items():
         parser.add_argument(f"--{name}", help=text)
     given = {name: value for name, value in vars(parser.parse_args(arguments)).items() if value is not None}
@@ -58,8 +60,6 @@ def _read(source: str, given: dict[str, Any]) -> Dataset:
     if "success" in given:
         given["success"] = _success(given["success"])
     known = inspect.signature(read).parameters
-    if list(known)[0] == "file" and "actions" in given:
-        given["actions"] = given["actions"][0]
     for name in given.keys() - known.keys():
         words = ", ".join(f"--{name}" for name in [*known][1:])
         raise ValueError(f"--{name} says nothing of this source; {words or 'nothing'} does")

@@ -1,5 +1,5 @@
 # The types of the compiled module; help() of each class has the rest.
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from os import PathLike
 from typing import Any
 
@@ -13,7 +13,7 @@ class Policy:
     def from_bytes(file: bytes, precision: str = "f32", name: str = "the file") -> Policy: ...
     def act(
         self,
-        observations: ArrayLike,
+        observations: ArrayLike | Mapping[str, ArrayLike],
         *,
         candidates: int | None = None,
         rule: str | None = None,
@@ -22,7 +22,7 @@ class Policy:
     ) -> NDArray[np.float32]: ...
     def predict(
         self,
-        observations: ArrayLike,
+        observations: ArrayLike | Mapping[str, ArrayLike],
         *,
         candidates: int | None = None,
         rule: str | None = None,
@@ -31,14 +31,14 @@ class Policy:
     ) -> NDArray[np.float32]: ...
     def sample(
         self,
-        observations: ArrayLike,
+        observations: ArrayLike | Mapping[str, ArrayLike],
         *,
         candidates: int | None = None,
         value: str | None = None,
         seed: int | Sequence[int] | NDArray[np.integer[Any]] | None = None,
     ) -> tuple[NDArray[np.float32], NDArray[np.float32]]: ...
     def value(
-        self, observations: ArrayLike, actions: ArrayLike, *, value: str | None = None
+        self, observations: ArrayLike | Mapping[str, ArrayLike], actions: ArrayLike | Mapping[str, ArrayLike], *, value: str | None = None
     ) -> NDArray[np.float32]: ...
     def noise(
         self,
@@ -81,7 +81,7 @@ class Policy:
 
 class Episodes:
     def act(
-        self, observations: ArrayLike, *, rows: Sequence[int] | NDArray[np.integer[Any]] | None = None
+        self, observations: ArrayLike | Mapping[str, ArrayLike], *, rows: Sequence[int] | NDArray[np.integer[Any]] | None = None
     ) -> NDArray[np.float32]: ...
     def __len__(self) -> int: ...
 

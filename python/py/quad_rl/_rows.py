@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 _NAMES = {"terminations": "terminated", "truncations": "truncated"}
+_AMOUNTS = "hint: amounts, such as torques, are given as floats, actions.astype(float); readers take continuous=True, quad-convert --continuous"
 
 
 class Rows(NamedTuple):
@@ -36,9 +37,9 @@ def episode_rows(where: str, episode: Any) -> Rows:
         raise ValueError(f"{where}it has no step")
     ends = []
     for name in _NAMES:
-        flags = np.asarray(of(name))
-        ends.append(flags if flags.ndim else np.arange(steps) == (steps - 1 if flags else steps))
-    observations = np.asarray(of("observations"))
+        flags = plain(where, name, of(name))
+        ends.append(flags if flags.ndim else np.where(np.arange(steps) == steps - 1, flags, 0))
+    observations = plain(where, "observations", of("observations"))
     after = observations[1:] if len(observations) == steps + 1 else None
     rows = rows_of(where, observations[:steps], of("actions"), of("rewards"), ends[0], ends[1], after)
     if after is None:
@@ -57,7 +58,7 @@ def rows_of(
     next_observations: ArrayLike | None,
 ) -> Rows:
     if np.asarray(actions).dtype.kind in "iub":
-        raise ValueError(f"{where}actions are whole numbers, as if they were discrete; only continuous ones can be learnt")
+        raise ValueError(f"{where}actions are whole numbers, as if they were discrete; only continuous ones can be learnt\n{_AMOUNTS}")
     r = _array(where, "rewards", rewards, None, 1)
     n = len(r)
     o = _array(where, "observations", observations, n, 2)
@@ -66,9 +67,26 @@ def rows_of(
         _array(where, "actions", actions, n, 2),
         r,
         o if next_observations is None else _array(where, "next_observations", next_observations, n, 2, o.shape[1]),
-        _array(where, "terminations", terminations, n, 1) != 0,
-        _array(where, "truncations", truncations, n, 1) != 0,
+        _flags(where, "terminations", terminations, n),
+        _flags(where, "truncations", truncations, n),
     )
+
+
+def plain(where: str, name: str, values: Any) -> NDArray[Any]:
+    """As an array. Raises ValueError where a masked array hides a number: what lies below is none that was recorded."""
+    if np.ma.is_masked(values):
+        rows = np.unique(np.nonzero(np.ma.getmaskarray(values))[0])
+        hint = "hint: leave these rows out, or fill them yourself, as by numpy.ma's filled(0)"
+        raise ValueError(f"{where}{name}, row {rows[0]} is masked ({len(rows)} such rows)\n{hint}")
+    return np.asarray(values)
+
+
+def _flags(where: str, name: str, values: ArrayLike, rows: int) -> NDArray[np.bool_]:
+    array = _array(where, name, values, rows, 1)
+    bad = np.flatnonzero((array != 0) & (array != 1))
+    if len(bad):
+        raise ValueError(f"{where}{name}, row {bad[0]}: {array[bad[0]]} is neither 0 nor 1 ({len(bad)} such rows)")
+    return array == 1
 
 
 def _array(
@@ -76,7 +94,7 @@ def _array(
 ) -> NDArray[np.float32]:
     """Finite numbers, N or N × width."""
     with np.errstate(over="ignore"):
-        array = np.ascontiguousarray(values, dtype=np.float32)
+        array = np.ascontiguousarray(plain(where, name, values), dtype=np.float32)
     shape, n = list(array.shape), "N" if rows is None else rows
     if array.ndim == 1 and axes == 2 or shape[1:] == [1] and axes == 1:
         array = array.reshape([-1, 1][:axes])

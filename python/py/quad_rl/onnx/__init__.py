@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from os import PathLike
+from pathlib import Path
+from secrets import token_hex
 
 from quad_rl._extras import library
 from quad_rl._quad_rl import Policy
@@ -22,7 +24,7 @@ def export_onnx(
     states, n, is free.
 
     Inputs: `observations` [n, observation_size] and what `policy.noise(n, ...)` has: `noise`, standard normal numbers, and
-    `uniform`, numbers within [0, 1). Fill them anew for each action.
+    `uniform`, numbers within [0, 1); at 1 itself the best is taken. Fill them anew for each action.
 
     Outputs: `actions` [n, action_size]; `values` [n, candidates], as of `Policy.sample`, if the policy draws; and of a planner
     that follows a plan for several steps `plan` [n, steps, action_size], whose first action is in `actions`: ask the model
@@ -37,5 +39,12 @@ def export_onnx(
     if not isinstance(policy, Policy):
         policy = Policy.load(policy)
     written = model(policy, candidates=candidates, rule=rule, value=value).SerializeToString()
-    with open(path, "wb") as file:
-        file.write(written)
+    whole = Path(path)
+    partial = whole.with_name(f"{whole.name}.{token_hex(4)}.partial")  # A file that is there stays until the new one is whole.
+    try:
+        with open(partial, "xb") as file:
+            file.write(written)
+        partial.replace(whole)
+    except BaseException:
+        partial.unlink(missing_ok=True)
+        raise

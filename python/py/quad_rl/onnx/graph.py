@@ -9,6 +9,7 @@ import numpy as np
 from onnx import ModelProto, TensorProto, helper, numpy_helper
 
 OPSET, IR = 17, 8
+END = 2**62  # Of an axis of any length.
 
 
 def _binary(operator: str) -> tuple[Callable[[Value, Any], Value], Callable[[Value, Any], Value]]:
@@ -46,6 +47,9 @@ class Value:
     def clip(self, low: float, high: float) -> Value:
         return self.graph("Clip", self, low, high)
 
+    def double(self) -> Value:
+        return self.graph("Cast", self, to=TensorProto.DOUBLE)
+
     def mean(self, *axes: int) -> Value:
         """Over these axes, which stay with one place."""
         return self.graph("ReduceMean", self, axes=axes, keepdims=1)
@@ -53,7 +57,7 @@ class Value:
 
 class Graph:
     """`graph(operator, inputs…, attributes…)` adds a node. Numbers and arrays among the inputs become constants. All is float32,
-    int64 or bool."""
+    int64 or bool, but for what `double` makes."""
 
     def __init__(self) -> None:
         self.nodes: list[Any] = []
@@ -82,6 +86,10 @@ class Graph:
         outs = [self.new() for _ in range(2 if operator == "TopK" else 1)]
         self.nodes.append(helper.make_node(operator, names, [out.name for out in outs], **attributes))
         return outs[0]
+
+    def double(self, number: float) -> Value:
+        """A constant of float32 as float64."""
+        return self("Cast", number, to=TensorProto.DOUBLE)
 
     def repeat(self, times: int, x: Value, body: Callable[[Value, Value], Value]) -> Value:
         """x = body(i, x) for i = 0, 1, … below `times`, as a loop of the graph."""

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from quad_rl import _dataset
-from quad_rl._rows import Rows, episode_rows
+from quad_rl._rows import Rows, episode_rows, plain
 
 # A word or the name of a column, or a function of an episode, which is a dictionary of its columns, T rows each, and `episode`,
 # its number or name.
@@ -17,15 +17,20 @@ Rule = Union[str, Callable[[Mapping[str, Any]], Any], None]
 # Also the successful episodes' numbers or names, or a flag for each episode.
 Success = Union[Rule, Sequence[Any]]
 _HOW = 'success= a column, "all", a list of episodes, or a function of the episode'
+_MANY = 0.1  # The share of rows after a success that is worth a word; a few let the robot come to rest.
 _OF_SUCCESS = {"success-at-end": (0.0, 1.0), "step-cost": (-1.0, 0.0)}
 
 
 class Episode(NamedTuple):
-    """T steps, T > 0."""
+    """T steps."""
 
     name: Any  # Its number or name in the source.
     columns: dict[str, NDArray[Any]]  # A row each step.
     last: dict[str, NDArray[Any]]  # A row each: what was observed after the last step. Empty if that is not stored.
+
+    @property
+    def steps(self) -> int:
+        return max(map(len, self.columns.values()), default=0)
 
 
 class Log(NamedTuple):
@@ -38,7 +43,9 @@ class Log(NamedTuple):
     reward: str = ""  # The column with rewards, if there is one; `success` and `done`, which is set at any end, likewise.
     success: str = ""
     done: str = ""
+    terminated: str = ""  # The column that is set where the task itself was over.
     end: str = "terminate"  # What the reader calls `terminate`.
+    continuous: bool = False  # Whether whole numbers are actions, too.
 
 
 def columns_of(*rules: Any) -> set[str] | None:
@@ -59,7 +66,11 @@ def dataset(
     """The transitions of a source. Raises ValueError, with a hint, for what it does not have and nothing else says."""
     if isinstance(observations, str) or isinstance(actions, str):
         raise ValueError("observations and actions are lists of columns")
-    episodes, notes, count = log.episodes, log.notes, len(log.episodes)
+    episodes, notes = [episode for episode in log.episodes if episode.steps], log.notes
+    count, stepless = len(episodes), len(log.episodes) - len(episodes)
+    log = log._replace(episodes=episodes)
+    if stepless:
+        notes.append(f"{stepless} of {count + stepless} episodes dropped: without a step")
     if not episodes:
         raise ValueError("\n".join(["there is no episode", *notes]))
     for name in [*observations, *actions]:
@@ -74,7 +85,8 @@ def dataset(
         seen = [_beside(part, observations) for part in (episode.columns, episode.last) if part]
         open_ended += not episode.last and not ends[-1]
         lost += has_won and not episode.last and not ends[-1] and reward in _OF_SUCCESS
-        rows = {"observations": np.concatenate(seen), "actions": _beside(episode.columns, actions), "rewards": rewards}
+        done = _beside(episode.columns, actions)
+        rows = {"observations": np.concatenate(seen), "actions": done.astype(float) if log.continuous else done, "rewards": rewards}
         parts.append(episode_rows(f"episode {episode.name}: ", {**rows, "terminated": ends, "truncated": False}))
     if lost:
         pays = f"reward={reward!r} pays at the last step, which is dropped unless an episode terminates: {lost} of {count}"
@@ -90,11 +102,15 @@ def dataset(
 
 
 def _check(log: Log, name: str) -> None:
-    columns = log.episodes[0].columns
-    if name not in columns:
-        raise ValueError(f"there is no column {name!r}\nhint: there are {', '.join(map(repr, log.there or columns))}")
-    if columns[name].dtype.kind not in "fiub":
-        raise ValueError(f"column {name!r} holds {columns[name].dtype}, no numbers")
+    lacking = [episode for episode in log.episodes if name not in episode.columns]
+    if lacking:
+        some = len(lacking) < len(log.episodes)
+        there = lacking[0].columns if some else log.there or lacking[0].columns
+        where = f" in episode {lacking[0].name} ({len(lacking)} such episodes)" if some else ""
+        raise ValueError(f"there is no column {name!r}{where}\nhint: there are {', '.join(map(repr, there))}")
+    kind = log.episodes[0].columns[name].dtype
+    if kind.kind not in "fiub":
+        raise ValueError(f"column {name!r} holds {kind}, no numbers")
 
 
 def _names(log: Log, column: str) -> list[str]:
@@ -125,24 +141,37 @@ def _successes(log: Log, rule: Success) -> list[bool] | None:
         if rule == "all":
             return [True] * len(log.episodes)
         _check(log, rule)
-        return [bool(np.any(episode.columns[rule] > 0)) for episode in log.episodes]
+        flags = [episode.columns[rule].reshape(-1) > 0 for episode in log.episodes]
+        _suspect_going_on(log, rule, flags)
+        return [bool(flag.any()) for flag in flags]
     listed = list(rule)
     if listed and all(isinstance(flag, (bool, np.bool_)) for flag in listed):
         if len(listed) != len(names):
             raise ValueError(f"success has {len(listed)} flags, but there are {len(names)} episodes\nhint: list their numbers")
         return [bool(flag) for flag in listed]
     chosen = {*listed}
+    if len({*names}) < len(names):
+        raise ValueError('success lists names, of which some are those of several episodes\nhint: success= a column, or "all"')
     strangers = chosen - {*names}
     if strangers:
         raise ValueError(f"success names episodes that are not there: {[*strangers][:5]} ({len(strangers)} such)")
     return [name in chosen for name in names]
 
 
+def _suspect_going_on(log: Log, rule: str, flags: list[NDArray[np.bool_]]) -> None:
+    """Says so where many rows come after the success that their episode is for."""
+    later = sum(len(flag) - 1 - int(np.argmax(flag)) for flag in flags if flag.any())
+    rows = sum(map(len, flags))
+    if later > _MANY * rows:
+        log.notes.append(f"{later} of {rows} rows ({later / rows:.0%}) come after their episode's first {rule}, as if the task went on: "
+                         "leave them out of the source if it was over there")
+
+
 def _reward(log: Log, rule: Rule, won: list[bool] | None) -> Rule:
     rule = rule or log.reward
     ways = '"success-at-end" (1 there), "step-cost" (-1 a step, 0 there), a column, or a function of the episode'
     if not rule:
-        raise ValueError(f"nothing says what is rewarded\nhint: reward={ways}")
+        raise ValueError(f"no rewards were recorded, and nothing says what is rewarded\nhint: reward={ways}; {_HOW}")
     if rule in _OF_SUCCESS:
         if won is None:
             raise ValueError(f"reward={rule!r} needs to know which episodes are successes\nhint: {_HOW}")
@@ -153,6 +182,10 @@ def _reward(log: Log, rule: Rule, won: list[bool] | None) -> Rule:
 
 
 def _terminate(log: Log, rule: Rule, won: list[bool] | None) -> Rule:
+    if rule is None and log.terminated:
+        over = sum(bool(np.any(episode.columns[log.terminated] > 0)) for episode in log.episodes)
+        log.notes.append(f"{over} of {len(log.episodes)} episodes terminate, as {log.terminated} says; the others are cut off")
+        return log.terminated
     done = [bool(log.done and np.any(episode.columns[log.done] > 0)) for episode in log.episodes]
     unsure = sum(ends and not success for ends, success in zip(done, won or [False] * len(done)))
     at = f"{unsure} of {len(done)} episodes have {log.done} without a success, as at a time limit"
@@ -172,12 +205,12 @@ def _terminate(log: Log, rule: Rule, won: list[bool] | None) -> Rule:
     return rule
 
 
-def _flags(rule: Rule, episode: Episode, has_won: bool, steps: int) -> NDArray[np.bool_]:
+def _flags(rule: Rule, episode: Episode, has_won: bool, steps: int) -> NDArray[Any]:
     """Whether the task was over after each step."""
     if callable(rule) or rule not in ("success", "never"):
-        given = np.asarray(_call(rule, episode) if callable(rule) else episode.columns[str(rule)])
+        given = plain("", "", _call(rule, episode)) if callable(rule) else episode.columns[str(rule)]
         if given.ndim:
-            return given.reshape(-1) > 0
+            return given.reshape(-1)
         has_won = bool(given)
     ends = np.zeros(steps, bool)
     ends[-1] = has_won and rule != "never"

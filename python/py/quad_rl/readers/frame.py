@@ -12,8 +12,11 @@ from numpy.typing import NDArray
 
 from quad_rl import _dataset
 from quad_rl._extras import library
+from quad_rl._rows import plain
 from quad_rl.readers.arrow import array_of
 from quad_rl.readers.episodes import Episode, Log, Rule, Success, columns_of, dataset
+
+_EMPTY = {"", "nan", "none", "nat", "<na>", "null"}  # How the libraries of tables write that nothing is there.
 
 
 def from_frame(
@@ -25,6 +28,8 @@ def from_frame(
     episode: str,
     terminal: Rule = None,
     success: Success = None,
+    apart: str | None = None,
+    continuous: bool = False,
 ) -> _dataset.Dataset:
     """A table with a row for each step, in the order of recording.
 
@@ -39,6 +44,9 @@ def from_frame(
         or a function of the episode. By default "success" if that is known.
     success: which episodes are successes: a column that is above 0 in one of their rows, "all", a list of their names, or a
         function of the episode.
+    apart: what rows of the same value are that do not lie together: "interleaved", one episode, recorded at once with others; or
+        "repeated", several episodes, as in logs that were put together. By default such rows are refused.
+    continuous: whole numbers in `actions` are amounts, such as torques, and no choices.
 
     What followed the last step of an episode that does not terminate is not in a table, so that step is dropped, as
     `from_arrays` does it. Raises ValueError for what is missing, ImportError without pyarrow.
@@ -47,20 +55,52 @@ def from_frame(
     place = os.fspath(frame) if path else "the table"
     table = _read(place) if path else frame
     there = [str(name) for name in getattr(table, "column_names", getattr(table, "columns", table))]
+    if not {*observations, *actions, episode} & {*there} and any(map(_is_number, there)):
+        hint = "hint: write one above them, such as " + ",".join([*observations, *actions, episode])
+        raise ValueError(f"{place} has no line of names: its first line is {', '.join(there)}\n{hint}")
     words = columns_of(observations, actions, reward, terminal, success)
     columns = {name: _column(table, name, place) for name in there if words is None or name in words or name == episode}
     if episode not in columns:
         raise ValueError(f"{place}: there is no column {episode!r} for episodes\nhint: there are {', '.join(map(repr, there))}")
-    names, first, inverse = np.unique(columns[episode], return_index=True, return_inverse=True)
-    place_of = np.argsort(np.argsort(first))[inverse]  # Episodes in the order in which they begin.
-    order, notes = np.argsort(place_of, kind="stable"), []
-    apart = int((np.bincount(place_of[np.diff(place_of, prepend=-1) != 0], minlength=1) > 1).sum())
-    if apart:
-        notes.append(f"{apart} of {len(names)} episodes: their rows do not lie together; they count in the table's order")
-    cuts = np.cumsum(np.bincount(place_of, minlength=1))[:-1]
-    parts = zip(*(np.split(array[order], cuts) for array in columns.values())) if len(names) else ()
-    episodes = [Episode(name, dict(zip(columns, part)), {}) for name, part in zip(names[np.argsort(first)].tolist(), parts)]
-    return dataset(Log(episodes, notes, there, end="terminal"), observations, actions, reward, success, terminal)
+    names, of, notes = _episodes(columns[episode], episode, place, apart)
+    order, cuts = np.argsort(of, kind="stable"), np.cumsum(np.bincount(of, minlength=1))[:-1]
+    parts = zip(*(np.split(array[order], cuts) for array in columns.values())) if names else ()
+    episodes = [Episode(name, dict(zip(columns, part)), {}) for name, part in zip(names, parts)]
+    log = Log(episodes, notes, there, end="terminal", continuous=continuous)
+    return dataset(log, observations, actions, reward, success, terminal)
+
+
+def _episodes(ids: NDArray[Any], column: str, place: str, apart: str | None) -> tuple[list[Any], NDArray[Any], list[str]]:
+    """Names of episodes in the order in which they begin, the place of each row's among them, and notes."""
+    if apart not in (None, "interleaved", "repeated"):
+        raise ValueError(f'apart is {apart!r}, not "interleaved" or "repeated"')
+    listed = (ids.astype(str) if ids.dtype.kind in "mM" else ids).tolist()
+    empty = [row for row, name in enumerate(listed) if str(name).strip().lower() in _EMPTY]
+    if empty:
+        hint = "hint: leave these rows out, or say of which episode they are"
+        raise ValueError(f"{place}: column {column!r}, row {empty[0]} is empty: of no episode ({len(empty)} such rows)\n{hint}")
+    numbers: dict[Any, int] = {}
+    of = np.array([numbers.setdefault(name, len(numbers)) for name in listed], int)
+    begins = np.diff(of, prepend=-1) != 0
+    torn = [name for name, stretches in zip(numbers, np.bincount(of[begins], minlength=1)) if stretches > 1]
+    if not torn:
+        return list(numbers), of, []
+    those = f"{len(torn)} of {len(numbers)} episodes: their rows do not lie together"
+    if apart is None:
+        hint = 'apart="interleaved" if they were recorded at once, "repeated" if such a name is that of several episodes'
+        raise ValueError(f"{place}: {those}, as those of {column!r} {torn[0]!r}\nhint: {hint} (quad-convert --apart)")
+    if apart == "interleaved":
+        return list(numbers), of, [f"{those}; they count in the table's order"]
+    names = [listed[row] for row in np.flatnonzero(begins)]
+    return names, np.cumsum(begins) - 1, [f"{len(torn)} of {len(numbers)} names are those of several episodes: {len(names)} in all"]
+
+
+def _is_number(name: str) -> bool:
+    try:
+        float(name)
+        return True
+    except ValueError:
+        return False
 
 
 def _column(table: Any, name: str, place: str) -> NDArray[Any]:
@@ -68,7 +108,7 @@ def _column(table: Any, name: str, place: str) -> NDArray[Any]:
     if hasattr(column, "combine_chunks"):
         return array_of(column, name, place)
     to_numpy: Callable[[], Any] | None = getattr(column, "to_numpy", None)
-    array = np.asarray(to_numpy() if to_numpy else column)
+    array = plain(f"{place}: ", name, to_numpy() if to_numpy else column)
     if array.dtype == object and len(array) and not isinstance(array[0], str):
         return np.stack([np.asarray(row) for row in array])
     return array

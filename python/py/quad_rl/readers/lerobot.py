@@ -6,6 +6,7 @@ What they hold: `src/lerobot/datasets` of huggingface/lerobot, 0.4 and 0.3.
 from __future__ import annotations
 
 import json
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from os import PathLike
 from pathlib import Path
@@ -21,6 +22,7 @@ from quad_rl.readers.episodes import Episode, Log, Rule, Success, columns_of, da
 
 Columns = dict[str, NDArray[Any]]
 _REWARD, _SUCCESS, _DONE = "next.reward", "next.success", "next.done"
+_TERMINATED, _TRUNCATED = "next.terminated", "next.truncated"
 _INDEX = ["episode_index", "frame_index"]
 _UNFINISHED = "unreadable, as files are of recordings that were not finalized: "
 
@@ -34,6 +36,7 @@ def from_lerobot(
     success: Success = None,
     terminate: Rule = None,
     task: str | None = None,
+    continuous: bool = False,
 ) -> _dataset.Dataset:
     """A LeRobot dataset, v3.0 or v2.x: the folder with `meta/info.json`. Needs pyarrow.
 
@@ -41,12 +44,15 @@ def from_lerobot(
         keep their units, and their names in the file and in the policy. action: the feature that is done.
     reward, success: as in `from_frame`, columns being features, or numbers in `meta/episodes`, and names `episode_index`.
         By default `next.reward` and `next.success`, where these were recorded.
-    terminate: as `terminal` in `from_frame`. `next.done` is also set at time limits.
-    task: the only task to be read, in its words; "all" for all of them.
+    terminate: as `terminal` in `from_frame`. By default `next.terminated`, or `next.done` without `next.truncated`, where these
+        were recorded. `next.done` alone is also set at time limits.
+    task: the only task to be read, in its words; "all" for all of them. Episodes whose frames have several are dropped, but for
+        "all".
+    continuous: as in `from_frame`.
 
-    LeRobot stores no observation after the last step, which is dropped in episodes that do not terminate. Frames after a
-    `next.done` are no steps: the first of them is the observation that the episode ended with. `notes` of the result counts
-    what was left out. Raises ValueError for what has to be said and is not, ImportError without pyarrow.
+    LeRobot stores no observation after the last step, which is dropped in episodes that do not terminate. Frames after an
+    episode's end are no steps: the first of them is the observation that it ended with. `notes` of the result counts what was
+    left out. Raises ValueError for what has to be said and is not, ImportError without pyarrow.
     """
     root = Path(folder)
     if not (root / "meta/info.json").is_file():
@@ -61,15 +67,21 @@ def from_lerobot(
     notes = [f"left out: {len(images)} streams of images ({', '.join(images)})"] if images else []
     words = columns_of(observations, action, reward, success, terminate)
     plain = [name for name in features if name not in images and features[name]["dtype"] not in ("string", "language")]
-    wanted = {_REWARD, _SUCCESS, _DONE, "task_index", *_INDEX, *(plain if words is None else words)}
+    wanted = {_REWARD, _SUCCESS, _DONE, _TERMINATED, _TRUNCATED, "task_index", *_INDEX, *(plain if words is None else words)}
     columns, unreadable = _frames(root, [name for name in plain if name in wanted])
     parts = _of_task(root, _whole(root, columns, info, unreadable, notes), task, notes)
-    of = {part: name if name in columns else "" for part, name in (("reward", _REWARD), ("success", _SUCCESS), ("done", _DONE))}
-    episodes = _cut(parts, of["done"], notes)
-    if of["reward"] and of["success"] and reward in (None, _REWARD):
+    ends = [name for name in (_DONE, _TERMINATED, _TRUNCATED) if name in columns]
+    if ends == [_DONE, _TRUNCATED]:
+        for part in parts.values():
+            part[_TERMINATED] = (part[_DONE] > 0) & ~(part[_TRUNCATED] > 0)
+    terminated = _TERMINATED if _TERMINATED in ends or ends == [_DONE, _TRUNCATED] else ""
+    rewarded, won, done = (name if name in columns else "" for name in (_REWARD, _SUCCESS, _DONE))
+    episodes = _cut(parts, ends, notes)
+    if rewarded and won and reward in (None, _REWARD):
         _suspect_shift(episodes, notes)
     names = {name: _names(feature.get("names")) for name, feature in features.items()}
-    return dataset(Log(episodes, notes, plain, names, **of), observations, [action], reward, success, terminate)
+    log = Log(episodes, notes, plain, names, rewarded, won, done, terminated, continuous=continuous)
+    return dataset(log, observations, [action], reward, success, terminate)
 
 
 def _frames(root: Path, wanted: list[str]) -> tuple[Columns, list[str]]:
@@ -115,16 +127,21 @@ def _whole(
     numbers, first = np.unique(of[order], return_index=True)
     parts = zip(*(np.split(array[order], first[1:]) for array in columns.values()))
     there = {int(number): dict(zip(columns, part)) for number, part in zip(numbers, parts)}
-    kept, total = {}, max(int(info.get("total_episodes", 0)), len(there))
+    kept, longer, total = {}, [], max(int(info.get("total_episodes", 0)), len(there))
     for number, part in there.items():
         frames, row = part["frame_index"].reshape(-1), rows.get(number, {})
         of_all = {name: value for name, value in row.items() if name not in part and isinstance(value, (bool, int, float))}
-        if np.array_equal(frames, np.arange(row.get("length", len(frames)))):
-            kept[number] = part | {name: np.full(len(frames), value) for name, value in of_all.items()}
+        steps, said = len(frames), row.get("length", len(frames))
+        if steps >= said and np.array_equal(frames, np.arange(steps)):
+            kept[number] = part | {name: np.full(steps, value) for name, value in of_all.items()}
+            longer += [f"episode {number}: {said}, but data has {steps}"] if steps > said else []
     broken = [str(number) for number in there if number not in kept]
     if broken:
         some = ", ".join(broken[:5]) + (", …" if len(broken) > 5 else "")
         notes.append(f"{len(broken)} of {total} episodes dropped: frames are missing or there twice (episode {some})")
+    if longer:
+        some = "; ".join(longer[:5]) + ("; …" if len(longer) > 5 else "")
+        notes.append(f"{len(longer)} of {total} episodes: meta/episodes is wrong about their frames, which are all read ({some})")
     if unreadable or len(there) < total:
         why = _UNFINISHED + ", ".join(unreadable) if unreadable else "their rows are in no file"
         notes.append(f"{total - len(there)} of {total} episodes dropped: {why}")
@@ -132,19 +149,26 @@ def _whole(
 
 
 def _of_task(root: Path, parts: dict[int, Columns], task: str | None, notes: list[str]) -> dict[int, Columns]:
-    of = {number: int(part["task_index"].reshape(-1)[0]) if "task_index" in part else 0 for number, part in parts.items()}
-    counts = {index: list(of.values()).count(index) for index in sorted(set(of.values()))}
-    if task == "all" or (task is None and len(counts) < 2):
+    """The episodes of which all frames are of the task."""
+    of = {number: tuple(np.unique(part["task_index"]).tolist()) if "task_index" in part else (0,) for number, part in parts.items()}
+    counts = Counter(of[number] for number in sorted(of, key=lambda number: of[number]))
+    several = [number for number, indices in of.items() if len(indices) > 1]
+    if task == "all" or (task is None and len(counts) < 2 and not several):
         return parts
     # The other column of v3's is pandas's index, under any name.
     texts = {row["task_index"]: next(row[name] for name in row if name != "task_index") for row in _meta(root, "tasks")}
-    chosen = [index for index in counts if texts.get(index) == task]
+    chosen = [number for number, indices in of.items() if len(indices) == 1 and texts.get(indices[0]) == task]
     if not chosen:
-        told = ", ".join(f"{texts.get(index, index)!r} ({count} episodes)" for index, count in counts.items())
-        hint = 'hint: task="…" reads one of them; task="all" all, which only an observation can tell apart'
-        raise ValueError(f"{root}: {f'no task {task!r}' if task else 'several tasks'}: {told}\n{hint}")
-    notes.append(f"{len(parts) - counts[chosen[0]]} of {len(parts)} episodes dropped: of another task than {task!r}")
-    return {number: part for number, part in parts.items() if of[number] == chosen[0]}
+        told = ", ".join(f"{' and '.join(repr(texts.get(index, index)) for index in indices)} "
+                         f"({count} episodes{', each of several' if len(indices) > 1 else ''})" for indices, count in counts.items())
+        hint = 'hint: task="…" reads the episodes of one of them; task="all" all, which only an observation can tell apart'
+        raise ValueError(f"{root}: {f'no episode is of task {task!r} alone' if task else 'several tasks'}: {told}\n{hint}")
+    if several:
+        some = ", ".join(map(str, several[:5])) + (", …" if len(several) > 5 else "")
+        notes.append(f"{len(several)} of {len(parts)} episodes dropped: their frames are of several tasks (episode {some})")
+    others = len(parts) - len(several) - len(chosen)
+    notes.append(f"{others} of {len(parts)} episodes dropped: of another task than {task!r}")
+    return {number: parts[number] for number in chosen}
 
 
 def _names(names: Any) -> list[str]:
@@ -156,18 +180,18 @@ def _names(names: Any) -> list[str]:
     return [str(name) for name in names or ()]
 
 
-def _cut(parts: dict[int, Columns], done: str, notes: list[str]) -> list[Episode]:
+def _cut(parts: dict[int, Columns], flags: list[str], notes: list[str]) -> list[Episode]:
     """Episodes up to their end, with the frame after it as what was observed last."""
     episodes, cut, beyond = [], 0, 0
     for number, part in parts.items():
         steps = len(part["frame_index"])
-        ends = np.flatnonzero(part[done].reshape(-1) if done else ())
+        ends = np.flatnonzero(sum(part[name].reshape(-1) > 0 for name in flags))
         after = int(ends[0]) + 1 if len(ends) else steps
         cut, beyond = cut + (after < steps), beyond + max(0, steps - after - 1)
         last = {name: array[after : after + 1] for name, array in part.items()} if after < steps else {}
         episodes.append(Episode(number, {name: array[:after] for name, array in part.items()}, last))
     if cut:
-        notes.append(f"{cut} of {len(episodes)} episodes go on after {done}: the next frame is read as their last observation, "
+        notes.append(f"{cut} of {len(episodes)} episodes go on after {' or '.join(flags)}: the next frame is read as their last observation, "
                      f"{beyond} frames after it are dropped")
     return episodes
 

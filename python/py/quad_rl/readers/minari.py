@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from quad_rl import _dataset
 from quad_rl._extras import needing
 from quad_rl.readers.episodes import Episode, Log, dataset
+from quad_rl.readers.hdf5 import opened
 
 _ACTIONS, _REWARDS, _TERMINATIONS = "actions", "rewards", "terminations"
 
@@ -38,21 +39,19 @@ def _read(place: Path) -> _dataset.Dataset:
     folders = [place / "data", place]
     folder = next((folder for folder in folders if (folder / "metadata.json").is_file()), None)
     data = minari.MinariDataset(folder) if folder else minari.load_dataset(str(place), download=True)
+    for file in Path(data.storage.data_path).glob("*.hdf5"):
+        with opened(file, "minari"):
+            pass
     episodes, seen, done = [], {}, {}
     for episode in data.iterate_episodes():
         steps = len(episode.rewards)
-        if not steps:
-            continue
         seen = _parts("observations", data.observation_space, episode.observations)
         done = _parts(_ACTIONS, data.action_space, episode.actions)
         columns = {_REWARDS: np.asarray(episode.rewards), _TERMINATIONS: np.asarray(episode.terminations), **done}
         columns |= {name: array[:steps] for name, array in seen.items()}
         last = {name: array[steps:] for name, array in seen.items() if len(array) > steps}
         episodes.append(Episode(int(episode.id), columns, last))
-    empty = data.total_episodes - len(episodes)
-    notes = [f"{empty} of {data.total_episodes} episodes dropped: without a step"] if empty else []
-    log = Log(episodes, notes)
-    return dataset(log, [*seen], [*done], _REWARDS, None, _TERMINATIONS)
+    return dataset(Log(episodes, []), [*seen], [*done], _REWARDS, None, _TERMINATIONS)
 
 
 def _parts(name: str, space: Any, values: Any) -> dict[str, NDArray[Any]]:

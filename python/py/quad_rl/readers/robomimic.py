@@ -10,41 +10,47 @@ import numpy as np
 from numpy.typing import NDArray
 
 from quad_rl import _dataset
-from quad_rl._extras import library
 from quad_rl.readers.episodes import Episode, Log, Rule, Success, columns_of, dataset
+from quad_rl.readers.hdf5 import opened
+
+_REWARDS, _SUCCESS, _DONE = "rewards", "success", "dones"
 
 
 def from_robomimic(
     file: str | PathLike[str],
     *,
     observations: Sequence[str],
-    actions: str = "actions",
-    reward: Rule = "rewards",
+    actions: str | Sequence[str] = "actions",
+    reward: Rule = None,
     success: Success = None,
     terminate: Rule = None,
     filter: str | None = None,
+    continuous: bool = False,
 ) -> _dataset.Dataset:
-    """A file of robomimic or of what writes its layout (robosuite, RoboCasa, mimicgen). Needs h5py.
+    """A file of robomimic or of what writes its layout (robosuite, RoboCasa, mimicgen, Isaac Lab). Needs h5py.
 
-    observations: the keys below `obs` that are seen, in this order, such as ["object", "robot0_eef_pos"]; no images.
-    actions: the array that is done.
-    reward, success: as in `from_frame`, columns being arrays and names those of the groups, such as "demo_3".
+    observations: the keys below `obs` that are seen, in this order, such as ["object", "robot0_eef_pos"]; no images. Where `obs`
+        is an array, as Isaac Lab writes it, ["obs"].
+    actions: the array that is done, or several, in this order.
+    reward, success: as in `from_frame`, columns being arrays and names those of the groups, such as "demo_3". By default
+        `rewards` and, where demonstrations have it, their attribute `success`.
     terminate: as `terminal` in `from_frame`; by default `dones`, if they are set only where there is a reward: written with
         another --done_mode they also stand at the end of each demonstration.
     filter: the list of `mask` that says which demonstrations are read, such as "train"; None: all of them.
+    continuous: as in `from_frame`.
 
     Without `next_obs`, the last step of an episode that does not terminate is dropped. Raises ValueError for what has to be
-    said and is not, ImportError without h5py.
+    said and is not, and for `next_obs` that are not the following rows of `obs`; ImportError without h5py.
     """
-    h5py, done = library("h5py", "robomimic"), "dones"
-    with h5py.File(file) as opened:
-        if "data" not in opened or not any(name.startswith("demo") for name in opened["data"]):
+    actions = [actions] if isinstance(actions, str) else actions
+    with opened(file, "robomimic") as source:
+        if "data" not in source or not any(name.startswith("demo") for name in source["data"]):
             raise ValueError(f"{file} is no file of robomimic's: it has no group data/demo_0")
-        names: list[str] = sorted(opened["data"], key=lambda name: (len(name), name))  # demo_2 before demo_10.
+        names: list[str] = sorted(source["data"], key=lambda name: (len(name), name))  # demo_2 before demo_10.
         notes: list[str] = []
         there: list[str] = []
         if filter is not None:
-            masks = opened.get("mask", {})
+            masks = source.get("mask", {})
             if filter not in masks:
                 raise ValueError(f"{file}: there is no filter {filter!r}\nhint: there are {', '.join(masks) or 'none'}")
             chosen = {name.decode() if isinstance(name, bytes) else str(name) for name in masks[filter][()]}
@@ -53,34 +59,58 @@ def from_robomimic(
         words = columns_of(observations, actions, reward, success, terminate)
         episodes: list[Episode] = []
         for name in names:
-            group = opened["data"][name]
+            group = source["data"][name]
             low, images = _sort(group)
             there = list(low)
             for key in {*observations} & {*images}:
                 raise ValueError(f"{file}: {key} holds images, but only rows of numbers are learnt from")
             if images and not episodes:
                 notes.append(f"left out: {len(images)} streams of images ({', '.join(images)})")
-            columns = {key: low[key][()] for key in low if words is None or key in words or key == done}
-            after = group.get("next_obs", {})
-            last = {key: after[key][-1:] for key in observations if key in after}
+            columns = {key: low[key][()] for key in low if words is None or key in {*words, _REWARDS, _DONE}}
+            after = {key: array[()] for key, array in _below(group, "next_obs").items() if key in observations}
+            for key in [key for key in after if key in columns]:
+                _check_following(f"{file}: {name}", key, columns[key], after[key])
+            last = {key: array[-1:] for key, array in after.items()}
             episodes.append(Episode(name, columns, last if len(last) == len(observations) else {}))
-    done = done if all(done in episode.columns for episode in episodes) else ""
-    if done and terminate is None and success is None and _pays(episodes, reward, done):
+            if _SUCCESS in group.attrs and _SUCCESS not in low:
+                columns[_SUCCESS] = np.full(episodes[-1].steps, bool(group.attrs[_SUCCESS]))
+    full = [episode.columns for episode in episodes if episode.steps]
+    rewarded = _REWARDS if any(_REWARDS in columns for columns in full) else ""
+    won, done = (name if all(name in columns for columns in full) else "" for name in (_SUCCESS, _DONE))
+    if done and terminate is None and success is None and not won and _pays(full, reward or rewarded):
         terminate = done
-    return dataset(Log(episodes, notes, there, done=done), observations, [actions], reward, success, terminate)
+    log = Log(episodes, notes, there, reward=rewarded, success=won, done=done, continuous=continuous)
+    return dataset(log, observations, actions, reward, success, terminate)
+
+
+def _below(group: Any, name: str) -> dict[str, Any]:
+    """The arrays of a group or, where there is an array in its place, that one as `obs`."""
+    there = group.get(name, {})
+    return {"obs": there} if hasattr(there, "dtype") else {key: one for key, one in there.items() if hasattr(one, "dtype")}
 
 
 def _sort(group: Any) -> tuple[dict[str, Any], list[str]]:
     """Arrays of rows of numbers by their names, those of `obs` among them, and names of images."""
-    arrays = {**{name: group[name] for name in group}, **{key: group["obs"][key] for key in group.get("obs", {})}}
-    arrays = {name: array for name, array in arrays.items() if hasattr(array, "dtype")}
+    arrays = {**{name: group[name] for name in group if hasattr(group[name], "dtype")}, **_below(group, "obs")}
     images = [name for name, array in arrays.items() if array.ndim > 2]
-    return {name: array for name, array in arrays.items() if name not in images}, images
+    return {name: array for name, array in arrays.items() if array.ndim in (1, 2)}, images
 
 
-def _pays(episodes: list[Episode], reward: Rule, done: str) -> bool:
+def _check_following(where: str, key: str, seen: NDArray[Any], after: NDArray[Any]) -> None:
+    """Raises ValueError where a row of `next_obs` is not the following row of `obs`, as that is what is learnt from."""
+    if len(seen) != len(after):
+        raise ValueError(f"{where}: next_obs has {len(after)} rows of {key!r}, but obs has {len(seen)}")
+    coarse = min(seen.dtype, after.dtype, key=lambda dtype: dtype.itemsize)  # One of them may have been rounded.
+    differs = seen[1:].astype(coarse) != after[:-1].astype(coarse)
+    rows = np.flatnonzero(differs.any(axis=tuple(range(1, differs.ndim))))
+    if len(rows):
+        hint = "hint: rows between them were left out; Dataset.from_arrays takes next_observations of any rows"
+        raise ValueError(f"{where}: next_obs, row {rows[0]} of {key!r} is not the following row of obs ({len(rows)} such rows)\n{hint}")
+
+
+def _pays(columns: list[dict[str, NDArray[Any]]], reward: Rule) -> bool:
     """Whether `dones` are set, and only where there is a reward."""
-    if not isinstance(reward, str) or not all(reward in episode.columns for episode in episodes):
+    if not isinstance(reward, str) or not all(reward in of for of in columns):
         return False
-    flags: NDArray[Any] = np.concatenate([episode.columns[done].reshape(-1) > 0 for episode in episodes])
-    return bool(flags.any()) and bool((np.concatenate([e.columns[reward].reshape(-1) for e in episodes])[flags] > 0).all())
+    flags: NDArray[Any] = np.concatenate([of[_DONE].reshape(-1) > 0 for of in columns])
+    return bool(flags.any()) and bool((np.concatenate([of[reward].reshape(-1) for of in columns])[flags] > 0).all())

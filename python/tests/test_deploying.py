@@ -1,0 +1,73 @@
+"""The ROS 2 node of docs/deploying.md, as it stands there, with a stand-in for rclpy, which pip cannot install."""
+
+import re
+import sys
+from pathlib import Path
+from types import ModuleType, SimpleNamespace
+
+import numpy as np
+import pandas as pd
+import pytest
+from conftest import train
+
+from quad_rl import Dataset, Policy
+
+JOINTS = ["shoulder", "elbow"]
+SEEN = [f"{part}.{joint}" for part in ("position", "velocity") for joint in JOINTS]
+
+
+@pytest.fixture(scope="module")
+def snapshot(tmp_path_factory):
+    """A policy of a robot with two joints, whose actions have another order than the controller."""
+    folder, rng = tmp_path_factory.mktemp("robot"), np.random.default_rng(0)
+    numbers = {name: rng.normal(size=400) for name in SEEN}
+    done = {f"torque.{joint}": rng.uniform(-9, 9, 400) for joint in ("elbow", "shoulder")}
+    frame = pd.DataFrame({**numbers, **done, "gain": rng.normal(size=400), "run": np.arange(400) // 50})
+    Dataset.from_frame(frame, observations=SEEN, actions=[*done], reward="gain", episode="run", terminal="never").save(folder / "log.hdf5")
+    return train(folder / "run", folder / "log.hdf5", "--task", "own-data", "--env", "mine", "--steps", "2", "--scale", "actions")
+
+
+class Node:
+    """rclpy's Node: it keeps what is published and what is logged."""
+
+    def __init__(self, name):
+        self.published, self.errors = [], []
+
+    def create_publisher(self, kind, topic, depth):
+        return SimpleNamespace(publish=lambda message: self.published.append(message.data))
+
+    def create_subscription(self, kind, topic, callback, depth):
+        self.receive = callback
+
+    def get_logger(self):
+        return SimpleNamespace(error=self.errors.append)
+
+
+def message(names, position, velocity):
+    return SimpleNamespace(name=names, position=position, velocity=velocity, effort=[])
+
+
+def test_the_node_goes_by_the_names_of_joints(snapshot, tmp_path, monkeypatch):
+    page = (Path(__file__).parents[2] / "docs" / "deploying.md").read_text()
+    code = re.search(r"^## ROS 2\n.*?^```python\n(.*?)^```$", page, re.M | re.S).group(1)
+    spun, modules = [], {name: ModuleType(name) for name in ("rclpy", "rclpy.node", "sensor_msgs", "sensor_msgs.msg", "std_msgs", "std_msgs.msg")}
+    modules["rclpy"].init, modules["rclpy"].spin, modules["rclpy.node"].Node = lambda: None, spun.append, Node
+    modules["sensor_msgs.msg"].JointState, modules["std_msgs.msg"].Float64MultiArray = object, SimpleNamespace
+    for name, module in modules.items():
+        monkeypatch.setitem(sys.modules, name, module)
+    monkeypatch.chdir(tmp_path)
+    Path("policy.safetensors").write_bytes(snapshot.read_bytes())
+    exec(compile(code, "docs/deploying.md", "exec"), {})
+    node, episodes = spun[0], Policy.load(snapshot).begin([0])
+    node.receive(message(["shoulder", "elbow"], [0.1, 0.2], [0.3, 0.4]))
+    node.receive(message(["gripper", "elbow", "shoulder"], [9.0, 0.2, 0.1], [np.nan, 0.4, 0.3]))
+    state = np.array([[0.1, 0.2, 0.3, 0.4]], np.float32)
+    for found in node.published:
+        np.testing.assert_allclose(found, episodes.act(state)[0][::-1], rtol=1e-6)  # The controller's order.
+    assert len(node.published) == 2 and not node.errors
+    node.receive(message(["shoulder", "elbow"], [0.1, float("nan")], [0.3, 0.4]))
+    node.receive(message(["shoulder", "elbow"], [0.1, 0.2], []))
+    node.receive(message(["shoulder", "wrist"], [0.1, 0.2], [0.3, 0.4]))
+    assert len(node.published) == 2, "no command without a whole state"
+    assert [re.search("position.elbow|velocity.shoulder", error).group() for error in node.errors] == ["position.elbow", "velocity.shoulder", "position.elbow"]
+    assert "NaN" in node.errors[0] and "lacks" in node.errors[1]
