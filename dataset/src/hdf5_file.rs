@@ -78,7 +78,7 @@ impl Hdf5File {
 
     /// A text that stands in the file as an array of its own.
     pub(crate) fn text(&self, array: &str) -> Option<String> {
-        text_in(&*self.file.dataset(array).ok()?)
+        text_in(&*self.dataset(array).ok()?)
     }
 
     /// A text that the file's root has as an attribute; empty where the attribute is something else.
@@ -148,7 +148,8 @@ impl Hdf5File {
             Err(_) => unreadable(array, source),
         })?;
         let creation = dataset.dcpl().map_err(|source| unreadable(array, source))?;
-        if creation.layout() == Layout::Virtual || !creation.external().is_empty() {
+        let elsewhere = dataset.filename() != self.file.filename();
+        if elsewhere || creation.layout() == Layout::Virtual || !creation.external().is_empty() {
             return Err(Problem::Elsewhere { array: name() });
         }
         match creation.filters().iter().find(|filter| !filter.is_available()) {

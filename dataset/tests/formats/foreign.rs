@@ -162,7 +162,13 @@ fn arrays_that_lie_elsewhere() {
         builder.virtual_map("other.hdf5", name, values.dim(), .., values.dim(), ..).create(name).unwrap();
     };
     let link = |file: &hdf5::File, name: &str, _: Array2<f32>| file.link_external("other.hdf5", name, name).unwrap();
-    for (_folder, path) in [file(virtually), file(link)] {
+    // To a file that is there.
+    let stolen = |file: &hdf5::File, name: &str, values: Array2<f32>| {
+        let other = Path::new(&file.filename()).with_file_name("other.hdf5");
+        plain(&hdf5::File::append(&other).unwrap(), name, values.clone());
+        link(file, name, values);
+    };
+    for (_folder, path) in [file(virtually), file(link), file(stolen)] {
         let error = error(&path);
         assert!(matches!(&error.problem, Problem::Elsewhere { array } if array == "observations"), "{error}");
     }
