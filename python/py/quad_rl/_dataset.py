@@ -58,7 +58,8 @@ class Dataset:
             counts, inside an episode. What followed the last step of a truncated episode is then not known, so that step
             is dropped, as D4RL does it; so is the last row if nothing ends there. After a terminal step nothing counts.
 
-        Raises ValueError for shapes that do not fit one another, for whole numbers as actions, and for NaN, with the row.
+        Raises ValueError for shapes that do not fit one another, for whole numbers as actions, and, with the row, for NaN, numbers
+        that a masked array hides, and flags that are neither 0 nor 1.
         """
         rows = rows_of("", observations, actions, rewards, terminations, truncations, next_observations)
         return Dataset(rows if next_observations is not None else followed(rows))

@@ -86,7 +86,7 @@ def _flags(where: str, name: str, values: ArrayLike, rows: int) -> NDArray[np.bo
     bad = np.flatnonzero((array != 0) & (array != 1))
     if len(bad):
         raise ValueError(f"{where}{name}, row {bad[0]}: {array[bad[0]]} is neither 0 nor 1 ({len(bad)} such rows)")
-    return array == 1
+    return array.astype(bool)
 
 
 def _array(

@@ -17,8 +17,8 @@ def drawn_place(worth: Value, temperature: float, uniform: Value) -> Value:
     away = (worth - graph("ReduceMax", worth, axes=[1], keepdims=1)).double()
     sums = graph("CumSum", graph("Exp", away / graph.double(temperature)), np.array(1))
     beyond = graph("Cast", graph("Greater", sums, uniform.double() * sums.part(1, -1, END)), to=1)
-    last = graph("ReduceMax", beyond, axes=[1], keepdims=1)
-    return graph("Where", graph("Cast", last, to=9), graph("ArgMax", beyond, axis=1), graph("ArgMax", worth, axis=1))
+    some = graph("Cast", graph("ReduceMax", beyond, axes=[1], keepdims=1), to=9)
+    return graph("Where", some, graph("ArgMax", beyond, axis=1), graph("ArgMax", worth, axis=1))
 
 
 def choose(drawn: Value, worth: Value, rule: str, candidates: int, uniform: Value | None) -> Value:
@@ -29,13 +29,13 @@ def choose(drawn: Value, worth: Value, rule: str, candidates: int, uniform: Valu
         return drawn.at(1, 0)
     if uniform is None:
         return graph("GatherND", drawn, graph("ArgMax", worth, axis=1), batch_dims=1)
-    temperature = np.float32(numbers[0])
+    temperature = float(numbers[0])
     if name == "softmax":
         return graph("GatherND", drawn, drawn_place(worth, temperature, uniform), batch_dims=1)
     # Several, each once. Worth counts up to 40 temperatures above the smallest of as many largest.
     count = min(int(numbers[1]), candidates)
     largest = graph("TopK", worth, np.array([count]), axis=1).part(1, count - 1, count)
-    worth = graph("Min", worth, largest + np.float32(40) * temperature)
+    worth = graph("Min", worth, largest + np.float32(40) * np.float32(temperature))
     gone = -np.inf
     taken = None
     for i in range(count):
