@@ -99,7 +99,8 @@ impl<'a> Rows<'a> {
 /// The place of each name among a dictionary's keys.
 fn places(name: &str, keys: &[String], names: &[String]) -> PyResult<Vec<usize>> {
     if names.is_empty() {
-        let error = format!("{name} is a dictionary, but the policy's data has no names\nhint: give its numbers in its order");
+        let error =
+            format!("{name} is a dictionary, but the policy's data has no names\nhint: give its numbers in its order");
         return Err(PyValueError::new_err(error));
     }
     let place = |name: &String| keys.iter().position(|key| key == name);
