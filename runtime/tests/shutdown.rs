@@ -9,12 +9,12 @@ use tokio::runtime::{Builder, Runtime};
 use tokio::time::timeout;
 
 #[test]
-fn either_signal_is_noticed_even_before_it_is_awaited() {
+fn each_signal_is_noticed_even_before_it_is_awaited() {
     let send = |signal: &str| {
         let status = Command::new("sh").args(["-c", &format!("kill -{signal} {}", std::process::id())]).status();
         assert!(status.unwrap().success());
     };
-    for [signal, other] in [["INT", "TERM"], ["TERM", "INT"]] {
+    for [signal, other] in [["INT", "TERM"], ["TERM", "INT"], ["HUP", "TERM"], ["USR1", "TERM"]] {
         // A runtime each: the end of it ends the watch, to which another signal would be a further one.
         runtime().block_on(async {
             let shutdown = shutdown_signal(LEAVE_WITHIN);
@@ -27,6 +27,15 @@ fn either_signal_is_noticed_even_before_it_is_awaited() {
     }
     let quiet = runtime().block_on(async { timeout(Duration::from_millis(100), shutdown_signal(LEAVE_WITHIN)).await });
     assert!(quiet.is_err(), "a signal of the past is no reason to leave");
+    // As `nohup` does before it starts a program.
+    // SAFETY: it only sets what the system does at the signal.
+    unsafe { libc::signal(libc::SIGHUP, libc::SIG_IGN) };
+    let quiet = runtime().block_on(async {
+        let shutdown = shutdown_signal(LEAVE_WITHIN);
+        send("HUP");
+        timeout(Duration::from_secs(1), shutdown).await
+    });
+    assert!(quiet.is_err(), "what is ignored from the start on stays ignored");
 }
 
 fn runtime() -> Runtime {

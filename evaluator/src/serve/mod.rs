@@ -52,7 +52,7 @@ use worker::Worker;
 
 const AFTER_HELP: &str = "\
 The evaluator finds all runs at its endpoints, also runs that start later, and serves them in turn. You may stop it at any time
-(Ctrl-C or SIGTERM): the learner gives its job to another evaluator.
+(Ctrl-C, SIGTERM, SIGHUP or SIGUSR1): the learner gives its job to another evaluator.
 
 Examples:
   evaluator serve                                       a learner on this machine
@@ -90,7 +90,7 @@ const LEAVE: Duration = Duration::from_secs(1);
 /// The evaluator counts as stuck if it has made no progress for this long. It waits up to half a minute for weights.
 const STUCK: Duration = Duration::from_secs(60);
 
-/// Serves these environments until SIGINT or SIGTERM.
+/// Serves these environments until a signal to end.
 ///
 /// # Errors
 /// An endpoint or a folder of certificates that cannot be used, or a session that closed for good.

@@ -30,7 +30,7 @@ Examples:
 
 Each run is a `learner train` of one thread (RAYON_NUM_THREADS changes that) and logs to runs/STUDY/RUN/learner.log. A run that
 fails does not end the others. The same command continues the runs that are not complete. The exit code is 0 if all runs are
-complete, 1 if a run has failed, 75 if runs are left for the same command. At Ctrl-C or SIGTERM the learners save checkpoints, and
+complete, 1 if a run has failed, 75 if runs are left for the same command. At Ctrl-C, SIGTERM, SIGHUP or SIGUSR1 the learners save checkpoints, and
 the sweep ends within 18 s.";
 
 /// Arguments of `learner sweep`.

@@ -29,7 +29,7 @@ Examples:
 
   # Continue after a crash or Ctrl-C: the same command again.
 
-At Ctrl-C or SIGTERM the learner saves a checkpoint and ends with exit code 75; at a second signal it ends at once. The same
+At Ctrl-C, SIGTERM, SIGHUP or SIGUSR1 the learner saves a checkpoint and ends with exit code 75; at a second signal it ends at once. The same
 command continues from the newest checkpoint in the run's folder. On the same machine an interrupted run ends with the same
 weights, bit for bit, as a run without interruption.";
 

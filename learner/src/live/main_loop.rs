@@ -31,7 +31,7 @@ const LAST_WRITES: Duration = Duration::from_secs(15);
 pub(crate) enum Ending {
     /// Training is complete, and every episode has a score or was given up.
     Complete,
-    /// The user asked to stop (SIGINT or SIGTERM).
+    /// The user asked to stop, by a signal.
     Interrupted,
     /// Training is complete, but no evaluator with the run's environment came.
     Unscored,

@@ -55,7 +55,7 @@ struct Floor {
 }
 
 impl Sweep {
-    /// Runs all, or, at SIGINT or SIGTERM, lets those at work save what they have. Learners are the calling thread's.
+    /// Runs all, or, at a signal to end, lets those at work save what they have. Learners are the calling thread's.
     pub async fn run(mut self) -> Ended {
         LocalSet::new().run_until(self.work()).await
     }

@@ -55,6 +55,26 @@ fn a_stderr_that_is_never_read_holds_up_neither_the_work_nor_the_end() {
     assert!(checkpoints > 0, "it has left without a checkpoint");
 }
 
+/// A closed session, and what Slurm sends before the end of a time limit; but not where `nohup` keeps a session's end away.
+#[test]
+fn a_learner_ends_in_order_by_every_signal_that_tells_it_to() {
+    let scratch = Scratch::new();
+    let nohup = ["sh", "-c", "trap '' HUP CHLD; exec \"$0\" \"$@\""].map(str::to_owned);
+    for (run, launcher, signal) in [("hup", &[][..], "HUP"), ("usr1", &[], "USR1"), ("nohup", &nohup, "TERM")] {
+        let listen = ["--listen", "tcp/127.0.0.1:0", "--evaluators", "1"];
+        let mut learner = scratch.learner_through(launcher, run, ENDLESS, &listen);
+        learner.wait_for_scores(0);
+        if !launcher.is_empty() {
+            learner.process.signal("HUP");
+            learner.wait_for_scores(learner.scores().len());
+        }
+        learner.process.signal(signal);
+        assert_eq!(learner.process.wait(PATIENCE).code(), Some(75), "{run}: {}", learner.process.log());
+        assert!(learner.process.log().contains(&format!("received SIG{signal}")), "{}", learner.process.log());
+        assert!(!learner.files("checkpoints").is_empty(), "{run} has left without a checkpoint");
+    }
+}
+
 /// After a crash, the token of the dead learner is still there for some seconds.
 #[tokio::test(flavor = "multi_thread")]
 async fn a_learner_that_waits_for_another_to_be_gone_hears_of_a_failure_and_leaves_in_order() {
