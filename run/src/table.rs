@@ -50,7 +50,7 @@ impl Table {
         Self { right, rows: vec![header.iter().map(|(name, _)| name.as_ref().to_owned()).collect()] }
     }
 
-    /// A row has a cell for each column. A cell may be from another user's file: it has no line ends, and commands no terminal.
+    /// A row has a cell for each column. A cell is in one line, whatever file its text is from.
     pub fn push(&mut self, row: impl Into<Vec<String>>) {
         self.rows.push(row.into().iter().map(|cell| cell.replace(char::is_control, " ")).collect());
     }

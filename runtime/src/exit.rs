@@ -85,12 +85,17 @@ const LAST_WORDS: Timespec = Timespec { tv_sec: 1, tv_nsec: 0 };
 /// Bytes that a pipe with free space takes without waiting.
 const PIPE: usize = 4096;
 
-/// Prints a command's result to stdout; logs go to stderr. A reader that stops early, like `head`, is no error.
+/// Text as a terminal may have it: what may come from another user's files and names commands nothing.
+pub fn clean(text: &str) -> String {
+    text.replace(|c: char| c.is_control() && !matches!(c, '\n' | '\t'), " ")
+}
+
+/// Prints a command's result to stdout, [`clean`]; logs go to stderr. A reader that stops early, like `head`, is no error.
 ///
 /// # Errors
 /// Stdout cannot be written to.
 pub fn print(text: &str) -> anyhow::Result<()> {
-    match writeln!(io::stdout(), "{}", text.trim_end()) {
+    match writeln!(io::stdout(), "{}", clean(text.trim_end())) {
         Err(error) if error.kind() == io::ErrorKind::BrokenPipe => Ok(()),
         result => Ok(result?),
     }
@@ -114,9 +119,8 @@ pub fn run_main(logging: Logging, main: impl FnOnce() -> anyhow::Result<()>) -> 
     drop(logging);
     let Err(error) = result else { return ExitCode::SUCCESS };
     let unfinished = error.chain().filter_map(|cause| cause.downcast_ref::<Hinted>()).any(|hinted| hinted.unfinished);
-    let mut text = Vec::new();
     // If stderr is closed, only the exit code can say something.
-    show(&error, &mut text).and_then(|()| say(&text)).ok();
+    say(show(&error).as_bytes()).ok();
     if unfinished { UNFINISHED.into() } else { ExitCode::FAILURE }
 }
 
@@ -145,22 +149,23 @@ fn say(mut text: &[u8]) -> io::Result<()> {
     Ok(())
 }
 
-fn show(error: &anyhow::Error, to: &mut impl Write) -> io::Result<()> {
-    let mut last = String::new();
+/// An error as the user sees it, [`clean`].
+fn show(error: &anyhow::Error) -> String {
+    let (mut shown, mut last) = (String::new(), String::new());
     for (depth, cause) in error.chain().enumerate() {
         let text = cause.to_string().trim_end().to_owned();
         // Some errors already contain the text of their cause.
         if depth == 0 {
-            writeln!(to, "{ERROR}{text}")?;
+            shown += &format!("{ERROR}{text}\n");
         } else if !last.contains(&text) {
-            writeln!(to, "  because: {text}")?;
+            shown += &format!("  because: {text}\n");
         }
         last = text;
     }
     for hint in hints(error) {
-        writeln!(to, "hint: {hint}")?;
+        shown += &format!("hint: {hint}\n");
     }
-    Ok(())
+    clean(&shown)
 }
 
 #[cfg(test)]
@@ -171,9 +176,7 @@ mod tests {
     use crate::logging::init_logging;
 
     fn printed<T>(result: anyhow::Result<T>) -> String {
-        let mut text = Vec::new();
-        show(&result.err().unwrap(), &mut text).unwrap();
-        String::from_utf8(text).unwrap()
+        show(&result.err().unwrap())
     }
 
     #[test]
@@ -193,6 +196,12 @@ mod tests {
         let cause = io::Error::other("in use");
         let result: anyhow::Result<()> = Err(cause).with_context(|| "cannot listen: in use");
         assert_eq!(printed(result), "error: cannot listen: in use\n");
+    }
+
+    #[test]
+    fn what_a_name_or_a_file_says_commands_no_terminal() {
+        let named: anyhow::Result<()> = Err(anyhow!("a\u{1b}]0;x\u{7}\n\tb")).hint("c\r\u{9b}2J\u{7f}");
+        assert_eq!(printed(named), "error: a ]0;x \n\tb\nhint: c  2J \n");
     }
 
     #[test]

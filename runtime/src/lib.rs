@@ -33,7 +33,7 @@ mod threads;
 pub use background::stay_in_background;
 pub use certificates::{Certificates, CertificatesError, Role, certificates_folder};
 pub use endpoints::{DEFAULT_PORT, Endpoints, SessionError, default_endpoint, parse_endpoint};
-pub use exit::{ENDED_AT_ONCE, Hint, UNFINISHED, error_in, hinted, hints, json, print, run_main, unfinished};
+pub use exit::{ENDED_AT_ONCE, Hint, UNFINISHED, clean, error_in, hinted, hints, json, print, run_main, unfinished};
 pub use health::{Beat, Health};
 pub use logging::{Logging, init_logging};
 pub use metrics_server::{MetricsServer, serve_metrics};

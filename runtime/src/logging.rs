@@ -1,14 +1,13 @@
 //! Which log lines a program writes, and where to.
 
 use std::env;
-use std::io::IsTerminal;
+use std::io::{self, IsTerminal, Write};
 use std::sync::{Mutex, PoisonError};
 use std::time::{Duration, Instant};
 
 use tracing::{Level, Subscriber};
 use tracing_appender::non_blocking::{NonBlockingBuilder, WorkerGuard};
 use tracing_subscriber::filter::dynamic_filter_fn;
-use tracing_subscriber::fmt::MakeWriter;
 use tracing_subscriber::prelude::*;
 use tracing_subscriber::{EnvFilter, fmt, registry};
 
@@ -42,20 +41,39 @@ pub fn init_logging() -> Logging {
     let filter = EnvFilter::try_from_default_env().unwrap_or_else(|_| EnvFilter::new(DEFAULT_FILTER));
     let variable = |name| env::var_os(name).unwrap_or_default();
     let colours = std::io::stderr().is_terminal() && variable("NO_COLOR").is_empty() && variable("TERM") != "dumb";
-    subscriber(lines, filter, colours).try_init().ok();
+    subscriber(move || lines.clone(), filter, colours).try_init().ok();
     Logging { _writer: guard }
 }
 
-fn subscriber<W>(writer: W, filter: EnvFilter, colours: bool) -> impl Subscriber + Send + Sync + 'static
-where
-    W: for<'a> MakeWriter<'a> + Send + Sync + 'static,
-{
+/// Writes lines without control characters. The formatter has escaped those that terminals' commands begin with; what has these
+/// in the end is our own, for colours.
+struct Clean<W>(W);
+
+impl<W: Write> Write for Clean<W> {
+    fn write(&mut self, line: &[u8]) -> io::Result<usize> {
+        let is_command = |byte: u8| byte < b' ' && !matches!(byte, b'\n' | b'\t' | b'\x1b');
+        let clean = line.iter().map(|&byte| if is_command(byte) { b' ' } else { byte });
+        self.0.write_all(&Vec::from_iter(clean))?;
+        Ok(line.len())
+    }
+
+    fn flush(&mut self) -> io::Result<()> {
+        self.0.flush()
+    }
+}
+
+fn subscriber<W: Write + 'static>(
+    writer: impl Fn() -> W + Send + Sync + 'static,
+    filter: EnvFilter,
+    colours: bool,
+) -> impl Subscriber + Send + Sync + 'static {
     let minute = Mutex::new((Instant::now(), 0));
     let bounded = dynamic_filter_fn(move |metadata, _| {
         let counts = metadata.target().starts_with("zenoh") && *metadata.level() <= Level::INFO;
         !counts || has_room(&minute, Instant::now())
     });
-    let lines = fmt::layer().with_target(false).with_writer(writer).with_ansi(colours).with_filter(bounded);
+    let lines = fmt::layer().with_target(false).with_writer(move || Clean(writer())).with_ansi(colours);
+    let lines = lines.with_filter(bounded);
     registry().with(lines).with(filter)
 }
 
@@ -77,22 +95,43 @@ mod tests {
 
     use super::*;
 
+    #[derive(Clone, Default)]
+    struct Page(Arc<Mutex<Vec<u8>>>);
+
+    impl Page {
+        fn text(&self) -> String {
+            String::from_utf8(self.0.lock().unwrap().clone()).unwrap()
+        }
+    }
+
+    impl Write for Page {
+        fn write(&mut self, bytes: &[u8]) -> io::Result<usize> {
+            self.0.lock().unwrap().write(bytes)
+        }
+
+        fn flush(&mut self) -> io::Result<()> {
+            Ok(())
+        }
+    }
+
+    #[test]
+    fn what_is_logged_commands_no_terminal() {
+        let page = Page::default();
+        let writer = page.clone();
+        tracing::subscriber::with_default(subscriber(move || writer.clone(), EnvFilter::new("info"), false), || {
+            let all = String::from_iter((0..0xa0).filter_map(char::from_u32));
+            info!(name = all, "{all}");
+        });
+        let text = page.text();
+        assert!(!text.contains(|c: char| c.is_control() && !matches!(c, '\n' | '\t')), "{text:?}");
+    }
+
     #[test]
     fn refused_clients_do_not_fill_the_log_and_hide_nothing_of_ours() {
-        let page = Arc::new(Mutex::new(Vec::new()));
-        struct Page(Arc<Mutex<Vec<u8>>>);
-        impl std::io::Write for Page {
-            fn write(&mut self, bytes: &[u8]) -> std::io::Result<usize> {
-                self.0.lock().unwrap().write(bytes)
-            }
-
-            fn flush(&mut self) -> std::io::Result<()> {
-                Ok(())
-            }
-        }
+        let page = Page::default();
         let writer = page.clone();
         let filter = EnvFilter::new("debug");
-        tracing::subscriber::with_default(subscriber(move || Page(writer.clone()), filter, false), || {
+        tracing::subscriber::with_default(subscriber(move || writer.clone(), filter, false), || {
             // All events of a learner come from one place in the code.
             for text in std::iter::repeat_n("evaluator left", 1000).chain(["the score cannot be saved"]) {
                 warn!(target: "zenoh_transport::unicast", "refused");
@@ -100,7 +139,7 @@ mod tests {
                 info!("{text}");
             }
         });
-        let text = String::from_utf8(page.lock().unwrap().clone()).unwrap();
+        let text = page.text();
         let count = |what: &str| text.lines().filter(|line| line.contains(what)).count();
         assert_eq!((count("left"), count("cannot be saved"), count("asked for")), (1000, 1, 1001));
         assert_eq!(count("refused"), ZENOH_LINES as usize);

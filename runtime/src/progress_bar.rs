@@ -6,6 +6,8 @@ use std::time::{Duration, Instant};
 use indicatif::{HumanBytes, ProgressDrawTarget, ProgressStyle};
 use tracing::info;
 
+use crate::exit::clean;
+
 /// How often a log gets a line.
 const LINE: Duration = Duration::from_secs(5);
 
@@ -67,7 +69,7 @@ impl ProgressBar {
 
     /// An event, as a line of its own.
     pub fn say(&self, text: &str) {
-        if self.bar.is_hidden() { info!("{text}") } else { self.bar.println(text) }
+        if self.bar.is_hidden() { info!("{text}") } else { self.bar.println(clean(text)) }
     }
 }
 

@@ -4,6 +4,7 @@ use std::collections::VecDeque;
 use std::time::{Duration, Instant};
 
 use indicatif::{HumanDuration, ProgressBar, ProgressDrawTarget, ProgressStyle};
+use quad_runtime::clean;
 use tracing::info;
 
 use super::metrics::Metrics;
@@ -55,7 +56,7 @@ impl Display {
 
     /// Prints an event as a line.
     pub fn say(&self, text: &str) {
-        if self.bar.is_hidden() { info!("{text}") } else { self.bar.println(text) }
+        if self.bar.is_hidden() { info!("{text}") } else { self.bar.println(clean(text)) }
     }
 
     /// Adds the result of an evaluation.

@@ -3,6 +3,7 @@
 use std::time::{Duration, Instant};
 
 use indicatif::{ProgressBar, ProgressDrawTarget, ProgressStyle};
+use quad_runtime::clean;
 use tracing::info;
 
 /// How often the figures on a terminal change.
@@ -36,7 +37,7 @@ impl Display {
 
     /// An event, as a line of its own.
     pub fn say(&self, text: &str) {
-        if self.bar.is_hidden() { info!("{text}") } else { self.bar.println(text) }
+        if self.bar.is_hidden() { info!("{text}") } else { self.bar.println(clean(text)) }
     }
 
     /// Whether it is time to show something new; then the next time is an interval later.
