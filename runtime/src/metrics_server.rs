@@ -1,6 +1,7 @@
 //! Serves `/metrics`, `/healthz` and the pages of a program.
 
 use std::collections::VecDeque;
+use std::fs;
 use std::net::{IpAddr, SocketAddr};
 use std::sync::Arc;
 use std::time::Duration;
@@ -47,7 +48,8 @@ pub struct MetricsServer {
 /// Serves over HTTP at `address`: `/metrics` with the metrics of `registry` in Prometheus's text format; `/healthz` with `ok`,
 /// or with status 503 and a line for each problem; and the program's own `pages`.
 ///
-/// A request must name this machine by an address, as `localhost` or, if other machines can ask, by its own name.
+/// A request must name this machine by an address, as `localhost` or, if other machines can ask, by its own name, alone or with a
+/// domain that this machine searches.
 ///
 /// The server cuts off clients that send or read slowly, or hold idle connections; they cost a bounded amount of memory.
 ///
@@ -64,13 +66,15 @@ pub async fn serve_metrics(
         listener.hint("another program may listen there: choose another address, or port 0 for a free one")?;
     let address = listener.local_addr()?;
     let metrics = get(metrics).with_state(registry);
-    let own_name = std::fs::read_to_string("/proc/sys/kernel/hostname").ok().filter(|_| !address.ip().is_loopback());
-    let own_name: Option<Arc<str>> = own_name.map(|name| name.trim().into());
+    let [name, resolver] = ["/proc/sys/kernel/hostname", "/etc/resolv.conf"].map(|path| {
+        if address.ip().is_loopback() { String::new() } else { fs::read_to_string(path).unwrap_or_default() }
+    });
+    let own_names: Arc<[String]> = own_names(name.trim(), &resolver).into();
     let router = Router::new()
         .route("/metrics", metrics)
         .route("/healthz", get(healthz).with_state(health))
         .merge(pages)
-        .layer(middleware::from_fn_with_state(own_name, refuse_other_names));
+        .layer(middleware::from_fn_with_state(own_names, refuse_other_names));
     let task = tokio::spawn(accept(listener, router));
     Ok(MetricsServer { address, task })
 }
@@ -113,8 +117,8 @@ async fn answer(stream: TcpStream, router: Router) {
 
 /// The owner of a web page may let its name lead to this machine (DNS rebinding). The browser of a person who reads that page
 /// would then give it our answers, but it tells us the page's name.
-async fn refuse_other_names(State(own_name): State<Option<Arc<str>>>, request: Request, next: Next) -> Response {
-    let is_ours = |name: &[u8]| std::str::from_utf8(name).is_ok_and(|name| names_us(name, own_name.as_deref()));
+async fn refuse_other_names(State(own_names): State<Arc<[String]>>, request: Request, next: Next) -> Response {
+    let is_ours = |name: &[u8]| std::str::from_utf8(name).is_ok_and(|name| names_us(name, &own_names));
     if request.headers().get(header::HOST).is_none_or(|name| is_ours(name.as_bytes())) {
         return next.run(request).await;
     }
@@ -122,13 +126,21 @@ async fn refuse_other_names(State(own_name): State<Option<Arc<str>>>, request: R
     (StatusCode::FORBIDDEN, hint).into_response()
 }
 
-/// Whether `host` is an address, `localhost`, or our own name, whichever domain follows it.
-fn names_us(host: &str, own_name: Option<&str>) -> bool {
+/// What other machines may call this one: by its first name, its whole name, and its first name in each domain that a resolver's
+/// settings name. A stranger can have the first name in any other domain.
+fn own_names(name: &str, resolver: &str) -> Vec<String> {
+    let Some(first) = name.split('.').next().filter(|first| !first.is_empty()) else { return Vec::new() };
+    let lists = resolver.lines().filter_map(|line| line.strip_prefix("search ").or(line.strip_prefix("domain ")));
+    let domains = lists.flat_map(str::split_whitespace).map(|domain| format!("{first}.{domain}"));
+    domains.chain([first.to_owned(), name.to_owned()]).collect()
+}
+
+/// Whether `host` is an address, `localhost`, or one of our own names.
+fn names_us(host: &str, own_names: &[String]) -> bool {
     let Ok(authority) = host.parse::<Authority>() else { return false };
     let name = authority.host().trim_matches(['[', ']']);
-    let is_own =
-        |own: &str| own.split('.').next().zip(name.split('.').next()).is_some_and(|(a, b)| a.eq_ignore_ascii_case(b));
-    name.parse::<IpAddr>().is_ok() || name.eq_ignore_ascii_case("localhost") || own_name.is_some_and(is_own)
+    let is_ours = |own: &String| name.eq_ignore_ascii_case(own);
+    name.parse::<IpAddr>().is_ok() || name.eq_ignore_ascii_case("localhost") || own_names.iter().any(is_ours)
 }
 
 async fn metrics(State(registry): State<Registry>) -> impl IntoResponse {
@@ -153,20 +165,29 @@ impl Drop for MetricsServer {
 
 #[cfg(test)]
 mod tests {
-    use super::names_us;
+    use super::{names_us, own_names};
 
     #[test]
     fn by_which_names_a_request_may_ask() {
         for host in ["127.0.0.1:8080", "[::1]:8080", "192.0.2.1", "localhost", "LocalHost:9600"] {
-            assert!(names_us(host, None), "{host}");
+            assert!(names_us(host, &[]), "{host}");
         }
-        for host in ["box7", "box7:9600", "Box7.example.org:9600"] {
-            assert!(names_us(host, Some("box7.lan")) && !names_us(host, None), "{host}");
+        let own = own_names("box7.lan", "nameserver 192.0.2.1\nsearch lab.example.org example.org\n");
+        for host in ["box7", "box7:9600", "box7.lan", "Box7.example.org:9600", "box7.lab.example.org"] {
+            assert!(names_us(host, &own) && !names_us(host, &[]), "{host}");
         }
-        for host in
-            ["evil.example", "localhost.evil.example", "127.0.0.1.evil.example:80", "user@evil.example", "", "a b"]
-        {
-            assert!(!names_us(host, Some("box7")), "{host}");
+        for host in [
+            "evil.example",
+            "box7.evil.example",
+            "box7.org",
+            ":9600",
+            "localhost.evil.example",
+            "127.0.0.1.evil.example:80",
+            "user@evil.example",
+            "",
+            "a b",
+        ] {
+            assert!(!names_us(host, &own) && !names_us(host, &own_names("", "search evil.example")), "{host}");
         }
     }
 }
