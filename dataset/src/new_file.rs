@@ -41,6 +41,13 @@ impl NewFile {
         if path.is_dir() {
             return Err(DatasetError::new(path, Problem::Io(io::ErrorKind::IsADirectory.into())));
         }
+        // What a killed process has left, or a link, through which the library would write into another file.
+        let made = fs::remove_file(&partial).or_else(|error| match error.kind() {
+            io::ErrorKind::NotFound => Ok(()),
+            _ => Err(error),
+        });
+        let made = made.and_then(|()| fs::File::create_new(&partial));
+        made.map_err(|source| DatasetError::new(path, Problem::Io(source)))?;
         // The oldest format is read by every version of the library, and its groups do not say when they were made.
         let hdf5 = hdf5::File::with_options().with_fapl(|access| access.libver_earliest()).create(&partial);
         let hdf5 = hdf5.map_err(|source| DatasetError::new(path, Problem::Write(source)))?;
@@ -112,5 +119,21 @@ impl Column {
         self.dataset.write_slice(view, Hyperslab::from(slab))?;
         self.rows = rows;
         Ok(())
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn no_link_is_written_through() {
+        let folder = tempfile::tempdir().unwrap();
+        let [path, precious] = ["data.hdf5", "precious"].map(|name| folder.path().join(name));
+        fs::write(&precious, "precious").unwrap();
+        std::os::unix::fs::symlink(&precious, folder.path().join("data.hdf5.partial")).unwrap();
+        NewFile::create(&path).unwrap().finish().unwrap();
+        assert_eq!(fs::read_to_string(precious).unwrap(), "precious");
+        assert!(path.metadata().unwrap().len() > 0 && !path.is_symlink());
     }
 }

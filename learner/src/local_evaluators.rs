@@ -1,6 +1,5 @@
 //! Evaluators that the learner or a sweep starts itself, and that end with it: `--evaluators N`.
 
-use std::fs::File;
 use std::io;
 use std::os::unix::process::CommandExt;
 use std::path::{Path, PathBuf};
@@ -9,6 +8,7 @@ use std::time::{Duration, Instant};
 
 use anyhow::{Context, anyhow};
 use quad_protocol::Name;
+use quad_run::files;
 use quad_runtime::{Hint, threads_asked};
 use rustix::process::{Pid, Signal, kill_process, set_parent_process_death_signal};
 
@@ -23,7 +23,7 @@ const PAUSE: [Duration; 2] = [Duration::from_secs(1), Duration::from_secs(300)];
 /// Sets up a command so that its process ends with the thread that starts it, and appends all its output to a file. The
 /// process does not get a terminal's Ctrl-C; its parent tells it to leave.
 pub(crate) fn run_beside(command: &mut Command, log: &Path) -> io::Result<()> {
-    let file = File::options().create(true).append(true).open(log)?;
+    let file = files::append(log)?;
     command.stdin(Stdio::null()).stdout(file.try_clone()?).stderr(file).process_group(0);
     // SAFETY: the new process makes one system call, which may be made between fork and exec.
     #[allow(unsafe_code)]
@@ -184,6 +184,23 @@ impl Place {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    /// A folder of a study may be another user's.
+    #[test]
+    fn a_log_is_no_link_and_no_pipe() {
+        let folder = tempfile::tempdir().unwrap();
+        let [precious, link, pipe] = ["precious", "link", "pipe"].map(|name| folder.path().join(name));
+        std::fs::write(&precious, "precious").unwrap();
+        std::os::unix::fs::symlink(&precious, &link).unwrap();
+        assert!(Command::new("mkfifo").arg(&pipe).status().unwrap().success());
+        let (tell, told) = std::sync::mpsc::channel();
+        std::thread::spawn(move || {
+            let logged = |log: &Path| run_beside(&mut Command::new("true"), log).is_ok();
+            tell.send([&link, &pipe, &precious].map(|log| logged(log)))
+        });
+        let logged = told.recv_timeout(Duration::from_secs(60)).expect("it waits for a pipe");
+        assert_eq!(logged, [false, false, true]);
+    }
 
     #[test]
     fn one_that_ends_again_and_again_is_started_less_and_less_often() {

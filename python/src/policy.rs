@@ -1,6 +1,5 @@
 //! `quad_rl.Policy`: a trained policy, read from the file of a snapshot.
 
-use std::fs;
 use std::path::PathBuf;
 use std::sync::Arc;
 
@@ -10,6 +9,7 @@ use pyo3::types::{PyBytes, PyDict, PyTuple};
 use quad_dataset::Names;
 use quad_policy::{Header, Policy, PolicyConfig, Precision};
 use quad_protocol::Origin;
+use quad_run::files;
 
 use crate::acting::{Array, act, begin, compute, noise, not_seeds, parts, seeds};
 use crate::arrays::{Like, Rows};
@@ -45,7 +45,7 @@ impl PyPolicy {
     #[staticmethod]
     #[pyo3(signature = (path, precision = "f32"))]
     fn load(py: Python<'_>, path: PathBuf, precision: &str) -> PyResult<Self> {
-        let read = py.detach(|| fs::read(&path));
+        let read = py.detach(|| files::read_named(&path));
         let file = read.map_err(|error| {
             let message = format!("cannot read {}: {error}\nhint: {HINT}", path.display());
             std::io::Error::new(error.kind(), message)

@@ -7,6 +7,7 @@
 //! - [`run`]: a run's folder.
 //! - [`config`]: a run's settings.
 //! - [`table`]: a table as text, Markdown, LaTeX and CSV.
+//! - [`files`]: how every program opens and makes files in a run's folder.
 
 #![deny(unsafe_code)]
 
@@ -14,6 +15,7 @@
 extern crate self as quad_run;
 
 pub mod config;
+pub mod files;
 #[cfg(test)]
 mod fixtures;
 pub mod results;

@@ -1,6 +1,9 @@
 //! `learner doctor`: checks a machine before a run is started on it.
 
+use std::path::{Path, absolute};
+
 use quad_policy::Precision;
+use quad_run::run::Lock;
 use quad_runtime::doctor::{self, Findings};
 use quad_runtime::{DEFAULT_PORT, Endpoints, Role, certificates_folder};
 
@@ -18,6 +21,7 @@ pub fn examine(args: &DoctorArgs) -> anyhow::Result<Findings> {
     findings.ok("precision", format!("this CPU is fastest in {fastest}"));
     hdf5(&mut findings);
     doctor::folder(&mut findings, "run folder", &args.run_dir, "another folder is chosen by --run-dir");
+    locks(&mut findings, &args.run_dir);
     match data::cache::d4rl() {
         Ok(folder) => doctor::folder(&mut findings, "datasets", &folder, "D4RL_DATASET_DIR chooses another folder"),
         Err(error) => findings.warn("datasets", format!("{error:#}"), "name a folder in D4RL_DATASET_DIR"),
@@ -31,6 +35,20 @@ pub fn examine(args: &DoctorArgs) -> anyhow::Result<Findings> {
     let endpoints = Endpoints { connect: vec![endpoint.clone()], certificates, ..Endpoints::default() };
     doctor::connected(&mut findings, &endpoints, async |_, _| Ok(()))?;
     Ok(findings)
+}
+
+fn locks(findings: &mut Findings, run_dir: &Path) {
+    let path = absolute(run_dir).unwrap_or_else(|_| run_dir.to_owned());
+    let folder = path.ancestors().find(|folder| folder.is_dir()).unwrap_or(&path);
+    match Lock::is_possible(folder) {
+        Ok(true) => findings.ok("locks", format!("files have locks in {}", folder.display())),
+        Ok(false) => findings.warn(
+            "locks",
+            format!("files have no locks in {}", folder.display()),
+            "a learner keeps others out by a file scores.host instead: after the end of a host that had it, remove it",
+        ),
+        Err(error) => findings.fail("locks", format!("{}: {error}", folder.display()), "choose another --run-dir"),
+    }
 }
 
 fn hdf5(findings: &mut Findings) {

@@ -3,6 +3,7 @@
 use anyhow::{Context, anyhow};
 use quad_policy::{Header, PolicyError, read_tensors};
 use quad_protocol::Origin;
+use quad_run::files;
 use quad_run::results::RunReport;
 use quad_run::run::RunDir;
 use quad_runtime::{Hint, print};
@@ -11,7 +12,6 @@ use tracing::warn;
 
 use crate::cli::{At, ExportArgs};
 use crate::data::Source;
-use crate::report::replace;
 
 /// Writes the file.
 ///
@@ -38,7 +38,7 @@ pub fn export(args: &ExportArgs) -> anyhow::Result<()> {
     let about = about(&report, step, args.license.as_deref());
     let exported = Header { about, ..header }.to_safetensors(&tensors)?;
     let name = args.out.display();
-    replace(&args.out, &exported).with_context(|| format!("cannot export to {name}"))?;
+    files::replace(&args.out, &exported).with_context(|| format!("cannot export to {name}"))?;
     print(&format!("{name}: {} @ {step}, {} bytes", report.run, exported.len()))
 }
 

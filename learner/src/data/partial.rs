@@ -1,8 +1,10 @@
 //! What has arrived of a file so far.
 
-use std::fs::{self, File, OpenOptions};
+use std::fs::{self, File};
 use std::io::{self, Write};
 use std::path::{Path, PathBuf};
+
+use quad_run::files;
 
 /// A file of this run alone beside the place of the whole one, `<file>.<number>.partial`.
 pub struct Partial {
@@ -17,14 +19,15 @@ impl Partial {
     /// Goes on with what an interrupted run has left of `target`, or begins with nothing.
     pub fn open(target: &Path) -> io::Result<Self> {
         let path = target.with_added_extension(format!("{:08x}.partial", rand::random::<u32>()));
-        for (left, length) in left_of(target) {
+        for (left, _) in left_of(target) {
             // A run that is still fetching has a lock on its file.
-            let Ok(file) = OpenOptions::new().append(true).open(&left) else { continue };
+            let Ok(file) = files::append(&left) else { continue };
             if file.try_lock().is_ok() && fs::rename(&left, &path).is_ok() {
+                let length = file.metadata()?.len();
                 return Ok(Self { path, length, file });
             }
         }
-        let file = OpenOptions::new().append(true).create_new(true).open(&path)?;
+        let file = files::append(&path)?;
         // Where the file system has no locks, this run continues all the same, and nothing is taken over there.
         file.try_lock().ok();
         Ok(Self { path, length: 0, file })
@@ -46,7 +49,7 @@ impl Partial {
     pub fn finish(self, target: &Path) -> io::Result<()> {
         self.file.sync_all()?;
         fs::rename(&self.path, target)?;
-        File::open(target.parent().unwrap_or(Path::new(".")))?.sync_all()
+        files::synchronise_folder(target)
     }
 }
 

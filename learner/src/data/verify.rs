@@ -1,15 +1,15 @@
 //! Whether a file is the one that the catalogue means.
 
-use std::fs::File;
 use std::io::{self, Read};
 use std::path::Path;
 
 use quad_dataset::NamedDataset;
+use quad_run::files;
 use sha2::{Digest, Sha256};
 
 /// SHA-256 of a file in lower-case hexadecimal if the file is what `dataset` says, as far as that is known; else what is wrong.
 pub fn verify(dataset: &NamedDataset, path: &Path) -> io::Result<Result<String, String>> {
-    let mut file = File::open(path)?;
+    let mut file = files::open_named(path)?;
     let found = file.metadata()?.len();
     if let Some(expected) = dataset.bytes.filter(|expected| *expected != found) {
         return Ok(Err(format!("it has {found} bytes, but must have {expected}")));
@@ -30,7 +30,7 @@ pub fn verify(dataset: &NamedDataset, path: &Path) -> io::Result<Result<String, 
 
 /// SHA-256 of a file in lower-case hexadecimal.
 pub fn sha256(path: &Path) -> io::Result<String> {
-    let mut file = File::open(path)?;
+    let mut file = files::open_named(path)?;
     let mut hasher = Sha256::new();
     io::copy(&mut file, &mut hasher)?;
     Ok(format!("{:x}", hasher.finalize()))

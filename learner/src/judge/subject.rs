@@ -1,7 +1,6 @@
 //! The policies to be judged, found by the paths of their runs or of their files.
 
 use std::collections::BTreeSet;
-use std::fs;
 use std::path::{Path, PathBuf};
 
 use anyhow::{Context, anyhow};
@@ -74,7 +73,7 @@ fn of_file(path: &Path) -> anyhow::Result<Subject> {
 impl Subject {
     fn read(folder: RunDir, step: u64) -> anyhow::Result<Self> {
         let (config, path) = (folder.read_config()?, folder.snapshot_path(step));
-        let file = fs::read(&path).with_context(|| format!("cannot read {}", path.display()))?;
+        let file = folder.read_snapshot(step)?;
         let refused = |error: PolicyError| anyhow!("{} is not a policy: {error}", path.display());
         let policy = load_policy(&file, Precision::F32).map_err(refused).hint(ONE)?;
         Ok(Self {

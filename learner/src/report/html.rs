@@ -1,7 +1,6 @@
 //! The report as one HTML file that needs no other file: to send to a colleague, or to print.
 
 use std::collections::BTreeSet;
-use std::fs;
 use std::io::{self, ErrorKind};
 use std::path::Path;
 
@@ -9,12 +8,12 @@ use anyhow::Context;
 use base64::prelude::{BASE64_STANDARD, Engine};
 use minijinja::Environment;
 use minijinja::value::Serde;
+use quad_run::files;
 use quad_run::results::RunReport;
 use serde_json::{Value, json};
 use tracing::warn;
 
 use super::figures;
-use super::plot;
 use super::remake;
 use super::seeds::GroupReport;
 use super::summary::Report;
@@ -35,7 +34,7 @@ pub fn write(path: &Path, report: &Report) -> anyhow::Result<()> {
     // By its name all that is filled in is escaped, and nothing of a run's name is taken for HTML.
     templates.add_template("report.html", include_str!("../../assets/report.html"))?;
     let page = templates.get_template("report.html")?.render(Serde(page(report)?))?;
-    plot::replace(path, page.as_bytes())
+    files::replace(path, page.as_bytes()).with_context(|| format!("cannot write {}", path.display()))
 }
 
 /// What the template is filled with.
@@ -80,11 +79,11 @@ fn films(runs: &[RunReport]) -> Vec<Value> {
 /// Reads a film. The folder may be another user's, and the report is made to be sent: no other file gets into it by a link or
 /// another name.
 fn film(path: &Path, begin: &[u8]) -> io::Result<Vec<u8>> {
-    let found = fs::symlink_metadata(path)?;
-    if !found.is_file() || found.len() > LARGEST {
-        return Err(io::Error::other("it is a link or too large"));
+    let mut file = files::open(path)?;
+    if file.metadata()?.len() > LARGEST {
+        return Err(ErrorKind::FileTooLarge.into());
     }
-    let bytes = fs::read(path)?;
+    let bytes = files::rest(&mut file, 0)?;
     if bytes.starts_with(begin) { Ok(bytes) } else { Err(io::Error::other("it is no such picture")) }
 }
 

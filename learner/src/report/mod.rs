@@ -23,5 +23,4 @@ mod summary;
 
 pub(crate) use figures::{draw_all, of_run};
 pub(crate) use html::write as write_html;
-pub(crate) use plot::replace;
 pub(crate) use summary::Report;

@@ -9,6 +9,7 @@ use plotters::coord::Shift;
 use plotters::coord::types::RangedCoordf64;
 use plotters::prelude::*;
 use plotters::style::register_font;
+use quad_run::files;
 use quad_run::results::statistics::Estimate;
 
 const SIZE: (u32, u32) = (900, 540);
@@ -78,7 +79,7 @@ impl Picture {
     /// # Errors
     /// The file cannot be written.
     pub fn write_svg(&self, path: &Path) -> anyhow::Result<()> {
-        replace(path, self.svg()?.as_bytes())
+        files::replace(path, self.svg()?.as_bytes()).with_context(|| format!("cannot write {}", path.display()))
     }
 
     /// The picture as a PNG file, of twice as many pixels.
@@ -96,7 +97,7 @@ impl Picture {
         let mut encoder = png::Encoder::new(&mut file, width, height);
         encoder.set_color(png::ColorType::Rgb);
         encoder.write_header()?.write_image_data(&pixels)?;
-        replace(path, &file)
+        files::replace(path, &file).with_context(|| format!("cannot write {}", path.display()))
     }
 
     /// Whether there is nothing to be seen in it.
@@ -234,15 +235,6 @@ static FONT: LazyLock<()> = LazyLock::new(|| {
     // It is part of the program, and the tests draw with it.
     let _ = register_font("sans-serif", FontStyle::Normal, font);
 });
-
-/// A reader of the file finds all of it, or what was there.
-pub(crate) fn replace(path: &Path, content: &[u8]) -> anyhow::Result<()> {
-    let file = path.file_name().ok_or_else(|| anyhow!("{} is no file name", path.display()))?;
-    let partial = path.with_file_name(format!("{}.partial", file.display()));
-    let written = std::fs::write(&partial, content).and_then(|()| std::fs::rename(&partial, path));
-    let written = written.inspect_err(|_| drop(std::fs::remove_file(&partial)));
-    written.with_context(|| format!("cannot write {}", path.display()))
-}
 
 #[cfg(test)]
 mod tests;

@@ -9,6 +9,7 @@ use std::time::Duration;
 
 use anyhow::Context;
 use quad_run::config::tables;
+use quad_run::files;
 use quad_run::run::RunDir;
 use quad_run::status::{Pace, State};
 use quad_runtime::{ENDED_AT_ONCE, LEAVE_WITHIN, UNFINISHED, error_in};
@@ -131,8 +132,8 @@ impl Job {
         // On a disk that takes nothing, `--list` calls it begun.
         RunDir::at(&self.dir).mark_failed(true).ok();
         let log = log(&self.dir);
-        let text = fs::read(&log).unwrap_or_default();
-        let own = String::from_utf8_lossy(text.get(logged as usize..).unwrap_or_default());
+        let text = files::open(&log).and_then(|mut log| files::rest(&mut log, logged)).unwrap_or_default();
+        let own = String::from_utf8_lossy(&text);
         let reason = match (error_in(&own), status) {
             (Some(error), _) => error.to_owned(),
             (None, Ok(status)) => format!("the learner ended by {status}"),

@@ -7,8 +7,8 @@ use std::path::{Path, PathBuf};
 use quad_protocol::Hash;
 use tracing::warn;
 
-use super::durable;
 use super::error::{RunDirError, io_error};
+use crate::files;
 
 const SUFFIX: &str = ".safetensors";
 
@@ -40,7 +40,7 @@ impl Checkpoints {
     /// Saves one; only then are older ones removed.
     pub fn save(&self, checkpoint: &Checkpoint) -> Result<(), RunDirError> {
         let target = self.folder.join(file_name(checkpoint));
-        durable::replace(&target, &checkpoint.state)?;
+        files::replace(&target, &checkpoint.state).map_err(io_error("write", &target))?;
         for older in self.files()?.into_iter().skip(Checkpoint::KEPT) {
             // One file too many does no harm.
             fs::remove_file(older).ok();
@@ -56,7 +56,7 @@ impl Checkpoints {
     pub fn newest(&self) -> Result<Option<Checkpoint>, RunDirError> {
         let mut unreadable = None;
         for path in self.files()? {
-            let state = match fs::read(&path) {
+            let state = match files::read(&path) {
                 Ok(state) => state,
                 Err(error) => {
                     warn!("{} cannot be read ({error}); the checkpoint before it is taken", path.display());

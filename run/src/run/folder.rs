@@ -19,12 +19,12 @@ use serde::de::DeserializeOwned;
 use serde::{Deserialize, Serialize};
 
 use super::checkpoints::{Checkpoint, Checkpoints};
-use super::durable::{self, open_file, replace};
 use super::error::{CREATE, RunDirError, content, io_error};
 use super::lines::{RunEndpoints, ScoreLine};
 use super::lock::Lock;
 use super::log::Log;
 use crate::config::RunConfig;
+use crate::files;
 
 /// The file by which a sweep remembers that a run has failed.
 const FAILED: &str = "failed";
@@ -53,7 +53,7 @@ impl RunDir {
         }
         let run = Self::at(path);
         let snapshots = path.join("snapshots");
-        durable::create_folder(&snapshots).map_err(io_error(CREATE, &snapshots))?;
+        files::create_folder(&snapshots).map_err(io_error(CREATE, &snapshots))?;
         // Of two that begin at once, only one gets past this; and scores of unknown origin are not those of a new run.
         let scores = run.score_log()?;
         if Self::is_occupied(path) || !scores.is_empty() {
@@ -62,8 +62,8 @@ impl RunDir {
         run.mark_failed(false)?;
         let target = path.join("config.toml");
         let text = toml::to_string(config).map_err(|error| content(&target, None, &error))?;
-        replace(&target, text.as_bytes())?;
-        durable::synchronise_folder(path).map_err(io_error("write", path))?;
+        files::replace(&target, text.as_bytes()).map_err(io_error("write", &target))?;
+        files::synchronise_folder(path).map_err(io_error("write", path))?;
         Ok((run, scores))
     }
 
@@ -80,7 +80,7 @@ impl RunDir {
     /// Remembers that a run of a sweep has failed, or forgets it.
     pub fn mark_failed(&self, failed: bool) -> Result<(), RunDirError> {
         let path = self.path.join(FAILED);
-        let marked = if failed { fs::write(&path, "") } else { remove_if_there(&path) };
+        let marked = if failed { files::replace(&path, b"") } else { files::remove_if_there(&path) };
         marked.map_err(io_error("write", &path))
     }
 
@@ -114,7 +114,7 @@ impl RunDir {
     /// The configuration that the run began with.
     pub fn read_config(&self) -> Result<RunConfig, RunDirError> {
         let source = self.path.join("config.toml");
-        let text = open_file(&source).and_then(io::read_to_string).map_err(io_error("read", &source))?;
+        let text = files::read_text(&source).map_err(io_error("read", &source))?;
         let config: RunConfig = toml::from_str(&text).map_err(|error: toml::de::Error| {
             let line = error.span().and_then(|at| text.get(..at.start)).map(|before| before.matches('\n').count() + 1);
             content(&source, line, &error.message())
@@ -146,7 +146,7 @@ impl RunDir {
     /// Forgets where an earlier learner could be reached.
     pub fn remove_endpoints(&self) -> Result<(), RunDirError> {
         let path = self.path.join("endpoints.json");
-        remove_if_there(&path).map_err(io_error("remove", &path))
+        files::remove_if_there(&path).map_err(io_error("remove", &path))
     }
 
     /// Reads a JSON file of the folder.
@@ -155,7 +155,7 @@ impl RunDir {
     /// It cannot be read, or is something else.
     pub fn read_json<T: DeserializeOwned>(&self, name: &str) -> Result<T, RunDirError> {
         let path = self.path.join(name);
-        let text = open_file(&path).and_then(io::read_to_string).map_err(io_error("read", &path))?;
+        let text = files::read_text(&path).map_err(io_error("read", &path))?;
         serde_json::from_str(&text).map_err(|error| content(&path, None, &error))
     }
 
@@ -164,7 +164,7 @@ impl RunDir {
         let path = self.path.join(name);
         let mut text = serde_json::to_string_pretty(value).map_err(|error| content(&path, None, &error))?;
         text.push('\n');
-        replace(&path, text.as_bytes())
+        files::replace(&path, text.as_bytes()).map_err(io_error("write", &path))
     }
 
     /// Where the snapshot of a gradient step is or will be.
@@ -175,7 +175,8 @@ impl RunDir {
     /// Saves the snapshot of a gradient step. It survives a power cut from then on.
     pub fn write_snapshot(&self, step: u64, tensors: &[u8]) -> Result<(), RunDirError> {
         self.make_folder("snapshots")?;
-        replace(&self.snapshot_path(step), tensors)
+        let path = self.snapshot_path(step);
+        files::replace(&path, tensors).map_err(io_error("write", &path))
     }
 
     /// Makes a folder of the run again that was removed, but not the run's own.
@@ -183,8 +184,10 @@ impl RunDir {
         let folder = self.path.join(name);
         match fs::create_dir(&folder) {
             // Else a power cut could take what will be in it.
-            Ok(()) => durable::synchronise_folder(&folder).map_err(io_error("write", &folder)),
+            Ok(()) => files::synchronise_folder(&folder).map_err(io_error("write", &folder)),
             Err(error) if error.kind() == io::ErrorKind::NotFound => Err(RunDirError::Gone(self.path.clone())),
+            // It would be written to through the link.
+            Err(_) if folder.is_symlink() => Err(io_error("write", &folder)(files::no_file())),
             // There it is, or writing into it will say what is wrong.
             Err(_) => Ok(()),
         }
@@ -193,7 +196,7 @@ impl RunDir {
     /// Reads the snapshot of a gradient step.
     pub fn read_snapshot(&self, step: u64) -> Result<Vec<u8>, RunDirError> {
         let path = self.snapshot_path(step);
-        fs::read(&path).map_err(io_error("read", &path))
+        files::read(&path).map_err(io_error("read", &path))
     }
 
     /// Renames a snapshot whose contents are not what was scored, so that it does not count as one any more.
@@ -204,12 +207,12 @@ impl RunDir {
 
     /// Removes what writers that were killed have left behind.
     pub fn remove_partial_files(&self) {
-        for folder in [self.path.clone(), self.path.join("snapshots"), self.path.join("checkpoints")] {
-            durable::remove_partial_files(&folder);
-        }
+        files::remove_partial_files(&self.path);
+        let folders = ["snapshots", "checkpoints"].map(|name| self.path.join(name));
+        folders.iter().filter(|folder| !folder.is_symlink()).for_each(|folder| files::remove_partial_files(folder));
     }
 
-    /// The gradient steps of which there are snapshots, in ascending order.
+    /// The gradient steps of which there are snapshots, in ascending order; a link is none.
     pub fn snapshots(&self) -> Result<Vec<u64>, RunDirError> {
         let folder = self.path.join("snapshots");
         let entries = match fs::read_dir(&folder) {
@@ -217,8 +220,8 @@ impl RunDir {
             entries => entries.map_err(io_error("read", &folder))?,
         };
         let step = |entry: io::Result<fs::DirEntry>| {
-            let name = entry.ok()?.file_name();
-            name.to_str()?.strip_prefix("step_")?.strip_suffix(".safetensors")?.parse().ok()
+            let entry = entry.ok().filter(|entry| entry.file_type().is_ok_and(|kind| kind.is_file()))?;
+            entry.file_name().to_str()?.strip_prefix("step_")?.strip_suffix(".safetensors")?.parse().ok()
         };
         let mut steps: Vec<u64> = entries.filter_map(step).collect();
         steps.sort_unstable();
@@ -269,7 +272,7 @@ impl RunDir {
     /// The lines of `scores.jsonl`; none if nothing was scored yet. A last line that is not complete yet is left out.
     pub fn read_scores(&self) -> Result<Vec<ScoreLine>, RunDirError> {
         let path = self.path.join(SCORES);
-        let text = match open_file(&path).and_then(io::read_to_string) {
+        let text = match files::read_text(&path) {
             Err(error) if error.kind() == io::ErrorKind::NotFound => return Ok(Vec::new()),
             other => other.map_err(io_error("read", &path))?,
         };
@@ -284,8 +287,4 @@ impl RunDir {
     pub fn broken_scores(&self, reason: String) -> RunDirError {
         content(&self.path.join(SCORES), None, &reason)
     }
-}
-
-fn remove_if_there(path: &Path) -> io::Result<()> {
-    fs::remove_file(path).or_else(|error| if error.kind() == io::ErrorKind::NotFound { Ok(()) } else { Err(error) })
 }

@@ -1,6 +1,6 @@
 //! What the files of a run say: a line of each log, and where the learner is.
 
-use std::io::{self, ErrorKind};
+use std::io::ErrorKind;
 use std::path::Path;
 
 use anyhow::Context;
@@ -8,7 +8,7 @@ use quad_algorithms::MetricsLine;
 use quad_protocol::{EpisodeScore, ScoreReport};
 use serde::{Deserialize, Serialize};
 
-use super::open_file;
+use crate::files;
 
 /// Where a learner can be reached: `endpoints.json`.
 #[derive(Clone, Debug, Serialize, Deserialize)]
@@ -73,7 +73,7 @@ impl ScoreLine {
 /// The file cannot be read.
 pub fn read_metrics(folder: &Path) -> anyhow::Result<Vec<MetricsLine>> {
     let path = folder.join("metrics.jsonl");
-    match open_file(&path).and_then(io::read_to_string) {
+    match files::read_text(&path) {
         Ok(text) => Ok(text.lines().filter_map(|line| serde_json::from_str(line).ok()).collect()),
         Err(error) if error.kind() == ErrorKind::NotFound => Ok(Vec::new()),
         Err(error) => Err(error).with_context(|| format!("cannot read {}", path.display())),

@@ -1,7 +1,7 @@
 //! Keeps other processes out of a folder.
 
 use std::fs::{self, File, TryLockError};
-use std::io::{ErrorKind, Write};
+use std::io::{self, ErrorKind, Write};
 use std::os::linux::net::SocketAddrExt;
 use std::os::unix::fs::MetadataExt;
 use std::os::unix::net::{SocketAddr, UnixListener};
@@ -9,8 +9,10 @@ use std::path::{Path, PathBuf};
 use std::thread::sleep;
 use std::time::Duration;
 
-use super::durable::open_file;
+use rustix::io::Errno;
+
 use super::error::{RunDirError, io_error};
+use crate::files;
 
 /// A lock that another process has is tried again after this time: `learner list` takes one for microseconds.
 const GLANCE: Duration = Duration::from_millis(10);
@@ -38,7 +40,7 @@ impl Lock {
     /// # Errors
     /// [`RunDirError::InUse`] if another process has it, [`RunDirError::Claimed`] if another host had it.
     pub fn take(path: &Path) -> Result<Self, RunDirError> {
-        let file = open(path)?;
+        let file = files::append(path).map_err(io_error("open", path))?;
         let again = |_| {
             sleep(GLANCE);
             file.try_lock()
@@ -46,9 +48,7 @@ impl Lock {
         let claim = match file.try_lock().or_else(again) {
             Ok(()) => None,
             Err(TryLockError::WouldBlock) => return Err(in_use(path)),
-            Err(TryLockError::Error(error)) if error.kind() == ErrorKind::Unsupported => {
-                Some(Claim::make(&file, path)?)
-            }
+            Err(TryLockError::Error(error)) if means_no_locks(&error) => Some(Claim::make(&file, path)?),
             Err(TryLockError::Error(error)) => return Err(io_error("lock", path)(error)),
         };
         Ok(Self { _file: file, _claim: claim })
@@ -60,17 +60,32 @@ impl Lock {
     /// # Errors
     /// [`RunDirError::InUse`] if another process has it alone.
     pub fn share(path: &Path) -> Result<Self, RunDirError> {
-        let file = open(path)?;
+        let file = files::append(path).map_err(io_error("open", path))?;
         match file.try_lock_shared() {
             Err(TryLockError::WouldBlock) => Err(in_use(path)),
             _ => Ok(Self { _file: file, _claim: None }),
         }
     }
 
+    /// Whether files have locks in a folder; tries it with a file that it removes again.
+    ///
+    /// # Errors
+    /// No file can be made there, or locks fail in another way.
+    pub fn is_possible(folder: &Path) -> io::Result<bool> {
+        let path = folder.join(format!(".lock-{:08x}", rand::random::<u32>()));
+        let locked = files::append(&path)?.try_lock();
+        fs::remove_file(&path)?;
+        match locked {
+            Err(TryLockError::Error(error)) if means_no_locks(&error) => Ok(false),
+            Err(TryLockError::Error(error)) => Err(error),
+            _ => Ok(true),
+        }
+    }
+
     /// Whether another process has the lock of the file alone. Where files have no locks, one that was killed may still seem
     /// to have it.
     pub fn is_taken(path: &Path) -> bool {
-        let Ok(file) = open_file(path) else { return false };
+        let Ok(file) = files::open(path) else { return false };
         match file.try_lock_shared() {
             Ok(()) => false,
             Err(TryLockError::WouldBlock) => true,
@@ -95,7 +110,7 @@ impl Claim {
         match File::create_new(&path).and_then(|mut file| file.write_all(host.as_bytes())) {
             Ok(()) => {}
             // By a process of this host that was killed: the socket was free.
-            Err(_) if fs::read_to_string(&path).is_ok_and(|other| other == host) => {}
+            Err(_) if files::read_text(&path).is_ok_and(|other| other == host) => {}
             Err(error) if error.kind() == ErrorKind::AlreadyExists => return Err(RunDirError::Claimed(path)),
             Err(error) => return Err(io_error("write", &path)(error)),
         }
@@ -109,8 +124,9 @@ impl Drop for Claim {
     }
 }
 
-fn open(path: &Path) -> Result<File, RunDirError> {
-    File::options().create(true).read(true).append(true).open(path).map_err(io_error("open", path))
+/// Whether a lock was refused because files have none there: the system does not know them, or asks a server that does not.
+fn means_no_locks(error: &io::Error) -> bool {
+    error.kind() == ErrorKind::Unsupported || Errno::from_io_error(error) == Some(Errno::NOLCK)
 }
 
 fn in_use(path: &Path) -> RunDirError {
@@ -119,4 +135,16 @@ fn in_use(path: &Path) -> RunDirError {
 
 fn claim_of(path: &Path) -> PathBuf {
     path.with_extension("host")
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_system_that_knows_no_locks_says_so_in_one_of_three_ways() {
+        let is_none = |error: Errno| means_no_locks(&error.into());
+        assert!([Errno::NOSYS, Errno::OPNOTSUPP, Errno::NOLCK].into_iter().all(is_none));
+        assert!(![Errno::IO, Errno::INTR, Errno::AGAIN, Errno::ACCESS].into_iter().any(is_none));
+    }
 }

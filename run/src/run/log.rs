@@ -1,16 +1,14 @@
 //! Files of JSON lines that only grow.
 
-use std::fs::{File, OpenOptions};
-use std::io::{self, Read, Seek, SeekFrom, Write};
-use std::os::unix::fs::OpenOptionsExt;
+use std::fs::File;
+use std::io::{self, Write};
 use std::path::{Path, PathBuf};
 
-use rustix::fs::OFlags;
 use serde::Serialize;
 
-use super::durable::{open_file, synchronise_folder};
 use super::error::{RunDirError, content, io_error};
 use super::lock::Lock;
+use crate::files;
 
 /// A file of JSON lines, opened for appending.
 #[derive(Debug)]
@@ -32,14 +30,11 @@ impl Log {
     /// # Errors
     /// The file cannot be opened or changed.
     pub(super) fn open(path: PathBuf, lock: Option<Lock>) -> Result<Self, RunDirError> {
-        // No link: in a folder that another user made, it may lead to any file of its reader's, which would be cut.
-        let no_link = OFlags::NOFOLLOW.bits() as i32;
-        let opened = OpenOptions::new().create(true).read(true).append(true).custom_flags(no_link).open(&path);
-        let file = opened.map_err(io_error("open", &path))?;
+        let file = files::append(&path).map_err(io_error("open", &path))?;
         let mut log = Self { path, file, length: 0, torn: true, lock };
         log.length = whole_lines(&log.bytes()?) as u64;
         // Lines that a killed process did not synchronise count from now on.
-        let durable = log.mend().and_then(|()| log.synchronise()).and_then(|()| synchronise_folder(&log.path));
+        let durable = log.mend().and_then(|()| log.synchronise()).and_then(|()| files::synchronise_folder(&log.path));
         durable.map_err(io_error("open", &log.path))?;
         Ok(log)
     }
@@ -99,26 +94,21 @@ impl Log {
     }
 
     fn bytes(&mut self) -> Result<Vec<u8>, RunDirError> {
-        let mut bytes = Vec::new();
-        let read = self.file.seek(SeekFrom::Start(0)).and_then(|_| self.file.read_to_end(&mut bytes));
-        read.map_err(io_error("read", &self.path))?;
-        Ok(bytes)
+        files::rest(&mut self.file, 0).map_err(io_error("read", &self.path))
     }
 }
 
 /// The whole lines that a file has beyond its first `read` bytes, which then count as read; none if it is not there. A file
 /// that has become shorter is read from its beginning.
 pub fn new_lines(path: &Path, read: &mut u64) -> io::Result<Vec<u8>> {
-    let mut file = match open_file(path) {
+    let mut file = match files::open(path) {
         Err(error) if error.kind() == io::ErrorKind::NotFound => return Ok(Vec::new()),
         opened => opened?,
     };
     if file.metadata()?.len() < *read {
         *read = 0;
     }
-    let mut lines = Vec::new();
-    file.seek(SeekFrom::Start(*read))?;
-    file.read_to_end(&mut lines)?;
+    let mut lines = files::rest(&mut file, *read)?;
     lines.truncate(whole_lines(&lines));
     *read += lines.len() as u64;
     Ok(lines)

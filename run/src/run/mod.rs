@@ -4,11 +4,9 @@
 //! `scores.jsonl`, the main thread everything else. Commands that only read may run at any time. A learner at work holds a
 //! lock on `scores.jsonl`.
 //!
-//! In reading order: `folder`, `find` (looks for such folders), `lines` (of its files), `lock` (keeps a second learner out), `log` (files that only grow), `checkpoints`, `durable` (files that are
-//! written whole or not at all), `error`, `resume` (continues a run), `verify` (checks a run).
+//! In reading order: `folder`, `find` (looks for such folders), `lines` (of its files), `lock` (keeps a second learner out), `log` (files that only grow), `checkpoints`, `error`, `resume` (continues a run), `verify` (checks a run).
 
 mod checkpoints;
-mod durable;
 mod error;
 mod find;
 mod folder;
@@ -21,7 +19,6 @@ mod tests;
 pub mod verify;
 
 pub use checkpoints::Checkpoint;
-pub(crate) use durable::open_file;
 pub use error::RunDirError;
 pub use find::walk;
 pub use folder::RunDir;

@@ -1,8 +1,12 @@
 //! A run folder as the learner writes it.
 
+use std::fs::File;
 use std::os::unix::fs::symlink;
+use std::process::Command;
+use std::sync::mpsc::channel;
+use std::time::Duration;
 
-use super::{RunDir, RunDirError};
+use super::{Checkpoint, RunDir, RunDirError};
 use crate::fixtures::{config, line};
 
 #[test]
@@ -119,18 +123,65 @@ fn scores_survive_a_reopened_log_and_an_unfinished_line_is_left_out() {
 #[test]
 fn no_link_is_written_through() {
     let folder = tempfile::tempdir().unwrap();
-    let [path, precious] = ["a", "precious"].map(|name| folder.path().join(name));
+    let [path, precious, missing] = ["a", "precious", "missing"].map(|name| folder.path().join(name));
     std::fs::write(&precious, "no line of a log").unwrap();
     let (run, log) = RunDir::create(&path, &config("a", 0)).unwrap();
     drop(log);
-    for name in ["endpoints.json.partial", "metrics.jsonl", "scores.jsonl"] {
+    for name in ["endpoints.json.partial", "metrics.jsonl", "scores.jsonl", "failed", "judgements.json"] {
         std::fs::remove_file(path.join(name)).ok();
         symlink(&precious, path.join(name)).unwrap();
     }
     assert!(run.score_log().is_err() && run.metrics_log(0).is_err());
-    run.remove_partial_files();
     run.write_json("endpoints.json", &1).unwrap();
+    run.write_json("judgements.json", &1).unwrap();
+    run.mark_failed(true).unwrap();
+    run.remove_partial_files();
     assert_eq!(std::fs::read_to_string(precious).unwrap(), "no line of a log");
+    assert_eq!(run.read_json::<u8>("judgements.json").unwrap(), 1);
+
+    std::fs::remove_file(path.join("scores.jsonl")).unwrap();
+    symlink(&missing, path.join("scores.jsonl")).unwrap();
+    assert!(run.score_log().is_err() && !missing.exists(), "not even a lock makes the file that a link names");
+}
+
+/// Snapshots of another run would be overwritten, and half files of other programs removed.
+#[test]
+fn no_folder_is_written_to_through_a_link() {
+    let folder = tempfile::tempdir().unwrap();
+    let [path, other] = ["a", "other"].map(|name| folder.path().join(name));
+    let (run, _log) = RunDir::create(&path, &config("a", 0)).unwrap();
+    std::fs::create_dir(&other).unwrap();
+    std::fs::write(other.join("step_000000010.safetensors"), "precious").unwrap();
+    std::fs::write(other.join("download.partial"), "precious").unwrap();
+    std::fs::remove_dir(path.join("snapshots")).unwrap();
+    symlink(&other, path.join("snapshots")).unwrap();
+    run.remove_partial_files();
+    assert!(run.write_snapshot(10, b"weights").is_err() && other.join("download.partial").exists());
+    assert_eq!(std::fs::read_to_string(other.join("step_000000010.safetensors")).unwrap(), "precious");
+}
+
+/// A pipe that no program writes to, and a file that seems to have more bytes than any memory.
+#[test]
+fn what_is_no_file_of_a_learners_is_not_waited_for_and_not_read() {
+    let folder = tempfile::tempdir().unwrap();
+    let (run, _log) = RunDir::create(&folder.path().join("a"), &config("a", 0)).unwrap();
+    run.write_checkpoint(&Checkpoint { step: 10, state: b"state".to_vec() }).unwrap();
+    let checkpoint = run.path().join("checkpoints/step_000000020_0000000000000000.safetensors");
+    for path in [&checkpoint, &run.snapshot_path(20)] {
+        assert!(Command::new("mkfifo").arg(path).status().unwrap().success());
+    }
+    File::create(run.snapshot_path(30)).unwrap().set_len(1 << 42).unwrap();
+    symlink(run.snapshot_path(30), run.snapshot_path(40)).unwrap();
+    assert_eq!(run.snapshots().unwrap(), [30], "a pipe and a link are no snapshots");
+    let (tell, told) = channel();
+    let reader = run.clone();
+    std::thread::spawn(move || {
+        let refused = [20, 30].map(|step| anyhow::Error::from(reader.read_snapshot(step).unwrap_err()));
+        tell.send((refused.map(|error| format!("{error:#}")), reader.newest_checkpoint()))
+    });
+    let ([pipe, huge], newest) = told.recv_timeout(Duration::from_secs(60)).expect("it waits for a pipe");
+    assert!(pipe.contains("a pipe") && huge.contains("too large"), "{pipe}, {huge}");
+    assert_eq!(newest.unwrap().map(|checkpoint| checkpoint.step), Some(10));
 }
 
 /// A user who tidies up while a learner is at work.

@@ -1,13 +1,14 @@
 //! How far a run is, by its folder alone.
 
 use std::fmt;
-use std::io::{self, Read, Seek, SeekFrom};
+use std::io;
 use std::path::Path;
 
 use serde::Deserialize;
 
+use crate::files;
 use crate::results::RunReport;
-use crate::run::{RunDir, RunDirError, open_file};
+use crate::run::{RunDir, RunDirError};
 
 /// The last two lines of `metrics.jsonl` are in its last bytes, so many.
 const TAIL: u64 = 8192;
@@ -109,12 +110,9 @@ struct Row {
 /// The last lines of `metrics.jsonl`; those that are half written or half read are none.
 fn rows(dir: &Path) -> Vec<Row> {
     let read = || -> io::Result<Vec<u8>> {
-        let mut file = open_file(&dir.join("metrics.jsonl"))?;
+        let mut file = files::open(&dir.join("metrics.jsonl"))?;
         let length = file.metadata()?.len();
-        file.seek(SeekFrom::Start(length.saturating_sub(TAIL)))?;
-        let mut bytes = Vec::new();
-        file.read_to_end(&mut bytes)?;
-        Ok(bytes)
+        files::rest(&mut file, length.saturating_sub(TAIL))
     };
     let bytes = read().unwrap_or_default();
     bytes.split(|byte| *byte == b'\n').filter_map(|line| serde_json::from_slice(line).ok()).collect()

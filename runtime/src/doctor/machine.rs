@@ -1,6 +1,6 @@
 //! Processor cores, and folders that a program writes to.
 
-use std::fs::{self, OpenOptions};
+use std::fs::{self, File};
 use std::io::{self, Write};
 use std::path::{Path, absolute};
 use std::time::{Duration, Instant};
@@ -68,7 +68,7 @@ pub fn folder(findings: &mut Findings, check: &str, path: &Path, elsewhere: &str
 fn write_trial(folder: &Path) -> io::Result<(u64, Duration)> {
     let path = folder.join(format!(".doctor-{}", std::process::id()));
     let begin = Instant::now();
-    let mut file = OpenOptions::new().write(true).create_new(true).open(&path)?;
+    let mut file = File::create_new(&path)?;
     let written = file.write_all(&vec![0; TRIAL]).and_then(|()| file.sync_all());
     let took = begin.elapsed();
     fs::remove_file(&path)?;

@@ -6,7 +6,7 @@ use std::process::{Command, Output};
 use quad_protocol::keys;
 use quad_tests::certificates::Certificates;
 use quad_tests::made_up::name;
-use quad_tests::process::binary;
+use quad_tests::process::{binary, preload};
 use quad_tests::router::router;
 use quad_tests::setting::IDLE;
 use quad_tests::small_disk::SmallDisk;
@@ -101,6 +101,20 @@ fn folders_that_cannot_be_written_to() {
     disk.fill();
     let (text, _) = findings(&doctor("learner", &["--run-dir", scratch.path().join("disk/run").to_str().unwrap()]));
     assert_found(&text, "FAIL", "run folder", &["No space left", "hint: make room"]);
+}
+
+#[test]
+fn folders_where_files_have_no_locks() {
+    let scratch = Scratch::new();
+    let [launcher, preloaded] = <[String; 2]>::try_from(preload("no_locks")).unwrap();
+    let mut command = Command::new(launcher);
+    command.arg(preloaded).arg(binary("learner")).args(["doctor", "--run-dir"]).arg(scratch.path().join("run"));
+    let (text, _) = findings(&command.output().unwrap());
+    assert_found(&text, "warn", "locks", &["have no locks in", "hint: ", "scores.host"]);
+    let (text, _) = findings(&doctor("learner", &["--run-dir", scratch.path().to_str().unwrap()]));
+    assert_found(&text, "ok", "locks", &[]);
+    let left = std::fs::read_dir(scratch.path()).unwrap().map(|entry| entry.unwrap().file_name());
+    assert_eq!(left.collect::<Vec<_>>(), ["tiny.hdf5"], "the doctor leaves no file");
 }
 
 /// What may be wrong with certificates is tested where programs refuse them.

@@ -1,15 +1,14 @@
 //! Writes pictures to a file: an animation, a video or a strip.
 
 use std::ffi::OsStr;
-use std::fs::{self, File};
-use std::io::{BufWriter, Write};
+use std::io::Write;
 use std::iter::once;
-use std::path::Path;
 use std::process::{Command, Stdio};
 
 use anyhow::{Context, bail};
 use color_quant::NeuQuant;
 use gif::{Encoder, Frame, Repeat};
+use quad_run::files;
 use quad_runtime::Hint;
 
 use super::output::{Format, Output};
@@ -20,7 +19,7 @@ const COLOURS: usize = 64;
 /// Sampling of the first picture to choose colours: 1 is all of it, 10 a tenth.
 const SAMPLE: i32 = 10;
 
-/// Writes pictures, each shown for `seconds`. The file is `<path>.partial` until it is whole.
+/// Writes pictures, each shown for `seconds`. The file has its name when it is whole.
 ///
 /// # Errors
 /// A picture cannot be drawn, or the file cannot be written: then a file that was there stays.
@@ -29,62 +28,56 @@ pub fn write(
     seconds: f64,
     pictures: impl Iterator<Item = anyhow::Result<Picture>>,
 ) -> anyhow::Result<()> {
-    let (path, partial) = (&output.path, output.path.with_added_extension("partial"));
     let mut undrawn = Ok(());
     let drawn = pictures.map_while(|picture| picture.map_err(|error| undrawn = Err(error)).ok());
-    let written = match output.format {
-        Format::Gif => animation(&partial, seconds, drawn),
-        Format::Mp4 => video(&partial, seconds, drawn),
-        Format::Png => strip(&partial, drawn),
+    let film = match output.format {
+        Format::Gif => animation(seconds, drawn),
+        Format::Mp4 => video(seconds, drawn),
+        Format::Png => strip(drawn),
     };
-    let named = undrawn.and_then(|()| {
-        written
-            .and_then(|()| Ok(fs::rename(&partial, path)?))
-            .with_context(|| format!("cannot write {}", path.display()))
-            .hint("--out names a file in a folder that you may write in and that has room")
-    });
-    if named.is_err() {
-        fs::remove_file(&partial).ok();
-    }
-    named
+    undrawn?;
+    film.and_then(|film| Ok(files::replace(&output.path, &film)?))
+        .with_context(|| format!("cannot write {}", output.path.display()))
+        .hint("--out names a file in a folder that you may write in and that has room")
 }
 
-fn strip(path: &Path, pictures: impl Iterator<Item = Picture>) -> anyhow::Result<()> {
+fn strip(pictures: impl Iterator<Item = Picture>) -> anyhow::Result<Vec<u8>> {
     let pictures: Vec<_> = pictures.collect();
     if pictures.is_empty() {
         bail!("there is no picture");
     }
     let strip = Picture::strip(&pictures);
-    let file = BufWriter::new(File::create(path)?);
-    let mut encoder = png::Encoder::new(file, strip.width as u32, strip.height() as u32);
+    let mut file = Vec::new();
+    let mut encoder = png::Encoder::new(&mut file, strip.width as u32, strip.height() as u32);
     encoder.set_color(png::ColorType::Rgb);
     encoder.set_compression(png::Compression::High);
     let mut writer = encoder.write_header()?;
     writer.write_image_data(&strip.rgb)?;
-    Ok(writer.finish()?)
+    writer.finish()?;
+    Ok(file)
 }
 
 /// All pictures have the colours of the first: with a palette for each picture, the floor would flicker.
-fn animation(path: &Path, seconds: f64, mut pictures: impl Iterator<Item = Picture>) -> anyhow::Result<()> {
+fn animation(seconds: f64, mut pictures: impl Iterator<Item = Picture>) -> anyhow::Result<Vec<u8>> {
     let first = pictures.next().context("there is no picture")?;
     let (width, height) = (first.width as u16, first.height() as u16);
     let rgba: Vec<u8> = first.rgb.chunks_exact(3).flat_map(|rgb| [rgb[0], rgb[1], rgb[2], 255]).collect();
     let colours = NeuQuant::new(SAMPLE, COLOURS, &rgba);
     let nearest = |rgb: &[u8]| colours.index_of(&[rgb[0], rgb[1], rgb[2], 255]) as u8;
-    let file = BufWriter::new(File::create(path)?);
-    let mut encoder = Encoder::new(file, width, height, &colours.color_map_rgb())?;
+    let mut encoder = Encoder::new(Vec::new(), width, height, &colours.color_map_rgb())?;
     encoder.set_repeat(Repeat::Infinite)?;
     for picture in once(first).chain(pictures) {
         let pixels: Vec<u8> = picture.rgb.chunks_exact(3).map(nearest).collect();
         let frame = Frame::from_indexed_pixels(width, height, pixels, None);
         encoder.write_frame(&Frame { delay: (100.0 * seconds).round() as u16, ..frame })?;
     }
-    encoder.into_inner()?.flush()?;
-    Ok(())
+    Ok(encoder.into_inner()?)
 }
 
-fn video(path: &Path, seconds: f64, mut pictures: impl Iterator<Item = Picture>) -> anyhow::Result<()> {
+fn video(seconds: f64, mut pictures: impl Iterator<Item = Picture>) -> anyhow::Result<Vec<u8>> {
     let first = pictures.next().context("there is no picture")?;
+    let folder = tempfile::tempdir()?;
+    let path = folder.path().join("film.mp4");
     let size = format!("{}x{}", first.width, first.height());
     let mut ffmpeg = Command::new("ffmpeg")
         .args(["-loglevel", "error", "-nostdin", "-y", "-f", "rawvideo", "-pixel_format", "rgb24"])
@@ -108,17 +101,32 @@ fn video(path: &Path, seconds: f64, mut pictures: impl Iterator<Item = Picture>)
     if !status.success() {
         bail!("ffmpeg ended with {status}");
     }
-    Ok(())
+    Ok(files::read(&path)?)
 }
 
 #[cfg(test)]
 mod tests {
+    use std::fs;
+
     use super::*;
 
     /// Pictures of one colour each, of which the one with number `broken` cannot be drawn.
     fn pictures(broken: u8) -> impl Iterator<Item = anyhow::Result<Picture>> {
         let picture = |colour| Picture { width: 64, rgb: vec![colour; 3 * 64 * 48] };
         (0..9).map(move |number| if number == broken { bail!("no light") } else { Ok(picture(20 * number)) })
+    }
+
+    #[test]
+    fn no_link_beside_a_film_is_written_through() {
+        let folder = tempfile::tempdir().unwrap();
+        let precious = folder.path().join("precious");
+        fs::write(&precious, "precious").unwrap();
+        for (name, format) in [("film.gif", Format::Gif), ("film.png", Format::Png)] {
+            let output = Output { path: folder.path().join(name), format };
+            std::os::unix::fs::symlink(&precious, output.path.with_added_extension("partial")).unwrap();
+            write(&output, 0.04, pictures(9)).unwrap();
+            assert!(fs::read_to_string(&precious).unwrap() == "precious" && !output.path.is_symlink(), "{name}");
+        }
     }
 
     #[test]

@@ -1,6 +1,5 @@
 //! A saved policy, and the episodes to score it on.
 
-use std::fs;
 use std::path::{Path, PathBuf};
 
 use anyhow::{Context, anyhow};
@@ -8,6 +7,7 @@ use quad_dataset::EnvironmentSpec;
 use quad_dataset::environment;
 use quad_policy::{Choice, Header, Policy, load_policy};
 use quad_protocol::{Hash, Origin};
+use quad_run::files;
 use quad_runtime::Hint;
 
 use super::args::{MOST_EPISODES, ScoreArgs};
@@ -46,7 +46,7 @@ impl Subject {
     /// The file is no policy, or the policy cannot act in the environment or cannot choose in this way.
     pub fn read(path: &Path, args: &ScoreArgs) -> anyhow::Result<Vec<Self>> {
         let name = path.display();
-        let file = fs::read(path).with_context(|| format!("cannot read {name}")).hint(ONE)?;
+        let file = files::read_named(path).with_context(|| format!("cannot read {name}")).hint(ONE)?;
         let policy = load_policy(&file, args.precision);
         let policy = policy.with_context(|| format!("{name} is not a saved policy")).hint(ONE)?;
         let header = Header::read(&file).with_context(|| format!("{name} is not a snapshot of a run")).hint(ONE)?;

@@ -1,0 +1,135 @@
+//! Tests of `files.rs`, and of all code that could do without it.
+
+use std::fs::read_dir;
+use std::path::PathBuf;
+
+use super::*;
+
+/// What opens or makes a file, but for `File::create_new`, which follows no link and opens nothing that is there.
+const CALLS: [&str; 8] = [
+    "File::create",
+    "File::open",
+    "File::options",
+    "OpenOptions",
+    "fs::copy",
+    "fs::read",
+    "fs::read_to_string",
+    "fs::write",
+];
+/// The sources of what works in run folders.
+const SOURCES: [&str; 7] = ["algorithms", "dataset", "evaluator", "learner", "python", "run", "runtime"];
+/// Where else there are such calls, what is in such a line, and why.
+const ALLOWED: [(&str, &str, &str); 13] = [
+    ("", "\"/proc/", "the system's own"),
+    ("run/src/run/lock.rs", "fs::read_to_string(HOST)", "the system's own"),
+    ("runtime/src/metrics_server.rs", "fs::read_to_string(path)", "the system's own, by their names"),
+    ("run/src/files.rs", "OpenOptions", "the one way"),
+    ("run/src/files.rs", "File::open(folder)", "a folder, to synchronise it"),
+    ("run/src/config/presets.rs", "fs::read_to_string(preset)", "the user names it; it may be a pipe of a shell"),
+    ("learner/src/sweep/study.rs", "fs::read_to_string(path)", "the user names it; it may be a pipe of a shell"),
+    ("dataset/src/hdf5_file.rs", "File::open(path)", "data that the user names"),
+    ("dataset/src/npz_file.rs", "File::open(path)", "data that the user names"),
+    ("dataset/src/formats/mod.rs", "File::open(", "data that the user names"),
+    ("dataset/src/formats/minari.rs", "fs::read(&path)", "data that the user names"),
+    ("dataset/src/foreign.rs", "fs::read(folder", "data that the user names"),
+    ("dataset/src/new_file.rs", "File::open(&partial)", "what it has just made"),
+];
+
+/// The lines of a source that call something of [`CALLS`]: without comments, and up to its tests.
+fn calls(source: &str) -> Vec<&str> {
+    let is_call = |line: &&str| {
+        let is_part = |c: char| c.is_alphanumeric() || c == '_';
+        let whole =
+            |at: usize, call: &str| !line[..at].ends_with(is_part) && !line[at + call.len()..].starts_with(is_part);
+        CALLS.iter().any(|call| line.match_indices(call).any(|(at, _)| whole(at, call)))
+    };
+    let (code, _) = source.split_once("\nmod tests {").unwrap_or((source, ""));
+    let is_code = |line: &&str| !line.starts_with("//") && !line.starts_with("use ");
+    code.lines().map(str::trim).filter(is_code).filter(is_call).collect()
+}
+
+/// The files of programs below a folder.
+fn sources(folder: &Path, found: &mut Vec<PathBuf>) {
+    for entry in read_dir(folder).unwrap().flatten() {
+        let (path, name) = (entry.path(), entry.file_name().into_string().unwrap());
+        match path.is_dir() {
+            true if name != "tests" => sources(&path, found),
+            false if name.ends_with(".rs") && !["tests.rs", "fixtures.rs"].contains(&&*name) => found.push(path),
+            _ => {}
+        }
+    }
+}
+
+#[test]
+fn no_program_opens_or_makes_a_file_in_another_way() {
+    let root = Path::new(env!("CARGO_MANIFEST_DIR")).parent().unwrap();
+    let (mut paths, mut used) = (Vec::new(), [false; ALLOWED.len()]);
+    SOURCES.iter().for_each(|name| sources(&root.join(name).join("src"), &mut paths));
+    assert!(paths.len() > 200, "the sources are elsewhere");
+    for path in paths {
+        let (source, name) = (fs::read_to_string(&path).unwrap(), path.strip_prefix(root).unwrap().to_owned());
+        for line in calls(&source) {
+            let is_allowed = |(file, part, _): &(&str, &str, &str)| name.starts_with(file) && line.contains(part);
+            let allowed = ALLOWED.iter().position(is_allowed);
+            let place = allowed.unwrap_or_else(|| {
+                panic!("{}: {line}\nA file in a run's folder is opened and made by quad_run::files.", name.display())
+            });
+            used[place] = true;
+        }
+    }
+    let unused = ALLOWED.iter().zip(used).filter(|(_, used)| !used).map(|(allowed, _)| allowed);
+    assert_eq!(unused.collect::<Vec<_>>(), [] as [&(&str, &str, &str); 0], "these are allowed and not there");
+}
+
+#[test]
+fn each_way_to_open_a_file_is_found() {
+    for call in CALLS {
+        for line in [format!("let x = std::{call}(path)?;"), format!("paths.map({call})")] {
+            assert_eq!(calls(&line), [line.as_str()]);
+        }
+    }
+    for line in ["fs::read_dir(path)", "// fs::read(path)", "#[cfg(test)]\nmod tests {\n    fs::write(path, text)\n}"] {
+        assert_eq!(calls(line), [] as [&str; 0]);
+    }
+}
+
+#[test]
+fn a_path_that_the_user_names_may_be_a_link_but_no_pipe() {
+    let folder = tempfile::tempdir().unwrap();
+    let [file, link, zero] = ["file", "link", "zero"].map(|name| folder.path().join(name));
+    replace(&file, b"text").unwrap();
+    std::os::unix::fs::symlink(&file, &link).unwrap();
+    std::os::unix::fs::symlink("/dev/zero", &zero).unwrap();
+    assert_eq!(read_named(&link).unwrap(), b"text");
+    for refused in [read(&link), read(&zero), read_named(&zero), read(folder.path()), append(&link).map(|_| Vec::new())]
+    {
+        assert!(refused.unwrap_err().to_string().starts_with("it is a link, a pipe"));
+    }
+    assert_eq!(read(&folder.path().join("none")).unwrap_err().kind(), ErrorKind::NotFound);
+}
+
+#[test]
+fn a_file_is_replaced_whole_or_not_at_all_and_nothing_is_left_beside_it() {
+    let folder = tempfile::tempdir().unwrap();
+    let [file, taken] = ["file", "taken"].map(|name| folder.path().join(name));
+    replace(&file, b"old").unwrap();
+    replace(&file, b"new").unwrap();
+    fs::create_dir(&taken).unwrap();
+    assert!(replace(&taken, b"new").is_err());
+    assert_eq!(read_text(&file).unwrap(), "new");
+    assert_eq!(fs::read_dir(folder.path()).unwrap().count(), 2);
+}
+
+#[test]
+fn what_follows_a_byte_is_read_and_no_more_than_memory_holds() {
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("log");
+    append(&path).unwrap().write_all(b"first, second").unwrap();
+    append(&path).unwrap().write_all(b", third").unwrap();
+    let mut file = open(&path).unwrap();
+    assert_eq!(rest(&mut file, 7).unwrap(), b"second, third");
+    assert_eq!(rest(&mut file, 99).unwrap(), b"");
+    append(&path).unwrap().set_len(LARGEST + 8).unwrap();
+    assert_eq!(rest(&mut file, 7).unwrap_err().kind(), ErrorKind::FileTooLarge);
+    assert_eq!(rest(&mut file, LARGEST).unwrap(), [0; 8]);
+}
