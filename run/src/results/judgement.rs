@@ -6,16 +6,20 @@ use std::path::PathBuf;
 use serde::{Deserialize, Serialize};
 
 use super::spread::Spread;
-use crate::run::{RunDir, RunDirError};
+use crate::run::{Lock, RunDir, RunDirError};
 use crate::table::{Part, Table};
 
 const FILE: &str = "judgements.json";
+const LOCK: &str = "judgements.lock";
 
 /// How judgements were made: those that were made alike can be compared.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct Conditions {
     /// SHA-256 of the data.
     pub dataset: String,
+    /// The environment, whose task the rewards may be of; empty where an earlier learner did not say.
+    #[serde(default)]
+    pub environment: String,
     /// Numbers of the episodes in whose first states policies are judged, from 0 in the order of the file.
     pub episodes: Vec<usize>,
     /// Discount γ of the values.
@@ -68,7 +72,7 @@ pub struct Judgement {
 }
 
 impl Judgement {
-    /// The judgements of a run's snapshots that its folder has.
+    /// The judgements of a run's snapshots that its folder has, but for those that may be of another task's rewards.
     ///
     /// # Errors
     /// The file cannot be read, or is not what `learner judge` writes.
@@ -77,15 +81,23 @@ impl Judgement {
             return Ok(Vec::new());
         }
         let mut judgements: Vec<Self> = folder.read_json(FILE)?;
+        judgements.retain(|judgement| !judgement.conditions.environment.is_empty());
         judgements.iter_mut().for_each(|judgement| judgement.run = folder.path().to_owned());
         Ok(judgements)
     }
 
-    /// Keeps it in the folder, in the place of an earlier one of the same step.
+    /// Keeps it in the folder, in the place of an earlier one of the same step. Waits for another process that is doing so.
     ///
     /// # Errors
     /// Those of [`Self::read_all`], or the file cannot be written.
     pub fn keep(&self, folder: &RunDir) -> Result<(), RunDirError> {
+        let path = folder.path().join(LOCK);
+        let _lock = loop {
+            match Lock::take(&path) {
+                Err(RunDirError::InUse(_)) => {}
+                taken => break taken?,
+            }
+        };
         let mut judgements = Self::read_all(folder)?;
         judgements.retain(|earlier| earlier.step != self.step);
         judgements.push(self.clone());
@@ -135,7 +147,7 @@ impl Ranking {
 
     /// As words and a table.
     pub fn parts(&self) -> [Part; 2] {
-        let Self { conditions: Conditions { episodes, gamma, steps, seeds, .. }, policies, .. } = self;
+        let Self { conditions: Conditions { environment, episodes, gamma, steps, seeds, .. }, policies, .. } = self;
         let columns = [("rank", Right), ("policy", Left), ("value", Right), ("distance", Right), ("doubts", Left)];
         let mut table = Table::new(&columns);
         let value = |of: &Estimate| of.spread().map_or_else(|| "-".to_owned(), Spread::text);
@@ -157,8 +169,8 @@ impl Ranking {
         let recorded = ["-", "behaviour, as recorded", &format!("{:.2}", self.recorded), "", ""];
         table.push(recorded.map(str::to_owned));
         let words = format!(
-            "Judged without a simulator: a ranking, not a score.\n{}\nValues are discounted returns (γ = {gamma}) from the first \
-             states of {} episodes on, estimated by fitted Q evaluation ({steps} steps), ± standard deviation over {seeds} seeds. \
+            "Judged without a simulator: a ranking, not a score.\n{}\nValues are discounted returns (γ = {gamma}) in {environment} \
+             from the first states of {} episodes on, estimated by fitted Q evaluation ({steps} steps), ± standard deviation over {seeds} seeds. \
              Distance: of the policy's actions from the data's, in standard deviations of the data's.\n",
             self.verdict,
             episodes.len(),
@@ -202,7 +214,7 @@ mod tests {
 
     fn judgement(run: &str, values: &[f64], behavior: f64) -> Judgement {
         let conditions =
-            Conditions { dataset: "abc".to_owned(), episodes: vec![3, 5], gamma: 0.99, steps: 100, seeds: 2 };
+            Conditions { dataset: "abc".to_owned(), environment: "arm".to_owned(), episodes: vec![3, 5], gamma: 0.99, steps: 100, seeds: 2 };
         Judgement {
             run: run.into(),
             step: 20,
@@ -250,8 +262,41 @@ mod tests {
 
     #[test]
     fn judgements_of_other_conditions_are_apart() {
-        let mut other = judgement("other", &[1.0], 10.0);
-        other.conditions.gamma = 0.9;
-        assert_eq!(Ranking::of([judgement("a", &[1.0], 10.0), other, judgement("b", &[2.0], 10.0)]).len(), 2);
+        let mut others = [judgement("other", &[1.0], 10.0), judgement("other", &[1.0], 10.0)];
+        others[0].conditions.gamma = 0.9;
+        others[1].conditions.environment = "another arm".to_owned();
+        for other in others {
+            assert_eq!(Ranking::of([judgement("a", &[1.0], 10.0), other, judgement("b", &[2.0], 10.0)]).len(), 2);
+        }
+    }
+
+    #[test]
+    fn judges_at_work_at_a_time_lose_no_judgement() {
+        let folder = tempfile::tempdir().unwrap();
+        let run = RunDir::at(folder.path());
+        std::thread::scope(|scope| {
+            for judge in 0..4 {
+                let run = &run;
+                scope.spawn(move || {
+                    for step in 0..5 {
+                        let mut one = judgement("a", &[1.0], 10.0);
+                        one.step = 5 * judge + step;
+                        one.keep(run).unwrap();
+                    }
+                });
+            }
+        });
+        let kept = Judgement::read_all(&run).unwrap();
+        assert_eq!(Vec::from_iter(kept.iter().map(|one| one.step)), Vec::from_iter(0..20));
+    }
+
+    #[test]
+    fn judgements_that_do_not_say_of_which_environment_they_are_do_not_count() {
+        let folder = tempfile::tempdir().unwrap();
+        let run = RunDir::at(folder.path());
+        let mut written = serde_json::to_value([judgement("a", &[1.0], 10.0)]).unwrap();
+        written[0]["conditions"].as_object_mut().unwrap().remove("environment");
+        run.write_json(FILE, &written).unwrap();
+        assert_eq!(Judgement::read_all(&run).unwrap(), []);
     }
 }
