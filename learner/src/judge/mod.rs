@@ -108,8 +108,8 @@ fn judge_all(
 
 /// Says how long it will take, by the time that a little of it takes.
 fn forecast(evaluation: &Evaluation<'_>, subjects: &[&Subject]) -> anyhow::Result<()> {
-    let acting =
-        subjects.iter().map(|subject| Actions::time(&*subject.policy, evaluation.data)).sum::<anyhow::Result<Duration>>()?;
+    let asking = subjects.iter().map(|subject| Actions::time(&*subject.policy, evaluation.data));
+    let acting = asking.sum::<anyhow::Result<Duration>>()?;
     let evaluating = evaluation.time()? * (subjects.len() as u32 + 1);
     let minutes = |time: Duration| format!("{:.1}", time.as_secs_f64() / 60.0);
     let (all, acting) = (minutes(acting + evaluating), minutes(acting));

@@ -213,8 +213,14 @@ mod tests {
     }
 
     fn judgement(run: &str, values: &[f64], behavior: f64) -> Judgement {
-        let conditions =
-            Conditions { dataset: "abc".to_owned(), environment: "arm".to_owned(), episodes: vec![3, 5], gamma: 0.99, steps: 100, seeds: 2 };
+        let conditions = Conditions {
+            dataset: "abc".to_owned(),
+            environment: "arm".to_owned(),
+            episodes: vec![3, 5],
+            gamma: 0.99,
+            steps: 100,
+            seeds: 2,
+        };
         Judgement {
             run: run.into(),
             step: 20,
