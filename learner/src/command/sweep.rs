@@ -109,7 +109,7 @@ fn work(args: &SweepArgs, study: &str, folder: &Path, left: Runs) -> anyhow::Res
     let mut datasets = BTreeMap::<Option<String>, Option<PathBuf>>::new();
     for (run, _) in &left {
         datasets.entry(run.experiment.dataset.clone()).or_insert_with(|| {
-            let refused = |error| warn!("{} and other runs on its data cannot begin: {error:#}", run.name);
+            let refused = |error| warn!("no run on the data of {} can begin: {error:#}", run.name);
             run.source.obtain().map_err(refused).map(|dataset| dataset.path).ok()
         });
     }
