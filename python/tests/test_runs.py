@@ -36,10 +36,10 @@ def test_a_damaged_run_is_named_and_hides_no_other(data, tmp_path):
     for name in ("damaged", "whole"):
         train(tmp_path / name, data, "--task", "own-data", "--steps", "1")
     (tmp_path / "damaged" / "scores.jsonl").write_text('{"step": 10}\n')
-    (tmp_path / "odd" / "config.toml").mkdir(parents=True)
     with pytest.warns(UserWarning, match="damaged cannot be read: .*scores.jsonl, line 1, is not what a learner writes"):
         found = runs(tmp_path / "*")
     assert [row["run"] for row in found] == ["whole"]
+    (tmp_path / "odd" / "config.toml").mkdir(parents=True)
     with pytest.warns(UserWarning, match="odd cannot be read"):
         assert runs(tmp_path / "odd") == []
     with pytest.raises(RuntimeError, match="scores.jsonl, line 1"):
