@@ -7,9 +7,10 @@ from pathlib import Path
 
 import numpy as np
 import pandas as pd
+import pytest
 
 from conftest import train
-from quad_rl import runs
+from quad_rl import Run, runs
 
 
 def test_runs_are_a_table(hopper_runs, data, tmp_path):
@@ -29,6 +30,20 @@ def test_runs_are_a_table(hopper_runs, data, tmp_path):
     assert [(row["run"], row["step"]) for row in unscored] == [("unscored", None), ("seed1", 10), ("seed1", 20)]
     assert set(unscored[0]) >= {"score", "score_std", "return", "length", "complete", "mean_last_3", "agent"}
     assert runs(tmp_path / "nothing*") == []
+
+
+def test_a_damaged_run_is_named_and_hides_no_other(data, tmp_path):
+    for name in ("damaged", "whole"):
+        train(tmp_path / name, data, "--task", "own-data", "--steps", "1")
+    (tmp_path / "damaged" / "scores.jsonl").write_text('{"step": 10}\n')
+    with pytest.warns(UserWarning, match="damaged cannot be read: .*scores.jsonl, line 1, is not what a learner writes"):
+        found = runs(tmp_path / "*")
+    assert [row["run"] for row in found] == ["whole"]
+    (tmp_path / "odd" / "config.toml").mkdir(parents=True)
+    with pytest.warns(UserWarning, match="odd cannot be read"):
+        assert runs(tmp_path / "odd") == []
+    with pytest.raises(RuntimeError, match="scores.jsonl, line 1"):
+        Run(tmp_path / "damaged").scores
 
 
 SAMPLE = """

@@ -128,7 +128,7 @@ pub struct VerifyArgs {
     /// Folders of complete runs
     #[arg(value_name = "DIR", required = true)]
     pub dirs: Vec<PathBuf>,
-    /// Folder of another run of the same configuration: it must have each score of DIR, bit for bit and of the same weights
+    /// Folder of another run of the same configuration: it must have each score and each snapshot of DIR, bit for bit
     #[arg(long, value_name = "DIR")]
     pub same_as: Option<PathBuf>,
 }

@@ -2,7 +2,7 @@
 
 use anyhow::{Context, anyhow};
 use quad_policy::{Header, PolicyError, read_tensors};
-use quad_protocol::Origin;
+use quad_protocol::{Hash, Origin};
 use quad_run::files;
 use quad_run::results::RunReport;
 use quad_run::run::RunDir;
@@ -18,7 +18,7 @@ use crate::data::Source;
 /// # Errors
 /// The run or its snapshot cannot be read, or the file cannot be written.
 pub fn export(args: &ExportArgs) -> anyhow::Result<()> {
-    let report = RunReport::scored(&args.run)?;
+    let (mut report, lines) = RunReport::with_scores(&args.run)?;
     let folder = RunDir::at(&args.run);
     let steps = folder.snapshots()?;
     let (step, what) = match args.step {
@@ -35,6 +35,12 @@ pub fn export(args: &ExportArgs) -> anyhow::Result<()> {
     let read = || Ok((Header::<Origin>::read(&file)?, read_tensors(&file)?));
     let (header, tensors) = read()
         .map_err(|error: PolicyError| anyhow!("{} is not a policy: {error}", folder.snapshot_path(step).display()))?;
+    let weights = Hash::of(&file).to_string();
+    if lines.iter().any(|line| line.step == step && line.weights != weights) {
+        warn!("the file has no score: that of step {step} is of other weights (learner verify {})", args.run.display());
+        report.evaluations.retain(|evaluation| evaluation.step != step);
+    }
+    report.judgements.retain(|judgement| judgement.weights == weights);
     let about = about(&report, step, args.license.as_deref());
     let exported = Header { about, ..header }.to_safetensors(&tensors)?;
     let name = args.out.display();
@@ -52,6 +58,9 @@ fn about(report: &RunReport, step: u64, license: Option<&str>) -> Value {
         warn!("the file does not say which licence the data has; --license says it");
     }
     let score = report.evaluations.iter().find(|evaluation| evaluation.step == step);
+    if let Some(part) = score.filter(|score| !score.complete) {
+        warn!("the score is of {} of {} episodes, which the file says, too", part.episodes, experiment.episodes);
+    }
     json!({
         "run": report.run,
         "task": report.task,

@@ -137,7 +137,7 @@ fn check_runs(args: &VerifyArgs) -> anyhow::Result<()> {
         let about = if args.dirs.len() > 1 { format!("{}: ", dir.display()) } else { String::new() };
         let mut findings = vec![(about, verify::verify(dir)?)];
         if let Some(other) = &args.same_as {
-            findings.push((format!("with {}: ", other.display()), verify::compare(dir, other)?));
+            findings.extend(verify::compare(dir, other)?.map(|found| (format!("with {}: ", other.display()), found)));
         }
         for (about, found) in &findings {
             print(&format!("{about}{found}"))?;

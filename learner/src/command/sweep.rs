@@ -11,10 +11,9 @@ use quad_run::run::{Lock, RunDirError};
 use quad_run::status::State;
 use quad_run::table::{Style, Table};
 use quad_runtime::{Hint, SessionError, hinted, open_router, print, stay_in_background, threads_asked, unfinished};
-use tracing::info;
+use tracing::{info, warn};
 
 use super::all_readable;
-use super::train::record_hint;
 use crate::cli::SweepArgs;
 use crate::local_evaluators::LocalEvaluators;
 use crate::sweep::{Cost, Ended, Learners, PlannedRun, Study, Sweep};
@@ -107,17 +106,17 @@ fn shares(cores: usize, threads: usize, jobs: Option<u16>, runs: usize) -> (usiz
 fn work(args: &SweepArgs, study: &str, folder: &Path, left: Runs) -> anyhow::Result<Ended> {
     let Machine { jobs, threads, mut evaluators } = Machine::share(args, left.len())?;
     // Here once, not in each learner.
-    let mut datasets = BTreeMap::<Option<String>, PathBuf>::new();
+    let mut datasets = BTreeMap::<Option<String>, Option<PathBuf>>::new();
     for (run, _) in &left {
-        let dataset = &run.experiment.dataset;
-        if !datasets.contains_key(dataset) {
-            datasets.insert(dataset.clone(), run.source.obtain().hint(record_hint(&run.experiment))?.path);
-        }
+        datasets.entry(run.experiment.dataset.clone()).or_insert_with(|| {
+            let refused = |error| warn!("no run on the data of {} can begin: {error:#}", run.name);
+            run.source.obtain().map_err(refused).map(|dataset| dataset.path).ok()
+        });
     }
     let mut step_seconds = BTreeMap::new();
     // A single run, such as a task of an array job, starts at once and prints its own forecast.
     if args.index.is_none() {
-        let cost = Cost::measure(&left, |run| &*datasets[&run.experiment.dataset])?;
+        let cost = Cost::measure(&left, |run| datasets[&run.experiment.dataset].as_deref())?;
         info!("{}", cost.text(jobs));
         step_seconds = cost.step_seconds;
     }

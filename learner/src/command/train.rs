@@ -101,7 +101,7 @@ fn start_pool(asked: Option<NonZero<usize>>) -> anyhow::Result<()> {
 }
 
 /// A hint for a run without a dataset.
-pub(super) fn record_hint(Experiment { environment: name, .. }: &Experiment) -> String {
+fn record_hint(Experiment { environment: name, .. }: &Experiment) -> String {
     let is_recorded = environment::find(name).is_ok_and(|spec| spec.goal.is_none());
     let other = match is_recorded {
         true => format!("`evaluator collect --env {name} --out FILE` records one"),

@@ -40,13 +40,20 @@ pub(crate) struct Effort {
 /// Judges the last snapshots of runs, or single snapshots. What an earlier call has found out in this way is not computed again.
 ///
 /// # Errors
-/// There is nothing to judge, the policies have not learnt from the same data, or a policy cannot act.
+/// There is nothing to judge, the policies have not learnt from the same data in one environment, or a policy cannot act.
 pub(crate) fn judge(paths: &[PathBuf], effort: Effort) -> anyhow::Result<Ranking> {
     let config = FqeConfig::with_discount(effort.gamma).hint("γ is between 0 and 1, 1 left out: --gamma 0.99")?;
     let subjects = subject::find(paths)?;
     let data = Data::of(&subjects)?;
     let Effort { gamma, steps, seeds } = effort;
-    let conditions = Conditions { dataset: data.sha256.clone(), episodes: data.episodes.clone(), gamma, steps, seeds };
+    let conditions = Conditions {
+        dataset: data.sha256.clone(),
+        environment: data.environment.clone(),
+        episodes: data.episodes.clone(),
+        gamma,
+        steps,
+        seeds,
+    };
     let (mut judged, mut left) = (Vec::new(), Vec::new());
     for subject in &subjects {
         let known = Judgement::read_all(&subject.folder)?;
@@ -77,7 +84,7 @@ fn judge_all(
     let recorded = data.recorded_value(&fqes, evaluation.effort.gamma)?;
     let behavior = estimate(behaviors.iter().map(|(_, trace)| trace), &evaluation.units);
     for (subject, number) in subjects.iter().zip(1..) {
-        let actions = Actions::of(subject, data)?;
+        let actions = Actions::of(&*subject.policy, data)?;
         let traces = evaluation.of_policy(&actions, &fqes)?;
         let judgement = Judgement {
             run: subject.folder.path().to_owned(),
@@ -101,8 +108,8 @@ fn judge_all(
 
 /// Says how long it will take, by the time that a little of it takes.
 fn forecast(evaluation: &Evaluation<'_>, subjects: &[&Subject]) -> anyhow::Result<()> {
-    let acting =
-        subjects.iter().map(|subject| Actions::time(subject, evaluation.data)).sum::<anyhow::Result<Duration>>()?;
+    let asking = subjects.iter().map(|subject| Actions::time(&*subject.policy, evaluation.data));
+    let acting = asking.sum::<anyhow::Result<Duration>>()?;
     let evaluating = evaluation.time()? * (subjects.len() as u32 + 1);
     let minutes = |time: Duration| format!("{:.1}", time.as_secs_f64() / 60.0);
     let (all, acting) = (minutes(acting + evaluating), minutes(acting));

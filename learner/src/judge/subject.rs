@@ -28,7 +28,7 @@ pub(super) struct Subject {
     pub held_out: BTreeSet<usize>,
 }
 
-/// The last snapshot of each run in or below a folder, and each snapshot that is named itself.
+/// The last snapshot of each run in or below a folder, and each snapshot that is named itself; a policy that is named twice, once.
 ///
 /// # Errors
 /// There is no such policy, or it cannot be read.
@@ -56,6 +56,8 @@ pub(super) fn find(paths: &[PathBuf]) -> anyhow::Result<Vec<Subject>> {
             subjects.push(Subject::read(folder, step)?);
         }
     }
+    let mut seen = BTreeSet::new();
+    subjects.retain(|subject| seen.insert(subject.weights.clone()));
     Ok(subjects)
 }
 

@@ -113,9 +113,10 @@ struct Alike<'a> {
 }
 
 impl Alike<'_> {
-    /// Whether the value is the task's own, as its data are.
+    /// Whether the value is the task's own, as its environment and data are.
     fn has_own(&self, key: &str) -> bool {
-        self.given.is_empty() || key.starts_with("dataset.") || self.given.get(key) == self.settings.get(key)
+        let is_task = key == "environment" || key.starts_with("dataset.");
+        is_task || !self.given.is_empty() && self.given.get(key) == self.settings.get(key)
     }
 }
 

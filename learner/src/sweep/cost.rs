@@ -4,10 +4,10 @@ use std::collections::BTreeMap;
 use std::path::Path;
 use std::time::Duration;
 
-use anyhow::Context;
 use indicatif::{HumanBytes, HumanDuration};
 use quad_run::config::{Device, settings};
 use quad_run::status::State;
+use tracing::warn;
 
 use super::study::PlannedRun;
 use crate::data::load;
@@ -29,25 +29,29 @@ pub(crate) struct Cost {
 }
 
 impl Cost {
-    /// Measures these runs, of which so much is done, from data that is on this machine.
+    /// Measures these runs, of which so much is done, from data that is on this machine. A run that cannot begin takes nothing,
+    /// which is said; its learner will say it again.
     ///
     /// # Errors
-    /// A dataset cannot be read, or a run could not begin with it.
+    /// No thread can be started.
     pub fn measure<'a>(
         runs: &[(PlannedRun, State)],
-        dataset: impl Fn(&PlannedRun) -> &'a Path,
+        dataset: impl Fn(&PlannedRun) -> Option<&'a Path>,
     ) -> anyhow::Result<Self> {
         let mut prices: BTreeMap<String, Price> = BTreeMap::new();
         let one_thread = rayon::ThreadPoolBuilder::new().num_threads(1).build()?;
         for (run, _) in runs {
             let key = configuration(run);
             if prices.len() < MOST_MEASURED && !prices.contains_key(&key) {
-                let transitions = load(dataset(run), &run.experiment)?.training;
-                let price = one_thread.install(|| Price::measure(&run.experiment, Device::Cpu, transitions));
-                prices.insert(key, price.with_context(|| format!("the run {} cannot begin", run.name))?);
+                let price = dataset(run).map(|dataset| {
+                    let transitions = load(dataset, &run.experiment)?.training;
+                    one_thread.install(|| Price::measure(&run.experiment, Device::Cpu, transitions))
+                });
+                let refused = |error| warn!("the run {} cannot begin: {error:#}", run.name);
+                prices.insert(key, price.and_then(|price| price.map_err(refused).ok()).unwrap_or_default());
             }
         }
-        let measured = prices.len();
+        let measured = prices.values().filter(|price| price.step > 0.0).count();
         let mean = |value: fn(&Price) -> f64| prices.values().map(value).sum::<f64>() / measured.max(1) as f64;
         let other = Price {
             step: mean(|price| price.step),

@@ -13,7 +13,7 @@ use super::training::{begin, origin};
 const MEASURED: Duration = Duration::from_secs(1);
 
 /// What a run takes.
-#[derive(Clone, Copy)]
+#[derive(Clone, Copy, Default)]
 pub(crate) struct Price {
     /// Seconds of one gradient step.
     pub step: f64,

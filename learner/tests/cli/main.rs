@@ -1,9 +1,10 @@
-//! `learner presets`, `list`, `report`, `verify` and `train --dry-run`, as a user calls them on files that a test has made up.
+//! `learner presets`, `list`, `report`, `export`, `verify`, `sweep` and `train --dry-run`, as a user calls them on files that a test has made up.
 #![allow(clippy::unwrap_used, clippy::expect_used)]
 
 mod damaged;
 mod dry_run;
 mod endless;
+mod export;
 mod foreign;
 #[path = "../../../tests/fixtures/hopper.rs"]
 mod hopper;
@@ -13,6 +14,7 @@ mod published;
 mod report;
 mod run;
 mod study;
+mod sweep;
 mod verify;
 
 use std::path::Path;

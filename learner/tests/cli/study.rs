@@ -92,6 +92,33 @@ fn a_value_that_is_not_the_tasks_own_is_named_on_every_task() {
     }
 }
 
+/// Two tasks of a user's own, in environments with reference returns: nobody knows which τ is a task's own.
+#[test]
+fn values_of_a_users_own_tasks_are_named() {
+    let rows = |tasks: &[(&str, &str, f64)]| {
+        let folder = tempfile::tempdir().unwrap();
+        for (task, environment, tau) in tasks {
+            let run = Run::new("hopper-demo", 0).set(&[
+                ("run.preset", (*task).into()),
+                ("experiment.environment", (*environment).into()),
+                ("dataset.mean_return", (*tau).into()),
+                ("experiment.agent.tau", (*tau).into()),
+            ]);
+            complete(run, 40.0).write(&folder.path().join(task));
+        }
+        let report = study(folder.path());
+        let rows = report["study"].as_array().unwrap().iter().map(|row| (row["method"].clone(), row["tasks"].clone()));
+        Vec::from_iter(rows)
+    };
+    let [low, high] = ["quad, agent.tau = 0.1", "quad, agent.tau = 0.5"].map(|name| json!(name));
+    let mine = rows(&[("mine-a", "hopper", 0.1), ("mine-b", "walker2d", 0.5)]);
+    assert_eq!(mine, [(low, json!(["mine-a"])), (high.clone(), json!(["mine-b"]))]);
+    let known = rows(&[("hopper-demo", "hopper", 0.1), ("mine", "walker2d", 0.5)]);
+    assert_eq!(known, [(json!("quad"), json!(["hopper-demo"])), (high, json!(["mine"]))]);
+    let alike = rows(&[("mine-a", "hopper", 0.5), ("mine-b", "walker2d", 0.5)]);
+    assert_eq!(alike, [(json!("quad"), json!(["mine-a", "mine-b"]))]);
+}
+
 #[test]
 fn returns_are_summed_up_task_by_task_and_a_single_seed_has_no_interval() {
     let folder = tempfile::tempdir().unwrap();

@@ -88,3 +88,28 @@ fn two_runs_are_compared_bit_for_bit() {
         assert!(!wrong.contains("precision") || found.contains("(f32-avx512 here, bf16-amx there)"), "{found}");
     }
 }
+
+/// As with `--eval-interval 0`.
+#[test]
+fn runs_without_evaluations_are_compared_by_their_snapshots() {
+    let folder = tempfile::tempdir().unwrap();
+    let [ours, theirs] = ["a", "b"].map(|name| folder.path().join(name));
+    for path in [&ours, &theirs] {
+        let mut run = Run::new("hopper-demo", 4).set(&[("experiment.eval_interval", 0.into())]);
+        run.scores.clear();
+        run.write(path);
+        fs::write(path.join("snapshots/step_000000015.safetensors"), [7; 100]).unwrap();
+    }
+    let compare = |holds| verify(&[ours.to_str().unwrap(), "--same-as", theirs.to_str().unwrap()], holds);
+    assert!(compare(true).contains("1 of 1 snapshots are compared"));
+    let snapshot = theirs.join("snapshots/step_000000015.safetensors");
+    let mut flipped = [7; 100];
+    flipped[50] ^= 1;
+    fs::write(&snapshot, flipped).unwrap();
+    let found = compare(false);
+    assert!(found.contains("0 of 1 snapshots are compared\nsnapshots that differ (1): step 15"), "{found}");
+    fs::remove_file(&snapshot).unwrap();
+    assert!(compare(false).contains("snapshots that are not there (1): step 15"));
+    fs::remove_file(ours.join("snapshots/step_000000015.safetensors")).unwrap();
+    assert!(compare(false).contains("nothing to compare"), "no success");
+}

@@ -5,6 +5,7 @@ from __future__ import annotations
 import glob
 import json
 import os
+import warnings
 from collections.abc import Iterable
 from os import PathLike
 from pathlib import Path
@@ -24,12 +25,17 @@ def runs(folders: str | PathLike[str] | Iterable[str | PathLike[str]] = "runs/*"
     all its rows; and each setting of its `config.toml` under its name there, like `experiment.batch_size`. A run that has
     no evaluation yet has one row, in which these are None.
 
-    A learner may be writing the folders. Raises RuntimeError if a file is not what a learner writes.
+    A learner may be writing the folders. A run that cannot be read is left out, with a warning that names it.
     """
     patterns = [folders] if isinstance(folders, (str, PathLike)) else folders
     found = [path for pattern in patterns for path in sorted(glob.glob(os.path.expanduser(os.fspath(pattern))))]
-    found = [path for path in found if Path(path, "config.toml").is_file()]
-    return [row for path in found for row in _rows(path)]
+    rows: list[dict[str, Any]] = []
+    for path in found:
+        try:
+            rows += rows_of(path) if Path(path, "config.toml").exists() else []
+        except (OSError, RuntimeError) as error:
+            warnings.warn(f"the run in {path} cannot be read: {error}", stacklevel=2)
+    return rows
 
 
 def metrics(folder: str | PathLike[str]) -> list[dict[str, float]]:
@@ -41,14 +47,15 @@ def metrics(folder: str | PathLike[str]) -> list[dict[str, float]]:
     `train/NAME`. Where all episodes of an evaluation of that step are scored, it has `evaluation/score`,
     `evaluation/score_std` (if there are several episodes), `evaluation/return` and `evaluation/length`. Steps ascend.
 
-    A learner may be writing the folder. Raises FileNotFoundError if it holds no metrics.jsonl, else as `runs` does.
+    A learner may be writing the folder. Raises FileNotFoundError if it holds no metrics.jsonl, RuntimeError if a file is
+    not what a learner writes.
     """
     lines = Path(folder, "metrics.jsonl").read_text().split("\n")[:-1]  # What follows the last end of a line is half a line.
     rows: dict[int, dict[str, float]] = {}
     for line in map(json.loads, lines):
         named = {name if name in ("step", "seconds") else f"train/{name}": value for name, value in line.items()}
         rows[line["step"]] = named
-    for scored in _rows(folder):
+    for scored in rows_of(folder):
         if scored["complete"]:
             row = rows.setdefault(scored["step"], {"step": scored["step"]})
             values = {name: scored[name] for name in ("score", "score_std", "return", "length")}
@@ -56,7 +63,8 @@ def metrics(folder: str | PathLike[str]) -> list[dict[str, float]]:
     return [rows[step] for step in sorted(rows)]
 
 
-def _rows(folder: str | PathLike[str]) -> list[dict[str, Any]]:
+def rows_of(folder: str | PathLike[str]) -> list[dict[str, Any]]:
+    """What `runs` gives for one run. Raises RuntimeError if a file is not what a learner writes."""
     run, config = map(json.loads, _quad_rl.read_run(folder))
     of_run = _flat("", {name: value for name, value in run.items() if name not in ("evaluations", "episodes_missing")})
     of_run |= _flat("", config)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import ctypes
-import glob
 import json
 import os
 import re
@@ -21,7 +20,7 @@ from typing import Any
 
 from quad_rl import _quad_rl
 from quad_rl._dataset import Dataset
-from quad_rl._runs import metrics, runs
+from quad_rl._runs import metrics, rows_of
 
 _LINE = re.compile(r"\S+Z +([A-Z]+) (.*)")
 _STEP = re.compile(r"step (\d+)/(\d+) ")
@@ -52,8 +51,8 @@ class Run:
 
     @property
     def scores(self) -> list[dict[str, Any]]:
-        """Its rows of `runs`: a dictionary for each evaluation."""
-        return [row for row in runs(glob.escape(str(self.folder))) if row["step"] is not None]
+        """Its rows of `runs`: a dictionary for each evaluation. Raises RuntimeError if it cannot be read."""
+        return [row for row in rows_of(self.folder) if row["step"] is not None]
 
     @property
     def metrics(self) -> list[dict[str, float]]:

@@ -6,16 +6,20 @@ use std::path::PathBuf;
 use serde::{Deserialize, Serialize};
 
 use super::spread::Spread;
-use crate::run::{RunDir, RunDirError};
+use crate::run::{Lock, RunDir, RunDirError};
 use crate::table::{Part, Table};
 
 const FILE: &str = "judgements.json";
+const LOCK: &str = "judgements.lock";
 
 /// How judgements were made: those that were made alike can be compared.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct Conditions {
     /// SHA-256 of the data.
     pub dataset: String,
+    /// The environment, whose task the rewards may be of; empty where an earlier learner did not say.
+    #[serde(default)]
+    pub environment: String,
     /// Numbers of the episodes in whose first states policies are judged, from 0 in the order of the file.
     pub episodes: Vec<usize>,
     /// Discount γ of the values.
@@ -68,7 +72,7 @@ pub struct Judgement {
 }
 
 impl Judgement {
-    /// The judgements of a run's snapshots that its folder has.
+    /// The judgements of a run's snapshots that its folder has, but for those that may be of another task's rewards.
     ///
     /// # Errors
     /// The file cannot be read, or is not what `learner judge` writes.
@@ -77,15 +81,23 @@ impl Judgement {
             return Ok(Vec::new());
         }
         let mut judgements: Vec<Self> = folder.read_json(FILE)?;
+        judgements.retain(|judgement| !judgement.conditions.environment.is_empty());
         judgements.iter_mut().for_each(|judgement| judgement.run = folder.path().to_owned());
         Ok(judgements)
     }
 
-    /// Keeps it in the folder, in the place of an earlier one of the same step.
+    /// Keeps it in the folder, in the place of an earlier one of the same step. Waits for another process that is doing so.
     ///
     /// # Errors
     /// Those of [`Self::read_all`], or the file cannot be written.
     pub fn keep(&self, folder: &RunDir) -> Result<(), RunDirError> {
+        let path = folder.path().join(LOCK);
+        let _lock = loop {
+            match Lock::take(&path) {
+                Err(RunDirError::InUse(_)) => {}
+                taken => break taken?,
+            }
+        };
         let mut judgements = Self::read_all(folder)?;
         judgements.retain(|earlier| earlier.step != self.step);
         judgements.push(self.clone());
@@ -135,7 +147,7 @@ impl Ranking {
 
     /// As words and a table.
     pub fn parts(&self) -> [Part; 2] {
-        let Self { conditions: Conditions { episodes, gamma, steps, seeds, .. }, policies, .. } = self;
+        let Self { conditions: Conditions { environment, episodes, gamma, steps, seeds, .. }, policies, .. } = self;
         let columns = [("rank", Right), ("policy", Left), ("value", Right), ("distance", Right), ("doubts", Left)];
         let mut table = Table::new(&columns);
         let value = |of: &Estimate| of.spread().map_or_else(|| "-".to_owned(), Spread::text);
@@ -157,8 +169,8 @@ impl Ranking {
         let recorded = ["-", "behaviour, as recorded", &format!("{:.2}", self.recorded), "", ""];
         table.push(recorded.map(str::to_owned));
         let words = format!(
-            "Judged without a simulator: a ranking, not a score.\n{}\nValues are discounted returns (γ = {gamma}) from the first \
-             states of {} episodes on, estimated by fitted Q evaluation ({steps} steps), ± standard deviation over {seeds} seeds. \
+            "Judged without a simulator: a ranking, not a score.\n{}\nValues are discounted returns (γ = {gamma}) in {environment} \
+             from the first states of {} episodes on, estimated by fitted Q evaluation ({steps} steps), ± standard deviation over {seeds} seeds. \
              Distance: of the policy's actions from the data's, in standard deviations of the data's.\n",
             self.verdict,
             episodes.len(),
@@ -191,67 +203,4 @@ fn verdict(values: &[Spread], seeds: u64, behavior: &Estimate, recorded: f64) ->
 }
 
 #[cfg(test)]
-#[allow(clippy::unwrap_used)]
-mod tests {
-    use super::*;
-    use crate::table::Style;
-
-    fn estimate(values: &[f64]) -> Estimate {
-        Estimate { values: values.to_vec(), doubts: Vec::new() }
-    }
-
-    fn judgement(run: &str, values: &[f64], behavior: f64) -> Judgement {
-        let conditions =
-            Conditions { dataset: "abc".to_owned(), episodes: vec![3, 5], gamma: 0.99, steps: 100, seeds: 2 };
-        Judgement {
-            run: run.into(),
-            step: 20,
-            weights: String::new(),
-            conditions,
-            estimate: estimate(values),
-            distance: 1.0,
-            unseen: true,
-            behavior: estimate(&[behavior, behavior]),
-            recorded: 10.0,
-        }
-    }
-
-    fn ranked(judgements: &[Judgement]) -> (Vec<String>, bool, String) {
-        let [ranking] = <[Ranking; 1]>::try_from(Ranking::of(judgements.to_vec())).ok().unwrap();
-        (ranking.policies.iter().map(|one| one.run.display().to_string()).collect(), ranking.can_rank, ranking.verdict)
-    }
-
-    #[test]
-    fn the_best_comes_first_and_what_diverged_is_told_but_not_averaged() {
-        let mut diverged = judgement("diverged", &[1e9, 12.0], 10.5);
-        diverged.estimate.doubts.push("beyond what rewards allow".to_owned());
-        let judgements = [judgement("low", &[9.0, 9.2], 10.5), diverged, judgement("high", &[13.0, 14.0], 10.5)];
-        // Of the deviations 0.71 and 0.14 the root mean square is 0.51, twice that 1.02.
-        let (order, can_rank, verdict) = ranked(&judgements);
-        assert_eq!((order, can_rank), (["high", "low", "diverged"].map(str::to_owned).to_vec(), true));
-        assert!(verdict.contains("less than 1.02") && verdict.contains("0.50 off"), "{verdict}");
-        let text = Ranking::of(judgements.to_vec())[0].parts().map(|part| part.render(Style::Text)).concat();
-        assert!(text.contains("a ranking, not a score") && text.contains("13.50 ± 0.71"), "{text}");
-        assert!(!text.contains("500000006") && text.contains("beyond what rewards allow"), "{text}");
-    }
-
-    #[test]
-    fn what_the_behaviour_s_estimate_misses_by_more_is_not_ranked() {
-        let (_, can_rank, verdict) = ranked(&[judgement("a", &[9.0], 14.0), judgement("b", &[12.0], 14.0)]);
-        assert!(!can_rank && verdict.contains("4.00 off") && verdict.contains("3.00"), "{verdict}");
-        assert!(ranked(&[judgement("a", &[8.0, 10.0], 10.0), judgement("b", &[12.0, 14.0], 10.0)]).1);
-        let (_, can_rank, verdict) = ranked(&[judgement("a", &[8.0, 12.0], 10.0), judgement("b", &[12.0, 14.0], 10.0)]);
-        assert!(!can_rank && verdict.contains("no more than 3.00"), "the seeds differ as much: {verdict}");
-        let mut doubtful = judgement("a", &[9.0], 10.0);
-        doubtful.behavior.doubts.push("it moves".to_owned());
-        assert!(!ranked(&[doubtful.clone(), doubtful]).1);
-        assert!(!ranked(&[judgement("alone", &[9.0], 10.0)]).1);
-    }
-
-    #[test]
-    fn judgements_of_other_conditions_are_apart() {
-        let mut other = judgement("other", &[1.0], 10.0);
-        other.conditions.gamma = 0.9;
-        assert_eq!(Ranking::of([judgement("a", &[1.0], 10.0), other, judgement("b", &[2.0], 10.0)]).len(), 2);
-    }
-}
+mod tests;

@@ -21,11 +21,11 @@ const OTHER_ARITHMETIC: &str =
 /// What was found in a folder.
 #[derive(Debug, Default, PartialEq)]
 pub struct Findings {
-    /// What was looked for: `scored` or `compared`.
+    /// What was looked for, such as `episodes are scored`.
     pub what: &'static str,
-    /// Episodes that are.
+    /// How many are.
     pub found: u64,
-    /// Episodes that should be.
+    /// How many should be.
     pub expected: u64,
     /// What is wrong, kind by kind: how often, and the first cases.
     pub wrong: BTreeMap<&'static str, (u64, Vec<String>)>,
@@ -48,7 +48,7 @@ impl Findings {
 
 impl fmt::Display for Findings {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        write!(f, "{} of {} episodes are {}", self.found, self.expected, self.what)?;
+        write!(f, "{} of {} {}", self.found, self.expected, self.what)?;
         for (kind, (count, listed)) in &self.wrong {
             let more = if *count > listed.len() as u64 { "; …" } else { "" };
             write!(f, "\n{kind} ({count}): {}{more}", listed.join("; "))?;
@@ -66,7 +66,7 @@ pub fn verify(path: &Path) -> Result<Findings, RunDirError> {
     let experiment = &config.experiment;
     let schedule = experiment.schedule();
     let expected = schedule.evaluations().saturating_mul(experiment.episodes.into());
-    let mut found = Findings { what: "scored", expected, ..Findings::default() };
+    let mut found = Findings { what: "episodes are scored", expected, ..Findings::default() };
     let mut hashes: BTreeMap<u64, Option<String>> = BTreeMap::new();
     let planned = |step| match schedule.is_evaluated(step) {
         true => episode_seeds(experiment.seed, step, experiment.episodes),
@@ -76,9 +76,7 @@ pub fn verify(path: &Path) -> Result<Findings, RunDirError> {
     let mut seen = BTreeSet::new();
     for ScoreLine { step, seed, weights, episode_return, score, .. } in dir.read_scores()? {
         let name = format!("step {step}, seed {seed}");
-        let hash = hashes
-            .entry(step)
-            .or_insert_with(|| dir.read_snapshot(step).ok().map(|tensors| Hash::of(&tensors).to_string()));
+        let hash = hashes.entry(step).or_insert_with(|| hash(&dir, step).ok().map(|hash| hash.to_string()));
         match hash {
             None => found.add("scored, but the snapshot is gone", name.clone()),
             Some(hash) if *hash != weights => found.add("scored with other weights than are on disk", name.clone()),
@@ -107,12 +105,18 @@ pub fn verify(path: &Path) -> Result<Findings, RunDirError> {
     Ok(found)
 }
 
-/// Checks that each score of a run is in another run of the same configuration, too: bit for bit, of the same weights.
+/// The hash of a snapshot's file.
+fn hash(dir: &RunDir, step: u64) -> Result<Hash, RunDirError> {
+    Ok(Hash::of(&dir.read_snapshot(step)?))
+}
+
+/// Checks that each score and each snapshot of a run is in another run of the same configuration, too, bit for bit: what was
+/// found of scores, and of snapshots.
 ///
 /// # Errors
 /// As [`verify`].
-pub fn compare(path: &Path, other: &Path) -> Result<Findings, RunDirError> {
-    let mut found = Findings { what: "compared", ..Findings::default() };
+pub fn compare(path: &Path, other: &Path) -> Result<[Findings; 2], RunDirError> {
+    let mut found = Findings { what: "episodes are compared", ..Findings::default() };
     let [(dir, config), (other_dir, other_config)] = [RunDir::open(path)?, RunDir::open(other)?];
     let [a, b] = [&config, &other_config].map(settings::of_run);
     for key in settings::differences(&a, &b) {
@@ -137,6 +141,25 @@ pub fn compare(path: &Path, other: &Path) -> Result<Findings, RunDirError> {
             found.add(OTHER_ARITHMETIC, format!("{name} ({here} here, {there} there)"));
         } else if bits(line) != bits(same) {
             found.add("scores that differ", name);
+        } else {
+            found.found += 1;
+        }
+    }
+    Ok([found, compare_snapshots(&dir, &other_dir)?])
+}
+
+fn compare_snapshots(dir: &RunDir, other: &RunDir) -> Result<Findings, RunDirError> {
+    let (ours, theirs) = (dir.snapshots()?, other.snapshots()?);
+    let mut found = Findings { what: "snapshots are compared", expected: ours.len() as u64, ..Findings::default() };
+    if ours.is_empty() {
+        // Each run ends with one.
+        found.add("nothing to compare", format!("{} has no snapshot", dir.path().display()));
+    }
+    for step in ours {
+        if !theirs.contains(&step) {
+            found.add("snapshots that are not there", format!("step {step}"));
+        } else if hash(dir, step)? != hash(other, step)? {
+            found.add("snapshots that differ", format!("step {step}"));
         } else {
             found.found += 1;
         }

@@ -58,6 +58,14 @@ fn policies_are_judged_by_the_data_alone() {
     let again = judge(&[&all]);
     assert!(!said(&again, 0).contains("judging"), "nothing is computed twice");
     assert_eq!(json(&again), found);
+    for (flag, key, value) in [("--gamma", "gamma", "0.5"), ("--seeds", "seeds", "3"), ("--steps", "steps", "100")] {
+        let flags = ["--json", "--steps", "200"].into_iter().filter(|word| flag != "--steps" || *word == "--json");
+        let other = json(&learner("judge", &[&quad], &[&Vec::from_iter(flags)[..], &[flag, value]].concat()));
+        assert_eq!(other["conditions"][key], value.parse::<Value>().unwrap(), "of other conditions nothing is known");
+    }
+    let twice = json(&judge(&[&quad, &quad.join("snapshots/step_000000020.safetensors"), &all]));
+    assert_eq!(twice["policies"].as_array().unwrap().len(), 2, "a policy that is named twice counts once");
+
     let alone = |path: &Path| json(&judge(&[path]))["policies"][0]["estimate"].clone();
     let of =
         |run: &Path| policies.iter().find(|policy| policy["run"] == run.to_str().unwrap()).unwrap()["estimate"].clone();
@@ -84,6 +92,8 @@ fn what_cannot_be_judged_is_said_in_a_sentence() {
     refused(&[&stray], "in no run's folder", "RUN/snapshots/step_");
     let config = iql.join("config.toml");
     let text = fs::read_to_string(&config).unwrap();
+    fs::write(&config, text.replace("environment = \"my-robot\"", "environment = \"another\"")).unwrap();
+    refused(&[&quad, &iql], "quad is of the environment my-robot, iql of another", "judge them apart");
     let sha256 = text.split("sha256 = \"").nth(1).unwrap().split('"').next().unwrap().to_owned();
     fs::write(&config, text.replace(&sha256, &"0".repeat(64))).unwrap();
     refused(&[&quad, &iql], "have not learnt from the same data", "judge them apart");

@@ -1,0 +1,97 @@
+//! What `learner export` says of how good a policy is.
+
+use std::fs;
+use std::path::Path;
+
+use quad_policy::Header;
+use quad_protocol::{Hash, Origin};
+use quad_run::results::{Conditions, Estimate, Judgement};
+use quad_run::run::RunDir;
+use serde_json::{Value, json};
+
+use crate::{learner, printed, write_dataset};
+
+const STEPS: [u64; 2] = [5, 10];
+
+/// A run with two snapshots and without scores; gives the hash of both.
+fn train(folder: &Path) -> (RunDir, String) {
+    let [data, run] = ["data.hdf5", "run"].map(|name| folder.join(name));
+    write_dataset(&data);
+    let [data, path] = [&data, &run].map(|path| path.to_str().unwrap());
+    let asked = ["train", "--task", "hopper-demo", "--dataset", data, "--run-dir", path, "--http", "127.0.0.1:0"];
+    let small = ["--set", "batch_size=8", "--agent", "actor.hidden=[8]", "--agent", "critic.hidden=[8]"];
+    let sizes = ["--steps", "10", "--episodes", "2", "--eval-interval", "0"];
+    printed(&[&asked[..], &small, &sizes].concat());
+    let run = RunDir::at(&run);
+    fs::copy(run.snapshot_path(10), run.snapshot_path(5)).unwrap();
+    let weights = Hash::of(&run.read_snapshot(10).unwrap()).to_string();
+    (run, weights)
+}
+
+/// Scores each episode: its step, its seed, its score and the weights.
+fn score(run: &RunDir, episodes: &[(u64, u64, f64, &str)]) {
+    let line = |(step, seed, score, weights): &(u64, u64, f64, &str)| {
+        let line = json!({"step": step, "seed": seed, "return": 1.0, "length": 5, "score": score, "weights": weights,
+                          "precision": "f32-avx512", "evaluator": "e"});
+        format!("{line}\n")
+    };
+    fs::write(run.path().join("scores.jsonl"), episodes.iter().map(line).collect::<String>()).unwrap();
+}
+
+fn judge(run: &RunDir, step: u64, distance: f64, weights: &str) {
+    let estimate = Estimate { values: vec![1.0, 1.0], doubts: Vec::new() };
+    let judgement = Judgement {
+        run: run.path().to_owned(),
+        step,
+        weights: weights.to_owned(),
+        conditions: Conditions {
+            dataset: "abc".to_owned(),
+            environment: "hopper".to_owned(),
+            episodes: vec![0],
+            gamma: 0.99,
+            steps: 100,
+            seeds: 2,
+        },
+        estimate: estimate.clone(),
+        distance,
+        unseen: true,
+        behavior: estimate,
+        recorded: 1.0,
+    };
+    judgement.keep(run).unwrap();
+}
+
+/// What the file says of its score and judgement, and what is said to the user.
+fn export(run: &RunDir, step: &str) -> (Value, Value, String) {
+    let out = run.path().join("policy.safetensors");
+    let [path, file] = [run.path(), &out].map(|path| path.to_str().unwrap());
+    let output = learner(&["export", path, "--step", step, "--out", file, "--license", "CC0"]);
+    let said = String::from_utf8(output.stderr).unwrap();
+    assert!(output.status.success(), "{said}");
+    let about = Header::<Origin>::read(&fs::read(&out).unwrap()).unwrap().about;
+    (about["score"].clone(), about["judgement"].clone(), said)
+}
+
+#[test]
+fn a_file_has_the_score_and_judgement_of_its_own_step_and_weights() {
+    let folder = tempfile::tempdir().unwrap();
+    let (run, weights) = train(folder.path());
+    let episode = |step, seed| (step, seed, if step == 5 { 30.0 } else { 20.0 }, &*weights);
+    score(&run, &[episode(5, 0), episode(5, 1), episode(10, 0), episode(10, 1)]);
+    STEPS.iter().for_each(|step| judge(&run, *step, *step as f64, &weights));
+    for (asked, step, expected) in [("5", 5, 30.0), ("10", 10, 20.0), ("last", 10, 20.0), ("best", 5, 30.0)] {
+        let (score, judgement, said) = export(&run, asked);
+        assert_eq!((&score["step"], &score["score"]["mean"]), (&json!(step), &json!(expected)), "{asked}");
+        assert_eq!((&score["complete"], &judgement["distance"]), (&json!(true), &json!(step as f64)), "{asked}");
+        assert!(!said.contains("WARN"), "{said}");
+    }
+
+    score(&run, &[episode(5, 0), episode(10, 0), (10, 1, 20.0, "00")]);
+    judge(&run, 10, 1.0, "00");
+    let (part, judgement, said) = export(&run, "5");
+    assert_eq!((&part["episodes"], &part["complete"]), (&json!(1), &json!(false)));
+    assert!(said.contains("the score is of 1 of 2 episodes") && !judgement.is_null(), "{said}");
+    let (none, judgement, said) = export(&run, "10");
+    assert!(none.is_null() && judgement.is_null(), "of other weights: {none} {judgement}");
+    assert!(said.contains("that of step 10 is of other weights"), "{said}");
+}
