@@ -73,7 +73,7 @@ impl Worker {
         let over = |(key, client): (&RunKey, &mut RunClient)| {
             match found.get(key) {
                 Some(learner) => client.follow(&learner.incarnations),
-                None if client.has_scores() && now - *client.gone.get_or_insert(now) < KEEP_SCORES => {}
+                None if client.owes() && now - *client.gone.get_or_insert(now) < KEEP_SCORES => {}
                 None => return Some(key.clone()),
             }
             None
@@ -124,9 +124,9 @@ impl Worker {
     }
 }
 
-/// Delivers scores if there are any, else runs one job.
+/// Delivers what the evaluator owes, if anything, else runs one job.
 async fn serve(client: &mut RunClient, evaluator: &mut Evaluator) -> anyhow::Result<()> {
-    if !client.has_scores() {
+    if !client.owes() {
         let Some(job) = client.claim(evaluator.environments.names()).await? else { return Ok(()) };
         match evaluator.evaluate(&job, client).await {
             Ok(report) => client.keep(report),
