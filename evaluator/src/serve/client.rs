@@ -21,7 +21,7 @@ use super::snapshot::{Listener, Snapshots, is_named_by};
 use crate::metrics::Metrics;
 use delivery::Owed;
 
-/// A learner answers in milliseconds; one that takes this long hangs, and other runs wait meanwhile.
+/// A learner answers in milliseconds; for one that hangs or is very busy, other runs do not wait longer than this.
 pub const ANSWER_TIMEOUT: Duration = Duration::from_secs(5);
 /// Patience with a learner that sends a snapshot, which has megabytes.
 const WEIGHTS_TIMEOUT: Duration = Duration::from_secs(30);
@@ -108,7 +108,6 @@ impl RunClient {
     fn turn_to(&mut self, incarnation: u64) {
         debug!(run = %self.run, incarnation, "following a learner");
         self.incarnation = incarnation;
-        self.attempt = None;
         self.listener.follow(incarnation);
         self.turn.wake(Instant::now());
     }

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import ctypes
 import glob
 import json
 import os
@@ -17,10 +16,11 @@ from collections.abc import Iterator, Mapping
 from functools import cached_property
 from os import PathLike
 from pathlib import Path
-from typing import Any
+from typing import Any, TextIO
 
 from quad_rl import _quad_rl
 from quad_rl._dataset import Dataset
+from quad_rl._process import start, wait
 from quad_rl._runs import metrics, runs
 
 _LINE = re.compile(r"\S+Z +([A-Z]+) (.*)")
@@ -28,9 +28,6 @@ _STEP = re.compile(r"step (\d+)/(\d+) ")
 _PAGE = re.compile(r"page: (\S+)")
 # Characters of the bar.
 _BAR = 20
-# Found here, since a process that was just forked should look for nothing.
-_PRCTL = ctypes.CDLL(None).prctl
-_PR_SET_PDEATHSIG = 1
 
 
 class Run:
@@ -102,8 +99,8 @@ def train(
             path = Path(folder, "dataset.hdf5")
             dataset.save(path)
             dataset = path
-        process = _start("train", f"--dataset={os.fspath(dataset)}", *_flags(own | options))
         display = _Display()
+        process = _start("train", f"--dataset={os.fspath(dataset)}", *_flags(own | options))
         error: list[str] = []
         try:
             display.follow(process, error)
@@ -116,18 +113,22 @@ def train(
             process.wait()
             display.say("\n".join(error))
             raise
-    if process.wait() != 0:
+    if wait(process) != 0:
         raise _error(process, error)
     return Run(run_dir)
 
 
 class _Display:
-    """Shows what a learner says. In a notebook or on a terminal, its line of progress is a bar that stays in its place."""
+    """Shows what a learner says. In a notebook or on a terminal, its line of progress is a bar that stays in its place. Where
+    nothing can be shown, the learner works all the same."""
 
     def __init__(self) -> None:
         notebook = type(sys.stdout).__module__ == "ipykernel.iostream"
-        self._out = sys.stdout if notebook else sys.stderr
-        self._draws = notebook or self._out.isatty()
+        self._out: TextIO | None = sys.stdout if notebook else sys.stderr
+        if self._out is not None and self._out.closed:
+            self._out = None
+        self._is_terminal = self._out is not None and self._out.isatty()
+        self._draws = notebook or self._is_terminal
         self._bar = ""
 
     def follow(self, process: subprocess.Popen[str], error: list[str]) -> None:
@@ -140,7 +141,7 @@ class _Display:
                 done = _BAR * int(step[1]) // int(step[2])
                 text = f"{'█' * done}{'░' * (_BAR - done)} {text}"
                 # A line that a terminal breaks cannot be drawn over.
-                self._write(text[: shutil.get_terminal_size().columns - 1] if self._out.isatty() else text)
+                self._write(text[: shutil.get_terminal_size().columns - 1] if self._is_terminal else text)
             else:
                 self.say(text if level == "INFO" else f"{level} {text}")
 
@@ -149,8 +150,13 @@ class _Display:
         self._bar = ""
 
     def _write(self, text: str, end: str = "") -> None:
-        start = "\r" if self._bar else ""
-        print(start + text.ljust(len(self._bar)), end=end, file=self._out, flush=True)
+        if self._out is None:
+            return
+        begin = "\r" if self._bar else ""
+        try:
+            print(begin + text.ljust(len(self._bar)), end=end, file=self._out, flush=True)
+        except (OSError, ValueError):  # Its reader has gone, or it was closed.
+            self._out = None
         self._bar = text
 
 
@@ -160,22 +166,17 @@ def _start(*arguments: str) -> subprocess.Popen[str]:
     program = shutil.which("learner", path=path)
     if program is None:
         raise RuntimeError(f"there is no program `learner` in {path}\nhint: the wheel of deploy/wheel.sh contains it")
-    return subprocess.Popen(
+    return start(
         [program, *arguments],
+        ends_with_thread=True,
         stdin=subprocess.DEVNULL,
         stdout=subprocess.DEVNULL,
         stderr=subprocess.PIPE,
         encoding="utf-8",
         errors="replace",
-        # A session of its own: a terminal's Ctrl-C is this process's to pass on.
-        start_new_session=True,
-        preexec_fn=_end_with_parent,
+        # What the log says is read here, so nothing may hide lines of it.
+        env={name: value for name, value in os.environ.items() if name != "RUST_LOG"},
     )
-
-
-def _end_with_parent() -> None:
-    """Has the system end this process in order when the thread is gone that started it."""
-    _PRCTL(_PR_SET_PDEATHSIG, signal.SIGTERM)
 
 
 def _said(process: subprocess.Popen[str]) -> Iterator[tuple[str, str]]:
@@ -187,7 +188,7 @@ def _said(process: subprocess.Popen[str]) -> Iterator[tuple[str, str]]:
 
 
 def _error(process: subprocess.Popen[str], said: list[str]) -> RuntimeError:
-    code = process.wait()
+    code = wait(process)
     how = f"the learner was ended by {signal.Signals(-code).name}" if code < 0 else f"the learner ended with exit code {code}"
     return RuntimeError("\n".join(said).removeprefix("error: ") or how)
 
