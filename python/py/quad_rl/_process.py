@@ -39,17 +39,15 @@ def start(command: Sequence[str], *, ends_with_thread: bool = False, **settings:
     return subprocess.Popen(command, start_new_session=True, preexec_fn=ends, **settings)
 
 
-def wait(process: subprocess.Popen[Any]) -> int:
-    """Waits for its end, and gives its exit code. Raises RuntimeError if another part of this process took that."""
-    if process.returncode is None:
-        try:
-            os.waitid(os.P_PID, process.pid, os.WEXITED | os.WNOWAIT)
-        except ChildProcessError:  # Popen would say that it was a success.
-            raise RuntimeError(
-                "how the learner ended is not known, since another part of this process waits for all children or ignores SIGCHLD"
-                "\nhint: `learner list` says how far the run is"
-            ) from None
-    return process.wait()
+def exit_code(process: subprocess.Popen[Any]) -> int | None:
+    """Waits for its end, and gives its exit code; None if another part of this process took it, which Popen takes for 0."""
+    try:
+        ended = os.waitid(os.P_PID, process.pid, os.WEXITED)
+    except ChildProcessError:
+        return None
+    assert ended
+    process.returncode = ended.si_status if ended.si_code == os.CLD_EXITED else -ended.si_status
+    return process.returncode
 
 
 def _end_with_thread() -> None:

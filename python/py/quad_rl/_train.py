@@ -20,7 +20,7 @@ from typing import Any, TextIO
 
 from quad_rl import _quad_rl
 from quad_rl._dataset import Dataset
-from quad_rl._process import start, wait
+from quad_rl._process import exit_code, start
 from quad_rl._runs import metrics, runs
 
 _LINE = re.compile(r"\S+Z +([A-Z]+) (.*)")
@@ -66,7 +66,7 @@ class Run:
             if page := _PAGE.match(text):
                 return page[1]
             said.append(text)
-        raise _error(process, said)
+        raise _error(exit_code(process), said)
 
     def __repr__(self) -> str:
         return f"Run({str(self.folder)!r})"
@@ -113,8 +113,9 @@ def train(
             process.wait()
             display.say("\n".join(error))
             raise
-    if wait(process) != 0:
-        raise _error(process, error)
+    code = exit_code(process)
+    if code != 0:
+        raise _error(code, error)
     return Run(run_dir)
 
 
@@ -187,9 +188,13 @@ def _said(process: subprocess.Popen[str]) -> Iterator[tuple[str, str]]:
         yield (logged[1], logged[2]) if logged else ("", line.rstrip("\n"))
 
 
-def _error(process: subprocess.Popen[str], said: list[str]) -> RuntimeError:
-    code = wait(process)
-    how = f"the learner was ended by {signal.Signals(-code).name}" if code < 0 else f"the learner ended with exit code {code}"
+def _error(code: int | None, said: list[str]) -> RuntimeError:
+    if code is None:
+        how = "how the learner ended is not known: another part of this process waits for its children, or ignores their ends"
+    elif code < 0:
+        how = f"the learner was ended by {signal.Signals(-code).name}"
+    else:
+        how = f"the learner ended with exit code {code}"
     return RuntimeError("\n".join(said).removeprefix("error: ") or how)
 
 
