@@ -76,9 +76,9 @@ def test_it_ends_with_python_and_goes_on(by, data, tmp_path):
     assert [(row["step"], row["episodes"], row["complete"]) for row in run.scores] == [(20, 4, True), (40, 4, True)]
 
 
-def run(script, *arguments, shell="exec \"$@\"", **environment):
-    """What a script prints that a shell starts so."""
-    command = ["sh", "-c", shell, "sh", sys.executable, "-c", script, *map(str, arguments)]
+def run(script, *arguments, launcher=(), **environment):
+    """What a script prints that another program starts."""
+    command = [*launcher, sys.executable, "-c", script, *map(str, arguments)]
     ended = subprocess.run(command, cwd=pathlib.Path(__file__).parent, capture_output=True, text=True, timeout=600,
                            env=os.environ | environment)
     assert ended.returncode == 0, ended.stderr
@@ -122,7 +122,7 @@ train(sys.argv[1], steps=1)
 
 
 def test_a_learner_that_failed_is_no_success_where_the_ends_of_children_are_ignored(data, tmp_path):
-    said = run(FAILS, data, tmp_path / "run", shell="trap '' CHLD; exec \"$@\"")  # As some init scripts start programs.
+    said = run(FAILS, data, tmp_path / "run", launcher=["env", "--ignore-signal=CHLD"])  # As some init scripts start programs.
     first, killed, unknown, success = [line for line in said.splitlines() if not line.startswith((" ", "hint:"))]
     assert first.startswith("cannot read /nowhere.hdf5") and killed == "the learner was ended by SIGKILL", said
     assert unknown.startswith("how the learner ended is not known") and success == f"Run('{tmp_path / 'run'}')", said
@@ -142,7 +142,7 @@ files[0].write("done")
 
 
 def test_without_standard_streams_everything_works_and_no_file_is_taken_for_one(data, tmp_path):
-    run(CLOSED, data, tmp_path, shell='exec "$@" <&- >&- 2>&-')
+    run(CLOSED, data, tmp_path, launcher=["sh", "-c", 'exec "$@" <&- >&- 2>&-', "sh"])
     assert [(tmp_path / f"file{number}").read_text() for number in range(3)] == ["done", "", ""]
 
 

@@ -16,7 +16,7 @@ use zenoh::liveliness::LivelinessToken;
 use zenoh::query::Query;
 use zenoh::{Session, Wait};
 
-const PATIENCE: Duration = Duration::from_secs(60);
+const PATIENCE: Duration = Duration::from_secs(120);
 const INCARNATION: u64 = 7;
 
 /// What an evaluator has said.
