@@ -7,6 +7,8 @@ import signal
 import socket
 import subprocess
 import sys
+import threading
+import time
 import urllib.request
 
 import pytest
@@ -89,6 +91,16 @@ def test_a_page_is_found_whatever_the_log_shows(data, tmp_path):
     train(tmp_path / "run", data, "--task", "own-data", "--steps", "1")
     script = "import sys, quad_rl; print(quad_rl.Run(sys.argv[1]).page)"
     assert run(script, tmp_path / "run", RUST_LOG="warn").startswith("http://127.0.0.1:")
+
+    # It stays when the thread that asked for it is gone.
+    asked = quad_rl.Run(tmp_path / "run")
+    thread = threading.Thread(target=lambda: asked.page)
+    thread.start()
+    thread.join()
+    time.sleep(1)
+    assert urllib.request.urlopen(asked.page, timeout=600).status == 200
+    with pytest.raises(RuntimeError, match="there is no folder .*nothing(.|\n)*hint: "):
+        quad_rl.Run(tmp_path / "nothing").page
 
 
 FAILS = """

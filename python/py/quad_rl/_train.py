@@ -12,10 +12,12 @@ import subprocess
 import sys
 import sysconfig
 import tempfile
+import threading
 from collections.abc import Iterator, Mapping
 from functools import cached_property
 from os import PathLike
 from pathlib import Path
+from queue import SimpleQueue
 from typing import Any, TextIO
 
 from quad_rl import _quad_rl
@@ -60,16 +62,30 @@ class Run:
     @cached_property
     def page(self) -> str:
         """Address of its page, which `learner page` serves from the first access to the end of this process."""
-        process = _start("page", str(self.folder), "--http=127.0.0.1:0")
-        said = []
-        for _, text in _said(process):
-            if page := _PAGE.match(text):
-                return page[1]
-            said.append(text)
-        raise _error(exit_code(process), said)
+        answer: SimpleQueue[str | Exception] = SimpleQueue()
+        # The program ends with the thread that starts it, so that must not be the caller's.
+        threading.Thread(target=_serve_page, args=(self.folder, answer), daemon=True).start()
+        page = answer.get()
+        if isinstance(page, Exception):
+            raise page
+        return page
 
     def __repr__(self) -> str:
         return f"Run({str(self.folder)!r})"
+
+
+def _serve_page(folder: Path, answer: SimpleQueue[str | Exception]) -> None:
+    """Answers with the address, or with what is wrong, and reads the program's log to its end."""
+    try:
+        process = _start("page", str(folder), "--http=127.0.0.1:0")
+        said = []
+        for _, text in _said(process):
+            if page := _PAGE.match(text):
+                answer.put(page[1])
+            said.append(text)
+        raise _error(exit_code(process), said)
+    except (RuntimeError, OSError) as error:
+        answer.put(error)
 
 
 def train(
