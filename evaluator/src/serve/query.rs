@@ -11,6 +11,8 @@ use crate::metrics::Metrics;
 
 /// Most answers to one query that wait; one is enough, and few peers answer.
 const MOST_ANSWERS: usize = 64;
+/// Zenoh's own error where an answer has not come in time. It looks like a learner's, which it is not.
+const LATE: &[u8] = b"Timeout";
 /// Most bytes of a learner's error in a message.
 const LONGEST_ERROR: usize = 200;
 
@@ -51,7 +53,8 @@ pub async fn ask<A: Message + Send + 'static>(
         let (session, metrics, key) = (session.clone(), metrics.clone(), key.clone());
         move || {
             let callback = move |reply: Reply| {
-                if !tell.is_closed() {
+                let is_late = reply.result().err().is_some_and(|error| *error.payload().to_bytes() == *LATE);
+                if !is_late && !tell.is_closed() {
                     tell.try_send(read(&reply, &metrics, &fitting)).ok();
                 }
             };

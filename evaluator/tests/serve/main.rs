@@ -110,7 +110,9 @@ async fn an_evaluator_leaves_in_time_though_its_learner_hangs() {
     let (evaluator, _tokens) = learner.evaluator().await;
     learner.wait_for_scores(1).await;
     assert!(evaluator.leave().success());
+    // A learner that hangs has said nothing of the scores. When it goes on, it finds that the job is handed back.
     learner.answer(Answer::Nothing);
+    assert_eq!(learner.wait_for(handed_back).await, None);
 }
 
 #[tokio::test(flavor = "multi_thread")]
