@@ -26,6 +26,13 @@ def test_quad_convert_is_on_the_path():
     assert "--observations" in said
 
 
+def test_what_quad_convert_prints_may_be_read_in_part():
+    script = "from quad_rl._convert import _print; _print('line\\n' * 100_000)"
+    process = subprocess.Popen([sys.executable, "-c", script], stdout=subprocess.PIPE, stderr=subprocess.PIPE)
+    process.stdout.close()
+    assert (process.stderr.read(), process.wait(600)) == (b"", 0)
+
+
 def test_the_programs_need_no_library_but_the_systems_and_the_wheels():
     for file in [BIN / "learner", BIN / "evaluator", pathlib.Path(quad_rl.__file__).parent / "_quad_rl.abi3.so"]:
         for line in subprocess.run(["ldd", file], check=True, capture_output=True, text=True, timeout=600).stdout.splitlines():
