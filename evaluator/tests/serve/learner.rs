@@ -102,7 +102,10 @@ fn answer_scores(query: &Query, answer: &Mutex<Answer>, new: u32) {
             query.reply_err("No space left on device").wait().unwrap();
         }
         Answer::Refused => {
-            reply(query, &ScoreReply::Refused { incarnation: INCARNATION, reason: "they are of another sum".to_owned() });
+            reply(
+                query,
+                &ScoreReply::Refused { incarnation: INCARNATION, reason: "they are of another sum".to_owned() },
+            );
         }
         Answer::Nothing | Answer::NoClaim | Answer::LostHandBack => {}
         Answer::Hang => {

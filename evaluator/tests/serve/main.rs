@@ -154,7 +154,9 @@ async fn a_job_is_handed_back_until_the_learner_answers_and_nothing_is_claimed_b
     learner.answer(Answer::LostHandBack);
     let (_evaluator, _token) = learner.only_evaluator().await;
     learner.give(job(&learner.snapshot));
-    learner.wait_for(|heard| (handed_back(heard).is_some() && matches!(heard.last(), Some(Heard::Claim(_)))).then_some(())).await;
+    learner
+        .wait_for(|heard| (handed_back(heard).is_some() && matches!(heard.last(), Some(Heard::Claim(_)))).then_some(()))
+        .await;
     let heard = learner.heard.lock().unwrap();
     let is_back = |heard: &Heard| matches!(heard, Heard::HandedBack(_));
     let (first, last) = (heard.iter().position(is_back).unwrap(), heard.iter().rposition(is_back).unwrap());

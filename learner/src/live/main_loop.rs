@@ -222,7 +222,9 @@ impl MainLoop {
                 Saved::Scores => "scores wait for it; evaluators keep theirs",
             };
             let silent = STUCK.as_secs();
-            self.display.say(&format!("nothing was saved for {silent} s, as the disk hangs or the machine is too busy: {waits}"));
+            self.display.say(&format!(
+                "nothing was saved for {silent} s, as the disk hangs or the machine is too busy: {waits}"
+            ));
         }
         *told = hangs;
     }
