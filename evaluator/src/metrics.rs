@@ -11,7 +11,7 @@ pub enum JobOutcome {
     Scored,
     /// The evaluator gave it up: it is leaving and hands the job back, or the learner refused the scores or never came back.
     Abandoned,
-    /// The evaluator could not use its weights or its environment, or the policy could not act.
+    /// The evaluator could not use its weights or its environment, the policy could not act, or a return does not count.
     Failed,
 }
 

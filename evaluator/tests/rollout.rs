@@ -91,10 +91,13 @@ fn a_policy_that_fails_stops_the_batch_where_it_is() {
     assert_eq!(rollout.environment_steps(), 4);
 }
 
-/// An environment of another make: it observes and pays how many steps it has taken, and breaks down in the third if it is to.
+/// An environment of another make: it observes and pays how many steps it has taken. In the third it breaks down if it is to,
+/// or pays something else.
 struct Made {
     steps: [f64; 2],
     breaks: bool,
+    pays: Option<f64>,
+    worth: f64,
 }
 
 impl Environment for Made {
@@ -109,7 +112,8 @@ impl Environment for Made {
         if self.breaks && self.steps[0] == 3.0 {
             return Err(EnvironmentError::Failed { name: "made".to_owned(), reason: "a cable is loose".to_owned() });
         }
-        Ok(Step { reward: self.steps[0], terminated: self.steps[0] == 4.0, truncated: false })
+        let reward = self.pays.filter(|_| self.steps[0] == 3.0).unwrap_or(self.steps[0]);
+        Ok(Step { reward, terminated: self.steps[0] == 4.0, truncated: false })
     }
 
     fn observation(&self) -> &[f64] {
@@ -117,12 +121,16 @@ impl Environment for Made {
     }
 
     fn score(&mut self, episode_return: f64) -> Result<f64, EnvironmentError> {
-        Ok(episode_return / 10.0)
+        Ok(episode_return * self.worth)
     }
 }
 
 fn made(breaks: bool, sizes: (usize, usize)) -> Result<Vec<EpisodeOutcome>, EnvironmentError> {
-    let make = || Ok(Box::new(Made { steps: [0.0; 2], breaks }) as Box<dyn Environment>);
+    roll_out(|| Made { steps: [0.0; 2], breaks, pays: None, worth: 0.1 }, sizes)
+}
+
+fn roll_out(made: impl Fn() -> Made, sizes: (usize, usize)) -> Result<Vec<EpisodeOutcome>, EnvironmentError> {
+    let make = || Ok(Box::new(made()) as Box<dyn Environment>);
     let mut rollout = Rollout::new(make, sizes, &[7, 8], |_| ())?;
     while !rollout.is_done() {
         rollout.step(|observations, _, actions| {
@@ -145,4 +153,20 @@ fn an_environment_that_breaks_down_or_does_not_fit_says_so() {
     let error = |breaks, sizes| made(breaks, sizes).unwrap_err().to_string();
     assert_eq!(error(true, (2, 1)), "the environment \"made\" failed: a cable is loose");
     assert_eq!(error(false, (3, 1)), "an observation has 2 numbers, but the policy takes 3");
+}
+
+/// No episode counts whose return or score a learner would refuse; one that cannot come right again does not go on.
+#[test]
+fn a_return_or_score_that_cannot_count_is_told_as_soon_as_it_is_known() {
+    let told = |pays, worth| roll_out(|| Made { steps: [0.0; 2], breaks: false, pays: Some(pays), worth }, (2, 1));
+    for (pays, worth, sentence) in [
+        (f64::NAN, 0.1, "the return of the episode with seed 8 is NaN after 3 steps"),
+        (f64::NEG_INFINITY, 0.1, "the return of the episode with seed 8 is -inf after 3 steps"),
+        (2e12, 0.1, "the return of the episode with seed 8 is 2000000000007 after 4 steps"),
+        (3.0, f64::NAN, "the score of the episode with seed 8 is NaN after 4 steps"),
+        (3.0, -1e12, "the score of the episode with seed 8 is -10000000000000 after 4 steps"),
+    ] {
+        assert_eq!(told(pays, worth).unwrap_err().to_string(), format!("{sentence}, not a finite number up to 1e12"));
+    }
+    assert_eq!(told(1e12 - 7.0, 1.0).unwrap()[0].score, 1e12, "the largest that counts");
 }

@@ -129,6 +129,11 @@ impl LocalEvaluators {
         command
     }
 
+    /// The log of the first, if there is one.
+    pub fn log(&self) -> Option<&Path> {
+        self.places.first().map(|place| place.log.as_path())
+    }
+
     /// Starts others in place of evaluators that have ended by themselves, and returns log lines about them.
     pub fn news(&mut self) -> Vec<String> {
         self.places.iter_mut().filter_map(|place| place.look(Instant::now())).collect()

@@ -21,6 +21,17 @@ pub struct EpisodeScore {
     pub score: f64,
 }
 
+impl EpisodeScore {
+    /// Largest return or score that counts, whichever its sign. It is far above any use; statistics of larger ones would not
+    /// be finite.
+    pub const LARGEST: f64 = 1e12;
+
+    /// Whether a return or a score is finite and no larger than [`LARGEST`](Self::LARGEST).
+    pub fn counts(value: f64) -> bool {
+        value.abs() <= Self::LARGEST
+    }
+}
+
 /// An evaluator delivers the episodes of a job. The learner records them even if the job has gone to another evaluator, or an
 /// earlier incarnation of the learner handed it out: what counts is that run, step, weights and seeds are those of an evaluation.
 #[derive(Clone, Debug, PartialEq, Encode, Decode)]

@@ -42,7 +42,7 @@ def train(folder, data, *arguments, layers=True):
     narrow = ["--agent", "critic=" + SMALL % ("mish", "false"), "--agent", "actor=" + SMALL % ("mish", "false")]
     given = [a.split("=")[0] for a in arguments]
     narrow = [x for pair in zip(narrow[::2], narrow[1::2]) if layers and pair[1].split("=")[0] not in given for x in pair]
-    subprocess.run([*command, *narrow, *arguments], check=True, capture_output=True, timeout=60)
+    subprocess.run([*command, *narrow, *arguments], check=True, capture_output=True, timeout=600)
     return sorted((folder / "snapshots").iterdir())[-1]
 
 
@@ -70,14 +70,14 @@ def hopper_runs(tmp_path_factory, data):
         arguments = ["learner", "train", "--task", "hopper-demo", "--dataset", str(data), "--run-dir", str(run), "--steps", "20",
                      "--eval-interval", "10", "--episodes", "3", "--seed", str(seed), "--listen", "tcp/127.0.0.1:0"]
         learner = subprocess.Popen(arguments, stderr=subprocess.PIPE)
-        until = time.monotonic() + 60
+        until = time.monotonic() + 600
         while not (run / "endpoints.json").exists():
             assert learner.poll() is None and time.monotonic() < until, learner.stderr.read()
             time.sleep(0.05)
         endpoint = json.loads((run / "endpoints.json").read_text())["zenoh"][0]
         evaluator = subprocess.Popen(["evaluator", "serve", "--connect", endpoint], stderr=subprocess.DEVNULL)
         try:
-            _, log = learner.communicate(timeout=60)
+            _, log = learner.communicate(timeout=600)
             assert learner.returncode == 0, log.decode()
         finally:
             for process in (learner, evaluator):

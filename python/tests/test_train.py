@@ -1,11 +1,14 @@
 """`quad_rl.train` is the program `learner train`, with its words."""
 
 import io
+import os
 import pathlib
 import signal
 import socket
 import subprocess
 import sys
+import threading
+import time
 import urllib.request
 
 import pytest
@@ -25,13 +28,13 @@ def test_it_trains_as_the_program_does(data, tmp_path, capsys):
     flags += ["--algorithm", "iql", "--steps", "300", "--scale", "actions,states"]
     train(tmp_path / "program", data, "--task", "own-data", *flags)
     same = ["learner", "verify", run.folder, "--same-as", tmp_path / "program"]
-    compared = subprocess.run(same, capture_output=True, text=True, timeout=60)
+    compared = subprocess.run(same, capture_output=True, text=True, timeout=600)
     assert compared.returncode == 0, compared.stdout + compared.stderr
 
     said = capsys.readouterr().err.splitlines()
     assert " transitions of " in said[0] and said[2].startswith("page: http://") and said[-1] == "training is done"
     assert run.policy().step == run.policy(300).step == 300 and run.scores == [] and run.metrics[-1]["step"] == 300
-    assert urllib.request.urlopen(run.page, timeout=60).status == 200 and run.page == run.page
+    assert urllib.request.urlopen(run.page, timeout=600).status == 200 and run.page == run.page
     with pytest.raises(FileNotFoundError, match="no snapshot after step 7"):
         run.policy(7)
 
@@ -65,7 +68,7 @@ def test_it_ends_with_python_and_goes_on(by, data, tmp_path):
         said.append(process.stderr.readline())
     (learner,) = children(process.pid)
     process.send_signal(by)
-    rest = process.communicate(timeout=60)[1]
+    rest = process.communicate(timeout=600)[1]
     if by == signal.SIGINT:
         assert "interrupted before the end" in rest and "\nhint: everything up to" in rest and "KeyboardInterrupt" in rest
     wait(lambda: not pathlib.Path("/proc", learner).exists() or ") Z" in pathlib.Path("/proc", learner, "stat").read_text())
@@ -73,6 +76,101 @@ def test_it_ends_with_python_and_goes_on(by, data, tmp_path):
     with quad_rl.Evaluators("walk", lambda seed: Walk(), connect=endpoint, workers=1):
         run = quad_rl.train(data, **arguments)
     assert [(row["step"], row["episodes"], row["complete"]) for row in run.scores] == [(20, 4, True), (40, 4, True)]
+
+
+def run(script, *arguments, launcher=(), **environment):
+    """What a script prints that another program starts."""
+    command = [*launcher, sys.executable, "-c", script, *map(str, arguments)]
+    ended = subprocess.run(command, cwd=pathlib.Path(__file__).parent, capture_output=True, text=True, timeout=600,
+                           env=os.environ | environment)
+    assert ended.returncode == 0, ended.stderr
+    return ended.stdout
+
+
+def test_a_page_is_found_whatever_the_log_shows(data, tmp_path):
+    train(tmp_path / "run", data, "--task", "own-data", "--steps", "1")
+    script = "import sys, quad_rl; print(quad_rl.Run(sys.argv[1]).page)"
+    assert run(script, tmp_path / "run", RUST_LOG="warn").startswith("http://127.0.0.1:")
+
+    # It stays when the thread that asked for it is gone.
+    asked = quad_rl.Run(tmp_path / "run")
+    thread = threading.Thread(target=lambda: asked.page)
+    thread.start()
+    thread.join()
+    time.sleep(1)
+    assert urllib.request.urlopen(asked.page, timeout=600).status == 200
+    with pytest.raises(RuntimeError, match="there is no folder .*nothing(.|\n)*hint: "):
+        quad_rl.Run(tmp_path / "nothing").page
+
+
+FAILS = """
+import ctypes, os, signal, sys, threading, time
+import quad_rl
+
+def train(dataset, **arguments):
+    try:
+        print(quad_rl.train(dataset, run_dir=sys.argv[2], fresh=True, **arguments))
+    except RuntimeError as error:
+        print(error)
+
+def children():
+    return [child for task in os.listdir("/proc/self/task") for child in open(f"/proc/self/task/{task}/children").read().split()]
+
+def kill(ignored):
+    while not children():
+        time.sleep(0.01)
+    if ignored:
+        ctypes.CDLL(None).signal(signal.SIGCHLD, 1)
+    os.kill(int(children()[0]), signal.SIGKILL)
+
+train("/nowhere.hdf5")
+for ignored in (False, True):
+    killer = threading.Thread(target=kill, args=(ignored,))
+    killer.start()
+    train(sys.argv[1], steps=10**9)
+    killer.join()
+train(sys.argv[1], steps=1)
+"""
+
+
+def test_a_learner_that_failed_is_no_success_where_the_ends_of_children_are_ignored(data, tmp_path):
+    said = run(FAILS, data, tmp_path / "run", launcher=["env", "--ignore-signal=CHLD"])  # As some init scripts start programs.
+    first, killed, unknown, success = [line for line in said.splitlines() if not line.startswith((" ", "hint:"))]
+    assert first.startswith("cannot read /nowhere.hdf5") and killed == "the learner was ended by SIGKILL", said
+    assert unknown.startswith("how the learner ended is not known") and success == f"Run('{tmp_path / 'run'}')", said
+
+
+CLOSED = """
+import sys
+files = [open(f"{sys.argv[2]}/file{number}", "w") for number in range(3)]
+import quad_rl, test_evaluate
+assert [file.fileno() for file in files] == [0, 1, 2] and sys.stderr is None
+run = quad_rl.train(sys.argv[1], run_dir=f"{sys.argv[2]}/run", steps=1)
+run.page
+with quad_rl.Evaluators("walk", lambda seed: test_evaluate.Walk(), connect="tcp/127.0.0.1:1", workers=1):
+    pass
+files[0].write("done")
+"""
+
+
+def test_without_standard_streams_everything_works_and_no_file_is_taken_for_one(data, tmp_path):
+    run(CLOSED, data, tmp_path, launcher=["sh", "-c", 'exec "$@" <&- >&- 2>&-', "sh"])
+    assert [(tmp_path / f"file{number}").read_text() for number in range(3)] == ["done", "", ""]
+
+
+def test_where_nothing_can_be_shown_the_learner_goes_on(monkeypatch):
+    class Gone(io.StringIO):
+        def write(self, text):
+            raise BrokenPipeError
+
+    monkeypatch.setattr(_train, "_said", lambda process: [("INFO", "page: http://127.0.0.1:1/"), ("", "error: no")])
+    closed = io.StringIO()
+    closed.close()
+    for stream in (Gone(), closed, None):
+        monkeypatch.setattr(sys, "stderr", stream)
+        error = []
+        _train._Display().follow(None, error)
+        assert error == ["error: no"]
 
 
 def test_a_bar_stays_in_its_place(monkeypatch):

@@ -48,7 +48,7 @@ pub fn shutdown_signal(within: Duration) -> impl Future<Output = ()> + Send {
                 ENDED_AT_ONCE
             }
             Err(_) => {
-                warn!("{} s after {name} something still hangs: ending without it", within.as_secs());
+                warn!("{} s after {name} something has not ended: ending without it", within.as_secs());
                 UNFINISHED
             }
         };

@@ -2,11 +2,12 @@
 
 use std::path::{Path, PathBuf};
 use std::process::Command;
+use std::time::Instant;
 
 use tempfile::{TempDir, tempdir};
 use zenoh::{Config, Session};
 
-use crate::peers;
+use crate::{PATIENCE, peers};
 
 /// A folder of certificates, one of each role, besides an expired one.
 pub struct Certificates {
@@ -60,7 +61,18 @@ impl Certificates {
     }
 }
 
-/// Connects with the certificate in `folder`, or with none, and trusts the authority of `trusted`.
+/// Connects with the certificate in `folder`, which is to be let in, and trusts the authority of `trusted`.
+pub async fn come_in(endpoint: &str, trusted: &Path, folder: &Path) -> Session {
+    let deadline = Instant::now() + PATIENCE;
+    loop {
+        match connect(endpoint, trusted, Some(folder)).await {
+            Ok(session) => return session,
+            Err(error) => assert!(Instant::now() < deadline, "{folder:?} does not come in: {error}"),
+        }
+    }
+}
+
+/// Connects with the certificate in `folder`, or with none, and trusts the authority of `trusted`. Gives up soon.
 pub async fn connect(endpoint: &str, trusted: &Path, folder: Option<&Path>) -> zenoh::Result<Session> {
     let mut config = Config::default();
     let mut settings = vec![

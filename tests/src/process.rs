@@ -119,7 +119,7 @@ impl Process {
     pub fn terminate(&mut self, patience: Duration) -> ExitStatus {
         self.signal("TERM");
         let status = self.wait(patience);
-        assert!(!self.log().contains("something still hangs"), "{} had to end itself", self.name);
+        assert!(!self.log().contains("something has not ended"), "{} had to end itself", self.name);
         status
     }
 }

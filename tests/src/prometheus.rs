@@ -17,13 +17,13 @@ pub struct Prometheus {
     _process: Process,
 }
 
-/// Starts Debian's Prometheus with our alert rules, which scrapes the pages of each job twice a second.
+/// Starts Debian's Prometheus with our alert rules, which scrapes the pages of each job every second.
 pub fn start(scratch: &Scratch, jobs: &[(&str, &[String])]) -> Prometheus {
     let configuration = scratch.path().join("prometheus.yml");
     let rules = Path::new(env!("CARGO_MANIFEST_DIR")).join("../deploy/prometheus/alerts.yml");
     let mut text = format!("global:\n  evaluation_interval: 500ms\nrule_files: [{rules:?}]\nscrape_configs:\n");
     for (job, pages) in jobs {
-        text.push_str(&format!("- job_name: {job}\n  scrape_interval: 500ms\n  scrape_timeout: 500ms\n"));
+        text.push_str(&format!("- job_name: {job}\n  scrape_interval: 1s\n  scrape_timeout: 1s\n"));
         text.push_str(&format!("  static_configs:\n  - targets: {pages:?}\n"));
     }
     fs::write(&configuration, text).expect("the scratch folder is writable");

@@ -1,43 +1,32 @@
-//! All communication with the learner of one run: jobs, snapshots, progress, scores.
+//! All communication with the learner of one run: jobs, snapshots, progress; `delivery` has scores and jobs that go back.
+
+mod delivery;
 
 use std::collections::BTreeSet;
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use anyhow::Context;
-use quad_protocol::{Job, JobReply, JobRequest, Name, Progress, ScoreReply, ScoreReport, Snapshot, encode, keys};
+use quad_protocol::{Job, JobReply, JobRequest, Name, Progress, Snapshot, encode, keys};
 use rand::Rng;
-use tracing::{debug, info, warn};
+use tracing::{debug, warn};
 use zenoh::liveliness::LivelinessToken;
 use zenoh::qos::CongestionControl;
 use zenoh::{Session, Wait};
 
 use super::discovery::Found;
-use super::query::{AskError, ask, may_block};
+use super::query::{ask, may_block};
 use super::scheduler::Turn;
 use super::snapshot::{Listener, Snapshots, is_named_by};
-use crate::metrics::{JobOutcome, Metrics};
+use crate::metrics::Metrics;
+use delivery::Owed;
 
-/// A learner answers in milliseconds; one that takes this long hangs, and other runs wait meanwhile.
+/// A learner answers in milliseconds; for one that hangs or is very busy, other runs do not wait longer than this.
 pub const ANSWER_TIMEOUT: Duration = Duration::from_secs(5);
 /// Patience with a learner that sends a snapshot, which has megabytes.
 const WEIGHTS_TIMEOUT: Duration = Duration::from_secs(30);
 /// Limits of the pause that a learner without work may ask for: the learner gets no flood of queries, and loses no evaluator.
 const PAUSE: [Duration; 2] = [Duration::from_millis(20), Duration::from_secs(60)];
-/// How long a leaving evaluator tries to deliver its scores; it tries half as long to hand a job back.
-const LEAVE: Duration = Duration::from_secs(2);
-/// A leaving evaluator delivers scores again this long after the learner answered with an error.
-const AGAIN: Duration = Duration::from_millis(100);
-/// Most characters of a reason that the evaluator sends: the learner accepts no large messages.
-const LONGEST_REASON: usize = 1000;
-
-/// What an evaluator owes a learner. While it owes anything, it claims no job.
-enum Owed {
-    /// The episodes of a job.
-    Episodes { job: u64, incarnation: u64 },
-    /// Scores that the learner has not acknowledged.
-    Scores(ScoreReport),
-}
 
 /// An evaluator's side of one run.
 pub struct RunClient {
@@ -119,7 +108,6 @@ impl RunClient {
     fn turn_to(&mut self, incarnation: u64) {
         debug!(run = %self.run, incarnation, "following a learner");
         self.incarnation = incarnation;
-        self.attempt = None;
         self.listener.follow(incarnation);
         self.turn.wake(Instant::now());
     }
@@ -142,11 +130,6 @@ impl RunClient {
         self.turn.failed(Instant::now());
     }
 
-    /// Whether scores wait for an acknowledgement.
-    pub fn has_scores(&self) -> bool {
-        matches!(self.owed, Some(Owed::Scores(_)))
-    }
-
     /// Claims a job in one of these environments; `None` if there is none now.
     pub async fn claim(&mut self, environments: Vec<String>) -> anyhow::Result<Option<Job>> {
         // The same number until there is an answer: if only the answer was lost, the learner repeats the job.
@@ -163,7 +146,7 @@ impl RunClient {
         self.attempt = None;
         match answer {
             JobReply::Job(job) => {
-                self.owed = Some(Owed::Episodes { job: job.id, incarnation: job.incarnation });
+                self.owed = Some(Owed::Job { id: job.id, incarnation: job.incarnation, failed: None });
                 Ok(Some(job))
             }
             JobReply::Wait { milliseconds, .. } => {
@@ -203,93 +186,6 @@ impl RunClient {
         let put = self.session.put(keys::progress(&self.run, &self.evaluator), message);
         if let Err(error) = put.congestion_control(CongestionControl::Drop).wait() {
             debug!(run = %self.run, "cannot publish progress: {error}");
-        }
-    }
-
-    /// Keeps the scores of the claimed job for delivery.
-    pub fn keep(&mut self, report: ScoreReport) {
-        self.owed = Some(Owed::Scores(report));
-    }
-
-    /// Delivers the kept scores to the learner process that this evaluator follows. Keeps them after an error.
-    pub async fn deliver(&mut self, timeout: Duration) -> anyhow::Result<()> {
-        let Some(Owed::Scores(report)) = &self.owed else { return Ok(()) };
-        let incarnation = self.incarnation;
-        let fitting = move |reply: &ScoreReply| is_from(incarnation, reply.incarnation());
-        let key = keys::scores(&self.run);
-        let answer = ask(&self.session, key, encode(report)?, timeout, &self.metrics, fitting).await?;
-        let (run, step) = (&self.run, report.step);
-        match answer {
-            ScoreReply::Recorded { new, duplicates, .. } => {
-                let scores = report.episodes.iter().map(|episode| episode.score);
-                let mean = scores.clone().sum::<f64>() / report.episodes.len().max(1) as f64;
-                info!(%run, step, new, duplicates, "scores delivered, mean {mean:.2}");
-                scores.for_each(|score| self.metrics.episode_score.observe(score));
-                self.metrics.job(JobOutcome::Scored);
-            }
-            ScoreReply::Refused { reason, .. } => {
-                warn!(%run, step, "the learner refused the scores: {reason}");
-                self.metrics.job(JobOutcome::Abandoned);
-            }
-        }
-        self.owed = None;
-        self.complaint.clear();
-        self.turn.done(Instant::now(), Duration::ZERO);
-        Ok(())
-    }
-
-    /// Hands back the claimed job, which this evaluator could not run.
-    pub async fn fail(&mut self, reason: &str) {
-        self.metrics.job(JobOutcome::Failed);
-        self.hand_back(Some(reason.chars().take(LONGEST_REASON).collect())).await;
-    }
-
-    /// Before this evaluator ends: delivers the scores, or hands the job back, within a time limit.
-    pub async fn leave(mut self) {
-        let until = Instant::now() + LEAVE;
-        let mut answered = false;
-        while self.has_scores() {
-            let Err(error) = self.deliver(LEAVE / 2).await else { return };
-            // A learner that answers has received the scores, and may still save them; if it could not, it says why. If the
-            // evaluator handed the job back now, others would run it again.
-            let unusable = matches!(error.downcast_ref(), Some(AskError::Unusable { .. }));
-            answered |= unusable;
-            if !unusable || Instant::now() + AGAIN > until {
-                warn!(run = %self.run, "the learner has not acknowledged the scores: {error:#}");
-                break;
-            }
-            tokio::time::sleep(AGAIN).await;
-        }
-        if !answered {
-            self.hand_back(None).await;
-        }
-    }
-
-    async fn hand_back(&mut self, failed: Option<String>) {
-        let (id, incarnation) = match self.owed.take() {
-            Some(Owed::Episodes { job, incarnation }) => (job, incarnation),
-            Some(Owed::Scores(report)) => (report.job, report.incarnation),
-            None => return,
-        };
-        let fitting = move |reply: &JobReply| match reply {
-            JobReply::HandedBack { incarnation: of, .. } => is_from(incarnation, *of),
-            _ => Err("unexpected"),
-        };
-        let request = JobRequest::HandBack { evaluator: self.evaluator.clone(), job: id, failed };
-        let Ok(request) = encode(&request) else { return };
-        let (run, key) = (&self.run, keys::jobs(&self.run));
-        match ask(&self.session, key, request, LEAVE / 2, &self.metrics, fitting).await {
-            Ok(JobReply::HandedBack { accepted: true, .. }) => info!(%run, "a job was handed back"),
-            other => debug!(%run, ?other, "a job was not taken back"),
-        }
-    }
-
-    /// Stops serving the run, and drops scores that were not acknowledged.
-    pub fn give_up(self) {
-        self.snapshots.forget(&self.run);
-        if let Some(Owed::Scores(report)) = &self.owed {
-            warn!(run = %self.run, step = report.step, "the learner did not come back for its scores");
-            self.metrics.job(JobOutcome::Abandoned);
         }
     }
 }

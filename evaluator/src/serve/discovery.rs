@@ -132,7 +132,7 @@ fn take_in(
         (SampleKind::Delete, Some(found)) => {
             let changed = found.incarnations.remove(&incarnation);
             if found.incarnations.is_empty() {
-                info!(%run, incarnation, "the run's learner is gone");
+                info!(%run, incarnation, "the run's learner has left or lost its connection");
                 runs.remove(&place);
             }
             Ok(changed)

@@ -12,7 +12,7 @@
 //!
 //! - `discovery`: finds the runs, by their learners' liveliness tokens.
 //! - `worker`: the main loop, which serves the runs in turn; `scheduler`: chooses the next run.
-//! - `client`: all communication with the learner of one run; `query`: a query to a learner.
+//! - `client`: all communication with the learner of one run, with `delivery` of scores; `query`: a query to a learner.
 //! - `snapshot`: keeps the newest snapshots; `policy`: makes a policy from one.
 //! - `evaluate`: one job, from its policy to its scores; `job`: all of its episodes, as one batch.
 

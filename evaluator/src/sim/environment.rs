@@ -1,5 +1,6 @@
 //! What an environment is: the interface between a policy and a simulation, in this program or in another language.
 
+use quad_protocol::EpisodeScore;
 use thiserror::Error;
 
 /// The result of one step of an environment.
@@ -58,6 +59,12 @@ pub enum EnvironmentError {
     /// With the environment's own message.
     #[error("the environment \"{name}\" failed: {reason}")]
     Failed { name: String, reason: String },
+    /// No learner would count the episode.
+    #[error(
+        "the {what} of the episode with seed {seed} is {value} after {length} steps, not a finite number up to {:e}",
+        EpisodeScore::LARGEST
+    )]
+    NotCounted { what: &'static str, seed: u64, value: f64, length: u32 },
     /// The library is not the version that this program was built for.
     #[error("MuJoCo could not compile the model of \"{simulation}\": {reason}")]
     Model { simulation: &'static str, reason: String },

@@ -2,6 +2,7 @@
 
 use std::time::{Duration, Instant};
 
+use quad_protocol::EpisodeScore;
 use rayon::prelude::*;
 use serde::Serialize;
 
@@ -93,7 +94,8 @@ impl<S> Rollout<S> {
     ///
     /// # Errors
     ///
-    /// `select` failed, and no episode has advanced; or an environment failed, and the batch is unusable.
+    /// `select` failed, and no episode has advanced; or an environment failed, or an episode's return or score does not count,
+    /// and the batch is unusable.
     pub fn step<E: From<EnvironmentError>>(
         &mut self,
         select: impl FnOnce(&[f32], &mut [S], &mut [f32]) -> Result<(), E>,
@@ -139,7 +141,12 @@ impl<S> Rollout<S> {
             if self.live[row].ended {
                 let Episode { mut environment, index, seed, episode_return, length, .. } = self.live.swap_remove(row);
                 self.states.swap_remove(row);
-                let score = environment.score(episode_return)?;
+                let counted = |what, value| match EpisodeScore::counts(value) {
+                    true => Ok(value),
+                    false => Err(EnvironmentError::NotCounted { what, seed, value, length }),
+                };
+                let episode_return = counted("return", episode_return)?;
+                let score = counted("score", environment.score(episode_return)?)?;
                 self.outcomes.push(EpisodeOutcome { index, seed, episode_return, length, score });
             }
         }
@@ -183,7 +190,8 @@ impl Episode {
         let step = self.environment.step(action)?;
         self.episode_return += step.reward;
         self.length += 1;
-        self.ended = step.terminated || step.truncated;
+        // A sum that is not finite stays so.
+        self.ended = step.terminated || step.truncated || !self.episode_return.is_finite();
         Ok(())
     }
 }

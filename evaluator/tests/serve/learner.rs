@@ -16,7 +16,7 @@ use zenoh::liveliness::LivelinessToken;
 use zenoh::query::Query;
 use zenoh::{Session, Wait};
 
-const PATIENCE: Duration = Duration::from_secs(60);
+const PATIENCE: Duration = Duration::from_secs(120);
 const INCARNATION: u64 = 7;
 
 /// What an evaluator has said.
@@ -40,6 +40,9 @@ pub enum Answer {
     Hang,
     /// No claim is answered.
     NoClaim,
+    Refused,
+    /// The first time that a job is handed back goes without an answer, as if the learner were too busy for it.
+    LostHandBack,
 }
 
 /// A learner that has one job.
@@ -98,7 +101,13 @@ fn answer_scores(query: &Query, answer: &Mutex<Answer>, new: u32) {
             reply(query, &ScoreReply::Refused { incarnation: 99, reason: "not mine".to_owned() });
             query.reply_err("No space left on device").wait().unwrap();
         }
-        Answer::Nothing | Answer::NoClaim => {}
+        Answer::Refused => {
+            reply(
+                query,
+                &ScoreReply::Refused { incarnation: INCARNATION, reason: "they are of another sum".to_owned() },
+            );
+        }
+        Answer::Nothing | Answer::NoClaim | Answer::LostHandBack => {}
         Answer::Hang => {
             while matches!(*answer.lock().unwrap(), Answer::Hang) {
                 std::thread::sleep(Duration::from_millis(20));
@@ -136,7 +145,12 @@ impl Learner {
                     JobRequest::HandBack { failed, .. } => {
                         heard.push(Heard::HandedBack(failed));
                         *job.lock().unwrap() = None;
-                        reply(&query, &JobReply::HandedBack { incarnation: INCARNATION, accepted: true });
+                        let mut answer = answer.lock().unwrap();
+                        if matches!(*answer, Answer::LostHandBack) {
+                            *answer = Answer::Recorded;
+                        } else {
+                            reply(&query, &JobReply::HandedBack { incarnation: INCARNATION, accepted: true });
+                        }
                     }
                     JobRequest::Claim { attempt, .. } => {
                         heard.push(Heard::Claim(attempt));
@@ -207,6 +221,11 @@ impl Learner {
 pub fn reports(heard: &[Heard]) -> Vec<ScoreReport> {
     let report = |heard: &Heard| if let Heard::Scores(report) = heard { Some(report.clone()) } else { None };
     heard.iter().filter_map(report).collect()
+}
+
+/// Why a job was handed back first, if one was.
+pub fn handed_back(heard: &[Heard]) -> Option<Option<String>> {
+    heard.iter().find_map(|heard| if let Heard::HandedBack(failed) = heard { Some(failed.clone()) } else { None })
 }
 
 pub struct Evaluator(Child);

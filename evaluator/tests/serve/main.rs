@@ -9,7 +9,7 @@ use quad_policy::{Precision, load_policy};
 use quad_protocol::{EpisodeScore, Job, ScoreReport, encode, keys};
 use zenoh::qos::CongestionControl;
 
-use learner::{Answer, Heard, Learner, file, job, name, reports, snapshot};
+use learner::{Answer, Heard, Learner, file, handed_back, job, name, reports, snapshot};
 
 /// The scores that `job` must have, to the last bit.
 fn expected(job: &Job, file: &[u8]) -> Vec<EpisodeScore> {
@@ -110,7 +110,9 @@ async fn an_evaluator_leaves_in_time_though_its_learner_hangs() {
     let (evaluator, _tokens) = learner.evaluator().await;
     learner.wait_for_scores(1).await;
     assert!(evaluator.leave().success());
+    // A learner that hangs has said nothing of the scores. When it goes on, it finds that the job is handed back.
     learner.answer(Answer::Nothing);
+    assert_eq!(learner.wait_for(handed_back).await, None);
 }
 
 #[tokio::test(flavor = "multi_thread")]
@@ -132,4 +134,32 @@ async fn a_job_that_fails_is_handed_back_with_the_reason() {
         };
         learner.wait_for(told).await;
     }
+}
+
+/// The learner would else believe for the whole lease that the evaluator is at it.
+#[tokio::test(flavor = "multi_thread")]
+async fn a_job_whose_scores_are_refused_is_handed_back() {
+    let learner = Learner::start(snapshot(file(2))).await;
+    learner.answer(Answer::Refused);
+    learner.give(job(&learner.snapshot));
+    let (_evaluator, _tokens) = learner.evaluator().await;
+    let reason = learner.wait_for(handed_back).await;
+    assert_eq!(reason, Some("it refused the scores: they are of another sum".to_owned()));
+    assert_eq!(learner.count(|heard| matches!(heard, Heard::Scores(_))), 1, "they are not sent again");
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn a_job_is_handed_back_until_the_learner_answers_and_nothing_is_claimed_before() {
+    let learner = Learner::start(snapshot(b"no tensors".to_vec())).await;
+    learner.answer(Answer::LostHandBack);
+    let (_evaluator, _token) = learner.only_evaluator().await;
+    learner.give(job(&learner.snapshot));
+    learner
+        .wait_for(|heard| (handed_back(heard).is_some() && matches!(heard.last(), Some(Heard::Claim(_)))).then_some(()))
+        .await;
+    let heard = learner.heard.lock().unwrap();
+    let is_back = |heard: &Heard| matches!(heard, Heard::HandedBack(_));
+    let (first, last) = (heard.iter().position(is_back).unwrap(), heard.iter().rposition(is_back).unwrap());
+    assert!(first < last, "it is handed back once more: {heard:?}");
+    assert!(!heard[first..last].iter().any(|heard| matches!(heard, Heard::Claim(_))), "{heard:?}");
 }

@@ -172,7 +172,7 @@ async function refresh() {
     showCharts(found);
     showDetails(found);
   } catch (error) {
-    $("health").textContent = `The learner does not answer (${error.message}). What is shown may be old.`;
+    $("health").textContent = `There is no new answer (${error.message}). What is shown may be old.`;
     $("health").className = "bad";
   }
 }

@@ -20,6 +20,8 @@ pub(super) struct OpenJob {
     pub seeds: Vec<u64>,
     /// How long it may stay without progress.
     pub patience: Duration,
+    /// Whether a claim for another job has come under its evaluator's name.
+    pub asked_again: bool,
     handed_out: Instant,
     lease_until: Instant,
     /// Environment steps and episodes of the last accepted progress.
@@ -35,7 +37,8 @@ impl OpenJob {
         patience: Duration,
         now: Instant,
     ) -> Self {
-        Self { evaluator, attempt, step, seeds, patience, handed_out: now, lease_until: now + patience, done: (0, 0) }
+        let (lease_until, done) = (now + patience, (0, 0));
+        Self { evaluator, attempt, step, seeds, patience, asked_again: false, handed_out: now, lease_until, done }
     }
 
     /// Extends the lease, if the evaluator is further than before: one whose simulation hangs loses its job. Before the

@@ -44,13 +44,8 @@ pub(crate) enum Claimed {
         /// True if the job is handed out once more, because the answer was lost.
         again: bool,
     },
-    /// Nothing now.
-    Wait {
-        /// The evaluator is to ask again after this time.
-        time: Duration,
-        /// An evaluator of that name has a job already.
-        has_another: bool,
-    },
+    /// Nothing now; the evaluator is to ask again after this time.
+    Wait(Duration),
 }
 
 /// A job that its evaluator has handed back.

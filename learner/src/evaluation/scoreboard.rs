@@ -91,6 +91,11 @@ impl Scoreboard {
         self.evaluations.values().map(Evaluation::pending).sum()
     }
 
+    /// Evaluations of which episodes are pending.
+    pub fn evaluations_pending(&self) -> usize {
+        self.evaluations.values().filter(|evaluation| evaluation.pending() > 0).count()
+    }
+
     /// Step and seed of the episodes that have no score and are not handed out any more.
     pub fn missing(&self) -> Vec<(u64, u64)> {
         let of = |(&step, evaluation): (&u64, &Evaluation)| -> Vec<_> {
@@ -102,21 +107,25 @@ impl Scoreboard {
     /// Hands out a job: waiting episodes of the oldest step. An evaluator has one job at a time; asked the same again, because
     /// the answer was lost, the answer is the same.
     pub fn claim(&mut self, claim: Claim<'_>, now: Instant) -> Claimed {
-        let wait = |has_another| Claimed::Wait { time: among(claim.present, ASK_AGAIN), has_another };
+        let wait = Claimed::Wait(among(claim.present, ASK_AGAIN));
         if !claim.environments.contains(&self.rules.task.environment) {
-            return Claimed::Wait { time: NOT_FOR_YOU, has_another: false };
+            return Claimed::Wait(NOT_FOR_YOU);
         }
         if let Some((id, job)) = self.jobs.of(claim.evaluator) {
             let same = (job.attempt == claim.attempt).then(|| self.message(id, job, claim.present)).flatten();
-            return same.map_or(wait(true), |job| Claimed::Job { job, again: true });
+            let Some(job) = same else {
+                self.jobs.get_mut(id).into_iter().for_each(|job| job.asked_again = true);
+                return wait;
+            };
+            return Claimed::Job { job, again: true };
         }
         let (id, most) = (self.next_job, self.job_episodes(claim.present));
-        let Some(episodes) = self.hand_out(id, most, now) else { return wait(false) };
+        let Some(episodes) = self.hand_out(id, most, now) else { return wait };
         let job = OpenJob::new(claim.evaluator.clone(), claim.attempt, episodes, self.lease(claim.present), now);
         let message = self.message(id, &job, claim.present);
         self.jobs.insert(id, job);
         self.next_job += 1;
-        message.map_or(wait(false), |job| Claimed::Job { job, again: false })
+        message.map_or(wait, |job| Claimed::Job { job, again: false })
     }
 
     /// Most episodes of a job: half of an evaluator's share of those that wait, so that none is idle in the end. Large jobs
@@ -163,12 +172,14 @@ impl Scoreboard {
         self.jobs.of(evaluator).map(|(_, job)| (job.step, job.episodes_done(), job.seeds.len()))
     }
 
-    /// Extends the lease of the job that an evaluator is at, if the job is further than before.
-    pub fn progress(&mut self, progress: &Progress, now: Instant) -> Result<(), Refusal> {
+    /// Extends the lease of the job that an evaluator is at, if the job is further than before. Gives whether two evaluators
+    /// have one name: an evaluator that is at a job asks for no other, and one that asks is at none.
+    pub fn progress(&mut self, progress: &Progress, now: Instant) -> Result<bool, Refusal> {
         require(progress.run == self.rules.run, Refusal::Run)?;
         require(progress.incarnation == self.rules.incarnation, Refusal::Incarnation)?;
         let job = self.jobs.get_mut(progress.job).ok_or(Refusal::Job)?;
-        job.advance(progress, now)
+        job.advance(progress, now)?;
+        Ok(job.asked_again)
     }
 
     /// Counts the new scores of a report that [`validate`](Self::validate) let pass.

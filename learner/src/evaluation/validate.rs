@@ -9,8 +9,6 @@ use super::scoreboard::Scoreboard;
 
 /// Largest relative difference between a score and the one computed from its return; it allows for rounding only.
 const SCORE_TOLERANCE: f64 = 1e-6;
-/// Largest return or score, far above any use, whichever its sign: the statistics of larger ones would not be finite.
-const LARGEST: f64 = 1e12;
 
 /// A report that passed every check, split into new scores and scores that are recorded already.
 #[derive(Clone, Debug, PartialEq)]
@@ -49,8 +47,8 @@ impl Scoreboard {
         let longest = task.max_episode_steps().unwrap_or(usize::MAX);
         let length_fits = (1..=longest).contains(&(score.length as usize));
         length_fits
-            && score.episode_return.abs() <= LARGEST
-            && expected.abs() <= LARGEST
+            && EpisodeScore::counts(score.episode_return)
+            && EpisodeScore::counts(score.score)
             && (score.score - expected).abs() <= SCORE_TOLERANCE * expected.abs().max(1.0)
     }
 }

@@ -76,9 +76,9 @@ impl Coordinator {
         &self.environment
     }
 
-    /// Whether an evaluator with this environment is connected.
-    pub fn any_fits(&self) -> bool {
-        self.lock().evaluators.any_fits()
+    /// Whether an evaluator is connected that may have this environment.
+    pub fn any_may_fit(&self) -> bool {
+        self.lock().evaluators.any_may_fit()
     }
 
     /// Each connected evaluator and its job, for the page.
@@ -123,18 +123,21 @@ impl Coordinator {
         self.lock().scoreboard.pending()
     }
 
+    /// Evaluations with such episodes.
+    pub fn evaluations_pending(&self) -> usize {
+        self.lock().scoreboard.evaluations_pending()
+    }
+
     /// Answers a claim or a hand-back.
     pub fn job(&self, request: &JobRequest) -> JobReply {
         let mut state = self.lock();
         match request {
             JobRequest::Claim { evaluator, attempt, environments } => {
                 let present = state.evaluators.count();
-                if environments.contains(&self.environment) {
-                    state.evaluators.fits(evaluator);
-                }
+                state.evaluators.asks(evaluator, environments.contains(&self.environment));
                 let claim = Claim { evaluator, attempt: *attempt, environments, present };
                 let claimed = state.scoreboard.claim(claim, Instant::now());
-                self.claimed(&mut state, evaluator, claimed)
+                self.claimed(evaluator, claimed)
             }
             JobRequest::HandBack { evaluator, job, failed } => {
                 let when = failed.is_some().then(Instant::now);
@@ -152,7 +155,7 @@ impl Coordinator {
         }
     }
 
-    fn claimed(&self, state: &mut State, evaluator: &Name, claimed: Claimed) -> JobReply {
+    fn claimed(&self, evaluator: &Name, claimed: Claimed) -> JobReply {
         match claimed {
             Claimed::Job { job, again } => {
                 if !again {
@@ -161,11 +164,7 @@ impl Coordinator {
                 }
                 JobReply::Job(job)
             }
-            Claimed::Wait { time, has_another } => {
-                let names = &mut state.names_told;
-                if has_another && names.len() < MOST_NAMES_TOLD && names.insert(evaluator.clone()) {
-                    self.events.send(Event::SameName(evaluator.clone())).ok();
-                }
+            Claimed::Wait(time) => {
                 JobReply::Wait { incarnation: self.incarnation, milliseconds: time.as_millis() as u64 }
             }
         }
@@ -174,7 +173,11 @@ impl Coordinator {
     /// Records an evaluator's progress.
     pub fn progress(&self, progress: Progress) -> Result<(), NotAccepted> {
         let (mut state, now) = (self.lock(), Instant::now());
-        state.scoreboard.progress(&progress, now)?;
+        let shares_name = state.scoreboard.progress(&progress, now)?;
+        let (names, name) = (&mut state.names_told, &progress.evaluator);
+        if shares_name && names.len() < MOST_NAMES_TOLD && names.insert(name.clone()) {
+            self.events.send(Event::SameName(name.clone())).ok();
+        }
         state.evaluators.heard(progress, now)
     }
 

@@ -12,8 +12,8 @@ use zenoh::sample::{Sample, SampleKind};
 
 use super::events::{Event, Events};
 
-/// Zenoh takes five seconds to remove the token of a learner that lost its connection.
-const PATIENCE: Duration = Duration::from_secs(8);
+/// Zenoh takes five seconds to remove the token of a learner that lost its connection, and longer on a busy machine.
+const PATIENCE: Duration = Duration::from_secs(20);
 /// For this long after its start, a learner ends if it sees an earlier learner of the same name. By then the tokens of
 /// learners that started together have arrived.
 const TOGETHER: Duration = Duration::from_secs(10);

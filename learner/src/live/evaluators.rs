@@ -22,7 +22,7 @@ const PERIOD: Duration = Duration::from_secs(10);
 #[derive(Debug, Serialize)]
 pub(super) struct EvaluatorAtWork {
     pub name: String,
-    /// Whether it has the run's environment, if known.
+    /// Whether it has asked for a job, and has the run's environment.
     pub fits: bool,
     /// Time since its last progress message.
     pub seconds_ago: Option<f64>,
@@ -45,8 +45,8 @@ pub(super) struct JobAtWork {
 pub(super) struct Evaluators {
     metrics: EvaluatorMetrics,
     present: BTreeSet<Name>,
-    /// The connected evaluators that have the run's environment.
-    fitting: BTreeSet<Name>,
+    /// Whether each connected evaluator that has asked for a job has the run's environment.
+    asked: BTreeMap<Name, bool>,
     last_seen: BTreeMap<Name, Instant>,
     news: News,
 }
@@ -54,7 +54,7 @@ pub(super) struct Evaluators {
 impl Evaluators {
     pub fn new(metrics: EvaluatorMetrics, now: Instant) -> Self {
         let news = News { since: now, told: 0, joined: 0, left: 0, lines: Vec::new() };
-        Self { metrics, present: BTreeSet::new(), fitting: BTreeSet::new(), last_seen: BTreeMap::new(), news }
+        Self { metrics, present: BTreeSet::new(), asked: BTreeMap::new(), last_seen: BTreeMap::new(), news }
     }
 
     /// The number of connected evaluators.
@@ -62,21 +62,23 @@ impl Evaluators {
         self.present.len()
     }
 
-    /// Whether a connected evaluator has the run's environment.
-    pub fn any_fits(&self) -> bool {
-        !self.fitting.is_empty()
+    /// Whether a connected evaluator may have the run's environment. One that has not asked for a job yet may: it may be at a
+    /// long job of another run.
+    pub fn any_may_fit(&self) -> bool {
+        self.present.iter().any(|evaluator| self.asked.get(evaluator) != Some(&false))
     }
 
-    /// The connected evaluators: whether each has the run's environment, and when its last message came.
+    /// The connected evaluators: whether each is known to have the run's environment, and when its last message came.
     pub fn present(&self) -> impl Iterator<Item = (&Name, bool, Option<Instant>)> {
+        let fits = |evaluator: &Name| self.asked.get(evaluator) == Some(&true);
         let seen = |evaluator: &Name| self.last_seen.get(evaluator).copied();
-        self.present.iter().map(move |evaluator| (evaluator, self.fitting.contains(evaluator), seen(evaluator)))
+        self.present.iter().map(move |evaluator| (evaluator, fits(evaluator), seen(evaluator)))
     }
 
-    /// Records that an evaluator asked for a job, and has the run's environment.
-    pub fn fits(&mut self, evaluator: &Name) {
-        if self.present.contains(evaluator) && !self.fitting.contains(evaluator) {
-            self.fitting.insert(evaluator.clone());
+    /// Records that an evaluator asked for a job, and whether it has the run's environment.
+    pub fn asks(&mut self, evaluator: &Name, fits: bool) {
+        if self.present.contains(evaluator) && self.asked.get(evaluator) != Some(&fits) {
+            self.asked.insert(evaluator.clone(), fits);
         }
     }
 
@@ -98,11 +100,11 @@ impl Evaluators {
         if !self.present.remove(evaluator) {
             return;
         }
-        self.fitting.remove(evaluator);
+        self.asked.remove(evaluator);
         self.metrics.present.set(self.present.len() as i64);
         let line = match jobs {
-            0 => format!("evaluator {evaluator} has left"),
-            _ => format!("evaluator {evaluator} has left; its {jobs} unfinished jobs go to others"),
+            0 => format!("evaluator {evaluator} has left or lost its connection"),
+            _ => format!("evaluator {evaluator} has left or lost its connection; its unfinished job goes to others"),
         };
         if !self.news.tell(line) {
             self.news.left += 1;

@@ -19,7 +19,7 @@ pub(crate) enum Event {
     /// Episodes, by step and seed, that the learner has given up: too many evaluators were lost with them or could not run
     /// them.
     GivenUp(Vec<(u64, u64)>),
-    /// An evaluator that has a job has asked for another one; sent once for each name.
+    /// Two evaluators have this name: one works on a job, the other one has asked for one meanwhile. Sent once for each name.
     SameName(Name),
     /// All episodes of an evaluation are scored; the scores are in the order of the evaluation's seeds.
     Evaluated { step: u64, scores: Vec<EpisodeScore> },

@@ -2,7 +2,6 @@
 
 use std::time::{Duration, Instant};
 
-use quad_dataset::environment;
 use quad_run::results::Spread;
 use quad_run::run::RunDir;
 use quad_runtime::{Beat, Endpoints, Health};
@@ -16,11 +15,13 @@ use super::duplicate::Incarnation;
 use super::events::{Event, Saved};
 use super::metrics::Metrics;
 use super::network::{Online, Opening, Wire, go_online};
-use super::patience::{Patience, Verdict};
-use super::threads::Threads;
+use super::patience::{Patience, Verdict, how_to_evaluate};
+use super::threads::{STUCK, Threads};
 use crate::local_evaluators::LocalEvaluators;
 use crate::train::Outcome;
 
+/// When so many evaluations wait for scores, the evaluators are slower than the training.
+const BEHIND: usize = 3;
 /// Time limit for closing the session, if the network hangs.
 const CLOSE_PATIENCE: Duration = Duration::from_secs(5);
 /// After this time a failed run gives up output that waits for the disk: the disk may be in trouble, too.
@@ -33,7 +34,7 @@ pub(crate) enum Ending {
     Complete,
     /// The user asked to stop, by a signal.
     Interrupted,
-    /// Training is complete, but no evaluator with the run's environment came.
+    /// Training is complete, but no evaluator came that may have the run's environment.
     Unscored,
     /// The run could not continue.
     Failed(anyhow::Error),
@@ -68,6 +69,8 @@ struct Reached {
     reachable_at: Vec<String>,
     /// Outputs whose disk hangs, as reported.
     hangs: Vec<Saved>,
+    /// Whether it was said that the evaluators are slow.
+    is_behind: bool,
     patience: Patience,
 }
 
@@ -129,7 +132,13 @@ impl MainLoop {
                         reached.trained = true;
                         self.display.say(&self.trained());
                     }
-                    event => tell(event, &mut self.display),
+                    event => {
+                        let published = matches!(event, Event::Published { .. });
+                        tell(event, &mut self.display);
+                        if published && !reached.is_behind {
+                            reached.is_behind = self.say_if_behind();
+                        }
+                    }
                 },
                 _ = ticker.tick() => {
                     if let Verdict::GiveUp = self.tick(reached) {
@@ -170,6 +179,19 @@ impl MainLoop {
         }
     }
 
+    /// Says that the evaluators are slower than the training, if that is so. A run without any says so elsewhere.
+    fn say_if_behind(&self) -> bool {
+        let waiting = self.threads.services.coordinator.evaluations_pending();
+        let is_behind = waiting >= BEHIND && self.metrics.evaluators.present.get() > 0;
+        if is_behind {
+            self.display.say(&format!(
+                "the evaluators are slower than the training, which does not wait for them: {waiting} evaluations have no \
+                 score yet; more evaluators or a longer --eval-interval end the run sooner"
+            ));
+        }
+        is_behind
+    }
+
     fn tick(&mut self, reached: &mut Reached) -> Verdict {
         self.beat.alive();
         for line in self.threads.services.coordinator.tick() {
@@ -183,7 +205,7 @@ impl MainLoop {
         if !reached.trained {
             return Verdict::Wait;
         }
-        let verdict = reached.patience.look(self.threads.services.coordinator.any_fits(), Instant::now());
+        let verdict = reached.patience.look(self.threads.services.coordinator.any_may_fit(), Instant::now());
         if let Verdict::Advise = verdict {
             self.display.say(&self.advice(&reached.reachable_at));
         }
@@ -199,7 +221,10 @@ impl MainLoop {
                 Saved::Run => "snapshots and checkpoints wait for it; training continues",
                 Saved::Scores => "scores wait for it; evaluators keep theirs",
             };
-            self.display.say(&format!("the disk hangs: {waits}"));
+            let silent = STUCK.as_secs();
+            self.display.say(&format!(
+                "nothing was saved for {silent} s, as the disk hangs or the machine is too busy: {waits}"
+            ));
         }
         *told = hangs;
     }
@@ -209,19 +234,10 @@ impl MainLoop {
             [] => {
                 format!("no router has answered at {} yet; the scores wait for it", self.endpoints.connect.join(", "))
             }
-            [endpoint, ..] => how_to_evaluate(self.threads.services.coordinator.environment(), endpoint),
+            [endpoint, ..] => {
+                how_to_evaluate(self.threads.services.coordinator.environment(), endpoint, self.evaluators.log())
+            }
         }
-    }
-}
-
-/// A hint for a run without an evaluator that has its environment.
-fn how_to_evaluate(name: &str, endpoint: &str) -> String {
-    match environment::find(name) {
-        Ok(_) => format!("no evaluator is here; start one with: evaluator serve --connect {endpoint}"),
-        Err(_) => format!(
-            "no evaluator is here that has the environment {name}; from Python: \
-             quad_rl.evaluate(\"{name}\", YOUR_ENVIRONMENT, connect=\"{endpoint}\") (docs/python.md)"
-        ),
     }
 }
 
@@ -237,8 +253,7 @@ fn tell(event: Event, display: &mut Display) {
             format!("evaluator {evaluator} could not do a job of step {step}, which goes to others: {reason}")
         }
         Event::SameName(name) => format!(
-            "evaluator {name} asks for a job while it has one: if two evaluators were started with --name {name}, one of \
-             them gets no work; give each a name of its own"
+            "two evaluators were started with --name {name}, and one of them gets no work; give each a name of its own"
         ),
         Event::Evaluated { step, scores } => {
             let values: Vec<_> = scores.iter().map(|score| score.score).collect();

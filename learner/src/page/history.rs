@@ -30,7 +30,7 @@ pub(super) struct History {
     rows: Vec<Row>,
 }
 
-/// Means of each metric over some steps.
+/// Means of each metric over some steps; NaN where it was not measured.
 #[derive(Debug)]
 struct Row {
     /// The last of these steps.
@@ -54,15 +54,18 @@ impl History {
     pub fn refresh(&mut self) -> io::Result<()> {
         let lines = new_lines(&self.path, &mut self.read)?;
         let lines = lines.split(|byte| *byte == b'\n').filter_map(|line| serde_json::from_slice(line).ok());
-        for mut line in lines.collect::<Vec<BTreeMap<String, f64>>>() {
-            let [step, seconds] = ["step", "seconds"].map(|name| line.remove(name).unwrap_or_default());
+        for mut line in lines.collect::<Vec<BTreeMap<String, Option<f64>>>>() {
+            let [step, seconds] = ["step", "seconds"].map(|name| line.remove(name).flatten().unwrap_or_default());
             while self.rows.pop_if(|last| last.step >= step).is_some() {
                 self.lines = self.stride;
             }
-            if self.names.is_empty() {
-                self.names = line.keys().cloned().collect();
+            for name in line.keys() {
+                if !self.names.contains(name) {
+                    self.names.push(name.clone());
+                    self.rows.iter_mut().for_each(|row| row.values.push(f64::NAN));
+                }
             }
-            let value = |name: &String| line.get(name).copied().unwrap_or(f64::NAN);
+            let value = |name: &String| line.get(name).copied().flatten().unwrap_or(f64::NAN);
             self.push(Row { step, seconds, values: self.names.iter().map(value).collect() });
         }
         Ok(())
@@ -94,7 +97,11 @@ impl Row {
     fn join(&mut self, next: &Self, share: f64) {
         (self.step, self.seconds) = (next.step, next.seconds);
         for (mean, value) in self.values.iter_mut().zip(&next.values) {
-            *mean += (value - *mean) * share;
+            match (mean.is_nan(), value.is_nan()) {
+                (true, _) => *mean = *value,
+                (false, true) => {}
+                (false, false) => *mean += (value - *mean) * share,
+            }
         }
     }
 }

@@ -24,9 +24,9 @@ fn learner(arguments: &[&str]) -> Output {
     Command::new(env!("CARGO_BIN_EXE_learner")).args(arguments).output().unwrap()
 }
 
-/// As `learner`, with a minute, and of memory a thousandth of what a list of a trillion evaluations would take.
+/// As `learner`, with ten minutes, and of memory a thousandth of what a list of a trillion evaluations would take.
 fn bounded(arguments: &[&str]) -> Output {
-    let script = "ulimit -v 8000000; exec timeout 60 \"$0\" \"$@\"";
+    let script = "ulimit -v 8000000; exec timeout 600 \"$0\" \"$@\"";
     Command::new("sh").args(["-c", script, env!("CARGO_BIN_EXE_learner")]).args(arguments).output().unwrap()
 }
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import inspect
+import os
 import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -50,9 +51,15 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except Exception as error:  # A source's own library raises what it will, such as httpx's where there is no network.
         print(f"quad-convert: {source} cannot be read: {type(error).__name__}: {error}", file=sys.stderr)
         return 1
-    print(dataset)
-    print(f"\nwritten to {out}: learner train --task own-data --env my-robot --dataset {out} --scale actions,states")
+    _print(f"{dataset}\n\nwritten to {out}: learner train --task own-data --env my-robot --dataset {out} --scale actions,states")
     return 0
+
+
+def _print(text: str) -> None:
+    try:
+        print(text, flush=True)
+    except BrokenPipeError:  # A reader that stops early, such as `head`. Python would complain at its end, too.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
 
 
 def _read(source: str, given: dict[str, Any]) -> Dataset:

@@ -1,19 +1,66 @@
-"""A worker of `quad_rl.evaluate` as the process that starts it sees it: started, started again, ended."""
+"""Processes that this package starts: any; and a worker of `quad_rl.evaluate`, started, started again, ended."""
 
 from __future__ import annotations
 
+import ctypes
 import json
 import os
 import signal
 import subprocess
 import sys
 import time
+from collections.abc import Sequence
+from typing import Any
 
 # A worker that ends so soon after its start, seconds, is started again after a growing pause.
 _SOON = 60.0
 # So many such ends in a row are the last.
 _ENDS = 6
 _WHY = "its standard error may say why"
+# Found here, since a process that was just forked should look for nothing.
+_PRCTL, _SIGNAL = ctypes.CDLL(None).prctl, ctypes.CDLL(None).signal
+_SIGNAL.argtypes = [ctypes.c_int, ctypes.c_void_p]
+_PR_SET_PDEATHSIG = 1
+
+
+def start(command: Sequence[str], *, ends_with_thread: bool = False, **settings: Any) -> subprocess.Popen[Any]:
+    """Starts a program, in a session of its own: a terminal's Ctrl-C is this process's to pass on.
+
+    ends_with_thread: the system ends the program in order when the thread that starts it is gone.
+    settings: what else Popen takes. Standard error is this process's by default, if it has one.
+    """
+    if signal.getsignal(signal.SIGCHLD) == signal.SIG_IGN:
+        # Some init scripts leave it so, and then nobody learns how a child has ended. Python's own function would be for the
+        # main thread alone.
+        _SIGNAL(signal.SIGCHLD, None)
+    if "stderr" not in settings and not _has_stderr():
+        settings["stderr"] = subprocess.DEVNULL
+    ends = _end_with_thread if ends_with_thread else None
+    return subprocess.Popen(command, start_new_session=True, preexec_fn=ends, **settings)
+
+
+def exit_code(process: subprocess.Popen[Any]) -> int | None:
+    """Waits for its end, and gives its exit code; None if another part of this process took it, which Popen takes for 0."""
+    try:
+        ended = os.waitid(os.P_PID, process.pid, os.WEXITED)
+    except ChildProcessError:
+        return None
+    assert ended
+    process.returncode = ended.si_status if ended.si_code == os.CLD_EXITED else -ended.si_status
+    return process.returncode
+
+
+def _end_with_thread() -> None:
+    _PRCTL(_PR_SET_PDEATHSIG, signal.SIGTERM)
+
+
+def _has_stderr() -> bool:
+    """Whether this process was started with a standard error, and has not closed it. Else number 2 may be any file."""
+    try:
+        os.fstat(2)
+    except OSError:
+        return False
+    return sys.__stderr__ is not None
 
 
 class Worker:
@@ -31,10 +78,7 @@ class Worker:
         # One thread moves all of a worker's environments, whatever this process uses: they share NumPy's generator.
         environment = {"OMP_NUM_THREADS": "1", **os.environ, "RAYON_NUM_THREADS": "1"}
         command = [sys.executable, "-m", "quad_rl._worker"]
-        # A session of its own: a terminal's Ctrl-C is this process's to pass on.
-        self.process = subprocess.Popen(
-            command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, env=environment, start_new_session=True
-        )
+        self.process = start(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, env=environment)
         assert self.process.stdin and self.process.stdout
         self._out = self.process.stdout
         # A process that the worker's environment has forked holds the pipe, too: it may never end.

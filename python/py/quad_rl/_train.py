@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import ctypes
 import json
 import os
 import re
@@ -12,14 +11,17 @@ import subprocess
 import sys
 import sysconfig
 import tempfile
+import threading
 from collections.abc import Iterator, Mapping
 from functools import cached_property
 from os import PathLike
 from pathlib import Path
-from typing import Any
+from queue import SimpleQueue
+from typing import Any, TextIO
 
 from quad_rl import _quad_rl
 from quad_rl._dataset import Dataset
+from quad_rl._process import exit_code, start
 from quad_rl._runs import metrics, rows_of
 
 _LINE = re.compile(r"\S+Z +([A-Z]+) (.*)")
@@ -27,9 +29,6 @@ _STEP = re.compile(r"step (\d+)/(\d+) ")
 _PAGE = re.compile(r"page: (\S+)")
 # Characters of the bar.
 _BAR = 20
-# Found here, since a process that was just forked should look for nothing.
-_PRCTL = ctypes.CDLL(None).prctl
-_PR_SET_PDEATHSIG = 1
 
 
 class Run:
@@ -62,16 +61,30 @@ class Run:
     @cached_property
     def page(self) -> str:
         """Address of its page, which `learner page` serves from the first access to the end of this process."""
-        process = _start("page", str(self.folder), "--http=127.0.0.1:0")
-        said = []
-        for _, text in _said(process):
-            if page := _PAGE.match(text):
-                return page[1]
-            said.append(text)
-        raise _error(process, said)
+        answer: SimpleQueue[str | Exception] = SimpleQueue()
+        # The program ends with the thread that starts it, so that must not be the caller's.
+        threading.Thread(target=_serve_page, args=(self.folder, answer), daemon=True).start()
+        page = answer.get()
+        if isinstance(page, Exception):
+            raise page
+        return page
 
     def __repr__(self) -> str:
         return f"Run({str(self.folder)!r})"
+
+
+def _serve_page(folder: Path, answer: SimpleQueue[str | Exception]) -> None:
+    """Answers with the address, or with what is wrong, and reads the program's log to its end."""
+    try:
+        process = _start("page", str(folder), "--http=127.0.0.1:0")
+        said = []
+        for _, text in _said(process):
+            if page := _PAGE.match(text):
+                answer.put(page[1])
+            said.append(text)
+        raise _error(exit_code(process), said)
+    except (RuntimeError, OSError) as error:
+        answer.put(error)
 
 
 def train(
@@ -101,8 +114,8 @@ def train(
             path = Path(folder, "dataset.hdf5")
             dataset.save(path)
             dataset = path
-        process = _start("train", f"--dataset={os.fspath(dataset)}", *_flags(own | options))
         display = _Display()
+        process = _start("train", f"--dataset={os.fspath(dataset)}", *_flags(own | options))
         error: list[str] = []
         try:
             display.follow(process, error)
@@ -115,18 +128,23 @@ def train(
             process.wait()
             display.say("\n".join(error))
             raise
-    if process.wait() != 0:
-        raise _error(process, error)
+    code = exit_code(process)
+    if code != 0:
+        raise _error(code, error)
     return Run(run_dir)
 
 
 class _Display:
-    """Shows what a learner says. In a notebook or on a terminal, its line of progress is a bar that stays in its place."""
+    """Shows what a learner says. In a notebook or on a terminal, its line of progress is a bar that stays in its place. Where
+    nothing can be shown, the learner works all the same."""
 
     def __init__(self) -> None:
         notebook = type(sys.stdout).__module__ == "ipykernel.iostream"
-        self._out = sys.stdout if notebook else sys.stderr
-        self._draws = notebook or self._out.isatty()
+        self._out: TextIO | None = sys.stdout if notebook else sys.stderr
+        if self._out is not None and self._out.closed:
+            self._out = None
+        self._is_terminal = self._out is not None and self._out.isatty()
+        self._draws = notebook or self._is_terminal
         self._bar = ""
 
     def follow(self, process: subprocess.Popen[str], error: list[str]) -> None:
@@ -139,7 +157,7 @@ class _Display:
                 done = _BAR * int(step[1]) // int(step[2])
                 text = f"{'█' * done}{'░' * (_BAR - done)} {text}"
                 # A line that a terminal breaks cannot be drawn over.
-                self._write(text[: shutil.get_terminal_size().columns - 1] if self._out.isatty() else text)
+                self._write(text[: shutil.get_terminal_size().columns - 1] if self._is_terminal else text)
             else:
                 self.say(text if level == "INFO" else f"{level} {text}")
 
@@ -148,8 +166,13 @@ class _Display:
         self._bar = ""
 
     def _write(self, text: str, end: str = "") -> None:
-        start = "\r" if self._bar else ""
-        print(start + text.ljust(len(self._bar)), end=end, file=self._out, flush=True)
+        if self._out is None:
+            return
+        begin = "\r" if self._bar else ""
+        try:
+            print(begin + text.ljust(len(self._bar)), end=end, file=self._out, flush=True)
+        except (OSError, ValueError):  # Its reader has gone, or it was closed.
+            self._out = None
         self._bar = text
 
 
@@ -159,22 +182,17 @@ def _start(*arguments: str) -> subprocess.Popen[str]:
     program = shutil.which("learner", path=path)
     if program is None:
         raise RuntimeError(f"there is no program `learner` in {path}\nhint: the wheel of deploy/wheel.sh contains it")
-    return subprocess.Popen(
+    return start(
         [program, *arguments],
+        ends_with_thread=True,
         stdin=subprocess.DEVNULL,
         stdout=subprocess.DEVNULL,
         stderr=subprocess.PIPE,
         encoding="utf-8",
         errors="replace",
-        # A session of its own: a terminal's Ctrl-C is this process's to pass on.
-        start_new_session=True,
-        preexec_fn=_end_with_parent,
+        # What the log says is read here, so nothing may hide lines of it.
+        env={name: value for name, value in os.environ.items() if name != "RUST_LOG"},
     )
-
-
-def _end_with_parent() -> None:
-    """Has the system end this process in order when the thread is gone that started it."""
-    _PRCTL(_PR_SET_PDEATHSIG, signal.SIGTERM)
 
 
 def _said(process: subprocess.Popen[str]) -> Iterator[tuple[str, str]]:
@@ -185,9 +203,13 @@ def _said(process: subprocess.Popen[str]) -> Iterator[tuple[str, str]]:
         yield (logged[1], logged[2]) if logged else ("", line.rstrip("\n"))
 
 
-def _error(process: subprocess.Popen[str], said: list[str]) -> RuntimeError:
-    code = process.wait()
-    how = f"the learner was ended by {signal.Signals(-code).name}" if code < 0 else f"the learner ended with exit code {code}"
+def _error(code: int | None, said: list[str]) -> RuntimeError:
+    if code is None:
+        how = "how the learner ended is not known: another part of this process waits for its children, or ignores their ends"
+    elif code < 0:
+        how = f"the learner was ended by {signal.Signals(-code).name}"
+    else:
+        how = f"the learner ended with exit code {code}"
     return RuntimeError("\n".join(said).removeprefix("error: ") or how)
 
 

@@ -122,6 +122,8 @@ class Made:
             success = self.info.get("success", self.info.get("is_success"))
             if success is None:
                 raise EnvironmentFailed('the last info of an episode has neither "success" nor "is_success"')
+            if success not in (0, 1):
+                raise EnvironmentFailed(f'the last "success" of an episode is {success}, neither true nor false')
             return 100.0 * bool(success)
         low, high = map(float, self.score_rule)
         return 100.0 * (episode_return - low) / (high - low)

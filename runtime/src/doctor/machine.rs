@@ -59,7 +59,9 @@ pub fn folder(findings: &mut Findings, check: &str, path: &Path, elsewhere: &str
     match free {
         ..TOO_LITTLE => findings.fail(check, found, room),
         TOO_LITTLE..LITTLE => findings.warn(check, format!("{found}: little room for a long run"), room),
-        _ if took > SLOW => findings.warn(check, found, format!("a local disk is faster; {elsewhere}")),
+        _ if took > SLOW => {
+            findings.warn(check, found, format!("a local disk, or one that is less busy, is faster; {elsewhere}"))
+        }
         _ => findings.ok(check, found),
     }
 }

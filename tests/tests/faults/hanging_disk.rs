@@ -43,7 +43,7 @@ fn a_disk_that_hangs_holds_up_neither_training_nor_the_end() {
     let next = hang(&learner);
     // After one signal it ends itself when its time is over, two end it at once.
     for (signals, code, reason) in
-        [(1, 75, "9 s after SIGTERM something still hangs"), (2, 130, "received SIGTERM after SIGTERM")]
+        [(1, 75, "9 s after SIGTERM something has not ended"), (2, 130, "received SIGTERM after SIGTERM")]
     {
         let mut learner = scratch.learner_with("run", SETTING, &LISTEN);
         learner.process.wait_for_log("continues after step", PATIENCE);

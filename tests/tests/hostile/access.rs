@@ -4,7 +4,7 @@ use std::path::PathBuf;
 
 use quad_protocol::keys;
 use quad_tests::PATIENCE;
-use quad_tests::certificates::{Certificates, connect};
+use quad_tests::certificates::{Certificates, come_in, connect};
 use quad_tests::made_up::name;
 use quad_tests::router::protected_router;
 use quad_tests::setting::{ENDLESS, IDLE, SHORT};
@@ -14,6 +14,8 @@ use zenoh::sample::SampleKind;
 
 /// What the router's certificate is for.
 pub const HOST: &str = "127.0.0.1";
+/// For so many seconds a certificate is valid that a program is to come in with, and to be sent away with.
+const BRIEF: u64 = 20;
 
 #[tokio::test(flavor = "multi_thread")]
 async fn a_run_completes_through_the_shipped_router() {
@@ -60,8 +62,8 @@ async fn a_learner_that_listens_itself_asks_who_comes() {
     learner.wait_for_scores(0);
 
     // One that would stay connected by itself, although its certificate has expired. The other one stays.
-    certificates.short("brief", 10);
-    let brief = connect(&endpoint, &authority, Some(&certificates.of("brief"))).await.unwrap();
+    certificates.short("brief", BRIEF);
+    let brief = come_in(&endpoint, &authority, &certificates.of("brief")).await;
     let key = keys::live_evaluator(&name("run"), &name("brief"));
     let _token = brief.liveliness().declare_token(key).await.unwrap();
     for count in [2.0, 1.0] {
@@ -76,7 +78,7 @@ async fn the_router_refuses_those_without_a_valid_certificate() {
     let (_router, endpoint) = protected_router(HOST, &certificates.of("router")).await;
     let (authority, evaluator) = (certificates.of("router"), certificates.of("evaluator"));
     // In all but the certificate they are what is let in.
-    connect(&endpoint, &authority, Some(&evaluator)).await.expect("an evaluator is let in");
+    come_in(&endpoint, &authority, &evaluator).await;
     let foreign = elsewhere.of("evaluator");
     let expired = certificates.of("expired");
     for folder in [None, Some(&foreign), Some(&expired)] {
@@ -102,10 +104,10 @@ async fn an_expired_certificate_ends_a_connection_and_a_renewed_one_brings_it_ba
     let (scratch, folder) = (Scratch::new(), certificates.argument("learner"));
     let (_router, endpoint) = protected_router(HOST, &certificates.of("router")).await;
     let _learner = scratch.learner_with("run", IDLE, &["--connect", &endpoint, "--certificates", &folder]);
-    let monitor = connect(&endpoint, &certificates.of("router"), Some(&certificates.of("monitor"))).await.unwrap();
+    let monitor = come_in(&endpoint, &certificates.of("router"), &certificates.of("monitor")).await;
     let tokens = monitor.liveliness().declare_subscriber("quad/run/live/evaluator/*").history(true).await.unwrap();
     let next = async || timeout(PATIENCE, tokens.recv_async()).await.expect("it comes or goes").unwrap().kind();
-    certificates.short("brief", 10);
+    certificates.short("brief", BRIEF);
     let folder = certificates.argument("brief");
     let evaluator = scratch.evaluator_with("brief", &["--connect", &endpoint, "--certificates", &folder]);
     assert_eq!(next().await, SampleKind::Put);

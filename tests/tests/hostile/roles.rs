@@ -2,7 +2,7 @@
 
 use std::time::{Duration, Instant};
 
-use quad_tests::certificates::{Certificates, connect};
+use quad_tests::certificates::{Certificates, come_in};
 use quad_tests::router::protected_router;
 use quad_tests::setting::ENDLESS;
 use quad_tests::system::Scratch;
@@ -18,6 +18,8 @@ use crate::access::HOST;
 
 /// For what must not happen.
 const LULL: Duration = Duration::from_millis(500);
+/// A message that only shows whether messages arrive.
+const PROBE: &str = "probe";
 
 /// Sessions with the certificates of those roles at the shipped router, which stays as long as the first part.
 async fn at_the_router<const N: usize>(roles: [&str; N]) -> Option<(impl Sized, [Session; N])> {
@@ -25,14 +27,31 @@ async fn at_the_router<const N: usize>(roles: [&str; N]) -> Option<(impl Sized, 
     let (router, endpoint) = protected_router(HOST, &certificates.of("router")).await;
     let mut sessions = Vec::new();
     for role in roles {
-        sessions.push(connect(&endpoint, &certificates.of("router"), Some(&certificates.of(role))).await.unwrap());
+        sessions.push(come_in(&endpoint, &certificates.of("router"), &certificates.of(role)).await);
     }
     Some(((router, certificates), sessions.try_into().unwrap()))
 }
 
 /// The key that arrives next.
 async fn next(samples: &Subscriber<FifoChannelHandler<Sample>>) -> String {
-    timeout(PATIENCE, samples.recv_async()).await.expect("nothing arrives").unwrap().key_expr().to_string()
+    loop {
+        let sample = timeout(PATIENCE, samples.recv_async()).await.expect("nothing arrives").unwrap();
+        if *sample.payload().to_bytes() != *PROBE.as_bytes() {
+            return sample.key_expr().to_string();
+        }
+    }
+}
+
+/// Sends until it arrives: before, the router does not know of those who listen.
+async fn reach(from: &Session, key: &str, samples: &Subscriber<FifoChannelHandler<Sample>>) {
+    let deadline = Instant::now() + PATIENCE;
+    loop {
+        from.put(key, PROBE).await.unwrap();
+        match samples.recv_timeout(LULL).unwrap() {
+            Some(sample) if sample.key_expr().as_str() == key => return,
+            _ => assert!(Instant::now() < deadline, "{key} does not arrive"),
+        }
+    }
 }
 
 /// The keys that arrive until `last` does.
@@ -69,7 +88,10 @@ async fn only_learners_publish_weights_and_only_evaluators_tell_progress() {
     let heard = listener.declare_subscriber("quad/run/**").await.unwrap();
     let weights = receiver.declare_subscriber("quad/run/weights").await.unwrap();
     let spied = receiver.declare_subscriber("quad/run/progress/*").await.unwrap();
-    sleep(LULL).await;
+    reach(&evaluator, "quad/run/progress/e", &heard).await;
+    for samples in [&heard, &weights] {
+        reach(&learner, "quad/run/weights", samples).await;
+    }
     // A session hears itself whatever it may do, so listener and receiver put nothing.
     for key in ["progress/e", "jobs", "scores", "weights/1", "live/learner", "*", "**", "weights"] {
         for session in [&monitor, &evaluator, &learner] {
@@ -142,7 +164,7 @@ async fn at_a_learner_that_listens_only_evaluators_progress_passes() {
     let (scratch, folder) = (Scratch::new(), certificates.argument("learner"));
     let learner = scratch.learner_with("run", ENDLESS, &["--listen", "tls/127.0.0.1:0", "--certificates", &folder]);
     let (endpoint, authority) = (learner.endpoint(), certificates.of("learner"));
-    let connect = async |role| connect(&endpoint, &authority, Some(&certificates.of(role))).await.unwrap();
+    let connect = async |role| come_in(&endpoint, &authority, &certificates.of(role)).await;
     let (witness, asker) = (connect("monitor").await, connect("evaluator").await);
     let (evaluator, second) = (connect("evaluator").await, connect("learner").await);
     let heard = witness.declare_subscriber("quad/forged/**").await.unwrap();

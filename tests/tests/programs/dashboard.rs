@@ -1,11 +1,10 @@
 //! Grafana's files: sound by its schema, and every panel shows data of a running system.
 
 use std::path::Path;
-use std::time::Duration;
 
 use quad_tests::setting::ENDLESS;
 use quad_tests::system::Scratch;
-use quad_tests::{dashboard, peers, prometheus};
+use quad_tests::{PATIENCE, dashboard, peers, prometheus};
 
 #[test]
 fn provisioning_follows_the_schema() {
@@ -25,5 +24,5 @@ fn every_panel_shows_data() {
     let pages = evaluators.each_ref().map(|evaluator| evaluator.metrics());
     let jobs: [(&str, &[String]); 2] = [("learner", &[learner.metrics()]), ("evaluator", &pages)];
     let prometheus = prometheus::start(&scratch, &jobs);
-    dashboard::assert_every_panel_shows_data(&prometheus, Duration::from_secs(60));
+    dashboard::assert_every_panel_shows_data(&prometheus, PATIENCE);
 }

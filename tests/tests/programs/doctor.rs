@@ -55,7 +55,8 @@ fn a_machine_that_is_well() {
     let folder = scratch.path().join("another");
     let (text, well) = findings(&doctor("learner", &["--run-dir", folder.to_str().unwrap()]));
     assert!(well, "{text}");
-    assert_found(&text, "ok", "run folder", &["GiB free"]);
+    // A busy disk is slow, which is worth a warning.
+    assert!(text.lines().any(|line| line.contains("  run folder ") && line.contains("GiB free")), "{text}");
     assert_found(&text, "ok", "HDF5", &["with compression"]);
     assert!(!folder.exists(), "the doctor makes no folder");
 

@@ -46,6 +46,22 @@ fn work(count: usize, episode: Duration, during: Duration, launcher: &[String]) 
     percentile(measured.claims, 0.99)
 }
 
+/// The only one takes a job, and then all the time in the world.
+#[test]
+fn a_run_whose_evaluators_are_slow_says_so_once() {
+    let (scratch, runtime) = (Scratch::new(), Runtime::new().unwrap());
+    let learner = scratch.learner("run", ENDLESS);
+    learner.wait_for_metric("snapshots_published_total", "", |published| published > 5.0);
+    let said = || learner.process.log().matches("the evaluators are slower than the training").count();
+    assert_eq!(said(), 0, "there is none");
+    let _crowd = runtime.block_on(Crowd::connect(1, Duration::from_secs(3600), &name("run"), &learner.endpoint()));
+    let line = learner.process.wait_for_log("the evaluators are slower than the training", PATIENCE);
+    assert!(line.contains(" evaluations have no score yet"), "{line}");
+    let published = learner.metric("snapshots_published_total", "").unwrap();
+    learner.wait_for_metric("snapshots_published_total", "", |now| now > published + 2.0);
+    assert_eq!(said(), 1);
+}
+
 #[test]
 fn fifty_evaluators_are_served_and_each_score_counts_once() {
     work(50, Duration::from_millis(50), Duration::from_secs(2), &[]);

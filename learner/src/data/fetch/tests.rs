@@ -97,7 +97,7 @@ fn a_broken_connection_is_continued_where_it_broke() {
 
 #[test]
 fn a_silent_server_is_left_and_asked_again() {
-    assert_eq!(requests(2, &[], &[Stall(1_000), Stall(0), WHOLE]), [None, Some(1_000), Some(1_000)]);
+    assert_eq!(requests(5, &[], &[Stall(1_000), Stall(0), WHOLE]), [None, Some(1_000), Some(1_000)]);
 }
 
 #[test]
@@ -182,7 +182,7 @@ fn several_runs_that_fetch_the_same_file_at_once_all_have_it() {
     let dataset = dataset(&[&server]);
     thread::scope(|scope| {
         for _ in 0..4 {
-            scope.spawn(|| fetcher(2).fetch(&dataset, folder.path()).unwrap());
+            scope.spawn(|| fetcher(5).fetch(&dataset, folder.path()).unwrap());
         }
     });
     assert!(fs::read(folder.path().join("file.hdf5")).unwrap() == content());

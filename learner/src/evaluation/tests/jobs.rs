@@ -12,7 +12,7 @@ fn jobs_go_out_oldest_step_first_and_no_episode_twice() {
     assert_eq!(handed_out, expected);
     assert_eq!((jobs[0].weights, jobs[2].weights), (hash(1000), hash(2000)));
     assert_eq!((jobs[0].incarnation, jobs[0].environment_seed), (INCARNATION, 5));
-    assert!(matches!(bench.claim("e", 0, 0), Claimed::Wait { has_another: false, .. }));
+    assert!(matches!(bench.claim("e", 0, 0), Claimed::Wait(_)));
     assert_eq!(bench.board.pending(), 14);
 }
 
@@ -22,7 +22,7 @@ fn an_evaluator_without_the_environment_gets_nothing() {
     for environments in [vec![], vec!["ant".to_owned()]] {
         let now = bench.at(0);
         let claim = Claim { evaluator: &name("a"), attempt: 1, environments: &environments, present: 0 };
-        assert!(matches!(bench.board.claim(claim, now), Claimed::Wait { .. }));
+        assert!(matches!(bench.board.claim(claim, now), Claimed::Wait(_)));
     }
 }
 
@@ -33,10 +33,26 @@ fn a_claim_that_is_repeated_gets_the_same_job_and_another_one_waits() {
     let again = Claimed::Job { job: first.clone(), again: true };
     assert_eq!(bench.claim("a", 0, 3), again, "the answer was lost");
     let other = bench.claim("a", 1, 3);
-    assert!(matches!(other, Claimed::Wait { has_another: true, .. }), "one job at a time: {other:?}");
+    assert!(matches!(other, Claimed::Wait(_)), "one job at a time: {other:?}");
     assert_eq!(bench.job("b", 3).seeds, [6, 7]);
     assert_eq!(bench.expire(10), 1, "to ask again does not extend the lease");
     assert_eq!(bench.job("a", 10).seeds, first.seeds);
+}
+
+/// One of them works and the other asks. An evaluator that asks for another job, and works on none, has only lost word of it.
+#[test]
+fn two_of_one_name_are_known_by_what_both_do() {
+    let mut bench = Bench::new();
+    let job = bench.job("a", 0);
+    assert_eq!(bench.progress(&progress(&job, "a", 1), 1), Ok(false));
+    bench.claim("a", 0, 2);
+    assert_eq!(bench.progress(&progress(&job, "a", 2), 2), Ok(false), "the same claim once more");
+    bench.claim("a", 7, 3);
+    assert_eq!(bench.progress(&progress(&job, "a", 2), 3), Err(Refusal::NotAdvanced), "it does not work");
+    assert_eq!(bench.progress(&progress(&job, "a", 3), 4), Ok(true));
+    bench.deliver(&full_report(&job, "a")).unwrap();
+    let next = bench.job("a", 5);
+    assert_eq!(bench.progress(&progress(&next, "a", 1), 6), Ok(false));
 }
 
 #[test]

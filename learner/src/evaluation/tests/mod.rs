@@ -70,7 +70,7 @@ impl Bench {
         }
     }
 
-    fn progress(&mut self, progress: &Progress, seconds: u64) -> Result<(), Refusal> {
+    fn progress(&mut self, progress: &Progress, seconds: u64) -> Result<bool, Refusal> {
         let now = self.at(seconds);
         self.board.progress(progress, now)
     }

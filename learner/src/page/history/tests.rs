@@ -52,6 +52,24 @@ fn a_run_that_went_back_to_its_checkpoint_is_shown_as_it_went_on() {
     }
 }
 
+/// As of held-out episodes, which are measured now and then, or where the number was not finite.
+#[test]
+fn what_was_not_measured_at_a_step_leaves_its_other_numbers_and_other_steps_alone() {
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("metrics.jsonl");
+    let lines = ["\"loss\":1.0", "\"loss\":2.0,\"held_out_loss\":8.0", "\"loss\":null,\"held_out_loss\":4.0"];
+    let lines = (1..).zip(lines).map(|(step, rest)| format!("{{\"step\":{step},\"seconds\":{step}.0,{rest}}}\n"));
+    fs::write(&path, lines.collect::<String>()).unwrap();
+    let mut history = History::of(path);
+    history.refresh().unwrap();
+    let expected = json!([[1.0, 1.0, 1.0, null], [2.0, 2.0, 2.0, 8.0], [3.0, 3.0, null, 4.0]]);
+    assert_eq!((&shown(&history)["names"], &shown(&history)["rows"]), (&json!(["loss", "held_out_loss"]), &expected));
+    let mut rows = history.rows.into_iter();
+    let mut first = rows.next().unwrap();
+    rows.for_each(|row| first.join(&row, 0.5));
+    assert_eq!(first.values, [1.5, 6.0], "means of what there is");
+}
+
 #[test]
 fn a_file_that_has_a_step_twice_is_read() {
     let folder = tempfile::tempdir().unwrap();
