@@ -1,6 +1,6 @@
 //! An algorithm at work in a run: counts its updates, hands over its policy, and saves and loads its whole state.
 
-use crate::algorithm::{Algorithm, AlgorithmError};
+use crate::algorithm::{Algorithm, AlgorithmError, Measured};
 use crate::context::Context;
 use crate::definition::{Definition, Metric};
 #[cfg(test)]
@@ -99,19 +99,36 @@ impl Agent {
         self.step = step;
     }
 
-    /// One update on the items of these numbers. Gives the values of the metrics, in the order of their table.
+    /// One update on the items of these numbers. Gives the values of the metrics, in the order of their table; none of those
+    /// that this update did not measure.
     ///
     /// # Errors
     /// Candle fails.
-    pub fn update(&mut self, items: &[u32]) -> Result<Vec<f32>, AlgorithmError> {
+    pub fn update(&mut self, items: &[u32]) -> Result<Vec<Option<f32>>, AlgorithmError> {
         let (algorithm, step) = (&mut self.algorithm, self.step);
         let measured = match self.device.is_cpu() {
             true => run_awake(|| algorithm.update(step, items))?,
             false => algorithm.update(step, items)?,
         };
         self.step += 1;
-        let value = |name| measured.iter().find(|(known, _)| *known == name).map_or(0.0, |(_, value)| *value);
-        Ok(self.metrics().iter().map(|metric| value(metric.name)).collect())
+        Ok(self.in_order(&measured).collect())
+    }
+
+    /// What the last update would measure on the items of these numbers if no network moved, as [`Self::update`] gives it, but
+    /// only of metrics that are measured on held-out episodes. Nothing is changed.
+    ///
+    /// # Errors
+    /// Candle fails.
+    pub fn evaluate(&self, items: &[u32]) -> Result<Vec<Option<f32>>, AlgorithmError> {
+        let measured = self.algorithm.evaluate(self.step.saturating_sub(1), items)?;
+        let metrics = self.metrics().iter();
+        Ok(self.in_order(&measured).zip(metrics).map(|(value, metric)| value.filter(|_| metric.held_out)).collect())
+    }
+
+    /// Values in the order of the table.
+    fn in_order(&self, measured: &Measured) -> impl Iterator<Item = Option<f32>> {
+        let value = |name| measured.iter().find(|(known, _)| *known == name).map(|(_, value)| *value);
+        self.metrics().iter().map(move |metric| value(metric.name))
     }
 
     /// The file of the policy as it is now, which says where it is from.

@@ -27,6 +27,13 @@ pub trait Algorithm: Send {
     /// Candle fails.
     fn update(&mut self, step: u64, items: &[u32]) -> Result<Measured>;
 
+    /// What update number `step` would measure on the items of these numbers if no network moved: its losses with the weights
+    /// as they are. Nothing is changed.
+    ///
+    /// # Errors
+    /// Candle fails.
+    fn evaluate(&self, step: u64, items: &[u32]) -> Result<Measured>;
+
     /// The policy to be evaluated: what it is, and its tensors.
     ///
     /// # Errors
@@ -117,15 +124,35 @@ pub(super) fn largest(values: &Tensor, dimension: usize) -> Result<Tensor> {
     values.max(dimension)? + (values.sum(dimension)? * 0.0)?
 }
 
-/// Scalars `[]` by their names.
-pub(super) fn measured<const N: usize>(scalars: [(&'static str, &Tensor); N]) -> Result<Measured> {
-    let values = numbers(&scalars.map(|(_, scalar)| scalar))?;
-    Ok(scalars.into_iter().map(|(name, _)| name).zip(values).collect())
+/// A loss `[]` that a network is moved down, and the scalars `[]` that are measured with it.
+pub(super) struct Loss {
+    pub value: Tensor,
+    /// By the names of metrics, the loss first.
+    scalars: Vec<(&'static str, Tensor)>,
 }
 
-/// The numbers of some tensors, one tensor after the other; from a GPU in one copy, because each copy waits for the GPU.
-pub(super) fn numbers(x: &[&Tensor]) -> Result<Vec<f32>> {
-    joined(x)?.to_vec1()
+impl Loss {
+    /// A loss that is the metric of this name.
+    pub fn new(name: &'static str, value: Tensor) -> Self {
+        Self { scalars: vec![(name, value.clone())], value }
+    }
+
+    /// Also measures this scalar `[]`, or a number `[1]`.
+    pub fn with(mut self, name: &'static str, scalar: Tensor) -> Self {
+        self.scalars.push((name, scalar));
+        self
+    }
+}
+
+/// The scalars of some losses.
+pub(super) fn scalars(losses: &[Loss]) -> impl Iterator<Item = &(&'static str, Tensor)> {
+    losses.iter().flat_map(|loss| &loss.scalars)
+}
+
+/// What some losses measure; from a GPU in one copy, because each copy waits for the GPU.
+pub(super) fn measured(losses: &[Loss]) -> Result<Measured> {
+    let values = joined(&Vec::from_iter(scalars(losses).map(|(_, scalar)| scalar)))?.to_vec1()?;
+    Ok(scalars(losses).map(|(name, _)| *name).zip(values).collect())
 }
 
 /// The numbers of some tensors, one tensor after the other, `[n]`.

@@ -8,7 +8,7 @@
 #[path = "golden/align_iql.rs"]
 pub(super) mod golden;
 
-use super::algorithm::{Measured, smaller};
+use super::algorithm::{Loss, Measured, smaller};
 use super::context::{Context, Minibatch};
 use super::definition::{Definition, Metric, Reporting, metrics, read, readable};
 use super::denoising::Denoising;
@@ -18,7 +18,7 @@ use super::iql::expectile_loss;
 use super::parts::Parts;
 use super::replay::Computed;
 use super::trained::{Trained, ensemble};
-use candle_core::{Device, Result};
+use candle_core::{Device, Result, Tensor};
 use quad_policy::{
     AdamStep, Choice, DiffusionPolicy, DiffusionShape, Ensemble, EnsembleShape, MlpConfig, Reduce, Reverse, Rule,
     Tensors, Weighted, cosine_decay,
@@ -40,12 +40,12 @@ pub(super) const DEFINITION: Definition = Definition {
 const CRITICS: usize = 2;
 
 pub(super) const METRICS: &[Metric] = &metrics! {
-    q_mean: "Mean over the batch of the critics' target y = r + γ·mask·V(s') (IQL's Eq. 6).";
-    v_mean ["V"]: "Mean over the batch of the value V(s) after its step.";
-    value_loss ["value loss"]: "Expectile loss of V: mean over the batch of |expectile − 1(u < 0)|·u² with u = min_k Q̂_k(s, a) − V(s) (IQL's Eq. 5).";
-    critic_loss ["critic loss"]: "Mean over critics and batch of (Q_k(s, a) − y)² (IQL's Eq. 6).";
-    bc_loss ["BC loss"]: "Mean over the batch of the sum over dimensions of (ε − ε_θ(a^t, s, t))². A network that always outputs 0 has the number of dimensions as its loss.";
-    advantage_mean: "Mean over the batch of the advantage min_k Q̂_k(s, a) − V(s): AlignIQL's policy takes the sample for which it is closest to 0.";
+    q_mean held_out: "Mean over the batch of the critics' target y = r + γ·mask·V(s') (IQL's Eq. 6).";
+    v_mean ["V"] held_out: "Mean over the batch of the value V(s) after its step.";
+    value_loss ["value loss"] held_out: "Expectile loss of V: mean over the batch of |expectile − 1(u < 0)|·u² with u = min_k Q̂_k(s, a) − V(s) (IQL's Eq. 5).";
+    critic_loss ["critic loss"] held_out: "Mean over critics and batch of (Q_k(s, a) − y)² (IQL's Eq. 6).";
+    bc_loss ["BC loss"] held_out: "Mean over the batch of the sum over dimensions of (ε − ε_θ(a^t, s, t))². A network that always outputs 0 has the number of dimensions as its loss.";
+    advantage_mean held_out: "Mean over the batch of the advantage min_k Q̂_k(s, a) − V(s): AlignIQL's policy takes the sample for which it is closest to 0.";
     learning_rate: "The actor's learning rate; falls to 0 along a cosine.";
 };
 
@@ -103,6 +103,30 @@ impl Config {
     }
 }
 
+/// The policy: cloning, whatever the actions are worth.
+fn bc_loss(networks: &Networks, batch: &Minibatch, noise: &Denoising) -> Result<Loss> {
+    let (_, predicted) = networks.denoise(batch, noise)?;
+    Ok(Loss::new("bc_loss", (predicted - &noise.epsilon)?.sqr()?.sum(1)?.mean_all()?))
+}
+
+impl AlignIql {
+    /// V(s) towards an expectile of the smaller Q̂(s, a), `[B]`, IQL's Eq. 5.
+    fn value_loss(&self, batch: &Minibatch, q: &Tensor) -> Result<Loss> {
+        let u = (q - self.value.network.state_values(&batch.observations)?.squeeze(0)?)?;
+        Ok(Loss::new("value_loss", expectile_loss(&u, *self.config.expectile)?))
+    }
+
+    /// Q(s, a) towards r + γ·V(s'), IQL's Eq. 6. Also measures V and, with the smaller Q̂(s, a), the advantage.
+    fn critic_loss(&self, networks: &Networks, batch: &Minibatch, q: &Tensor) -> Result<Loss> {
+        let value = self.value.network.detach();
+        let targets = batch.target(*self.config.gamma, &value.state_values(&batch.next_observations)?.squeeze(0)?)?;
+        let loss = networks.critics.network.squared_error(&batch.observations, &batch.actions, &targets)?;
+        let v = value.state_values(&batch.observations)?.squeeze(0)?;
+        let loss = Loss::new("critic_loss", loss).with("q_mean", targets.mean_all()?);
+        Ok(loss.with("v_mean", v.mean_all()?).with("advantage_mean", (q - v)?.mean_all()?))
+    }
+}
+
 impl Update for AlignIql {
     type Noise = Denoising;
 
@@ -119,39 +143,27 @@ impl Update for AlignIql {
     }
 
     fn work(&mut self, networks: &mut Networks, batch: &Minibatch, noise: &Denoising) -> Result<Computed> {
-        let Self { config, value, .. } = self;
+        let bc_loss = bc_loss(networks, batch, noise)?;
+        let Networks { actor, target_actor, .. } = networks;
+        actor.descend_as_set(&bc_loss.value)?;
+        target_actor.follow(&actor.network, *self.config.actor_ema_rate)?;
 
-        // The policy: cloning, whatever the actions are worth.
-        let (_, predicted) = networks.denoise(batch, noise)?;
-        let Networks { actor, target_actor, critics, target_critics, .. } = networks;
-        let bc_loss = (predicted - &noise.epsilon)?.sqr()?.sum(1)?.mean_all()?;
-        actor.descend_as_set(&bc_loss)?;
-        target_actor.follow(&actor.network, *config.actor_ema_rate)?;
+        let q = smaller(&networks.target_critics.values(&batch.observations, &batch.actions)?)?;
+        let value_loss = self.value_loss(batch, &q)?;
+        self.value.descend_as_set(&value_loss.value)?;
 
-        // V(s) towards an expectile of the smaller Q̂(s, a), IQL's Eq. 5.
-        let q = smaller(&target_critics.values(&batch.observations, &batch.actions)?)?;
-        let u = (&q - value.network.state_values(&batch.observations)?.squeeze(0)?)?;
-        let value_loss = expectile_loss(&u, *config.expectile)?;
-        value.descend_as_set(&value_loss)?;
+        let critic_loss = self.critic_loss(networks, batch, &q)?;
+        let Networks { critics, target_critics, .. } = networks;
+        critics.descend_as_set(&critic_loss.value)?;
+        target_critics.follow(&critics.network, *self.config.ema_rate)?;
+        Computed::new(&[bc_loss, value_loss, critic_loss], &[])
+    }
 
-        // Q(s, a) towards r + γ·V(s'), IQL's Eq. 6.
-        let value = value.network.detach();
-        let next = value.state_values(&batch.next_observations)?.squeeze(0)?;
-        let targets = batch.target(*config.gamma, &next)?;
-        let critic_loss = critics.network.squared_error(&batch.observations, &batch.actions, &targets)?;
-        critics.descend_as_set(&critic_loss)?;
-        target_critics.follow(&critics.network, *config.ema_rate)?;
-
-        let v = value.state_values(&batch.observations)?.squeeze(0)?;
-        let scalars = [
-            ("q_mean", &targets.mean_all()?),
-            ("v_mean", &v.mean_all()?),
-            ("value_loss", &value_loss),
-            ("critic_loss", &critic_loss),
-            ("bc_loss", &bc_loss),
-            ("advantage_mean", &(q - &v)?.mean_all()?),
-        ];
-        Computed::new(&scalars, &[])
+    fn evaluate(&self, networks: &Networks, batch: &Minibatch, noise: &Denoising) -> Result<Computed> {
+        let q = smaller(&networks.target_critics.values(&batch.observations, &batch.actions)?)?;
+        let of_critics = [self.value_loss(batch, &q)?, self.critic_loss(networks, batch, &q)?];
+        let [value_loss, critic_loss] = of_critics;
+        Computed::new(&[bc_loss(networks, batch, noise)?, value_loss, critic_loss], &[])
     }
 
     fn measure(&self, networks: &Networks, _: &Denoising, _: &[f32]) -> Result<Measured> {

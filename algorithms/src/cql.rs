@@ -7,7 +7,7 @@
 #[path = "golden/cql.rs"]
 mod golden;
 
-use super::algorithm::{Algorithm, AlgorithmError, Measured, largest, measured, smaller};
+use super::algorithm::{Algorithm, AlgorithmError, Loss, Measured, largest, measured, smaller};
 use super::context::{Context, Minibatch};
 use super::definition::{Definition, Metric, Reporting, metrics, read, readable};
 use super::denoising::normal;
@@ -44,13 +44,13 @@ const MOST_ALPHA_PRIME: f64 = 1e6;
 const CLONED: f64 = 0.999;
 
 const METRICS: &[Metric] = &metrics! {
-    q_mean: "Mean over the batch of the critics' target y = r + γ·mask·min_k Q̂_k(s', a') with a' from the policy; of several a' the best.";
-    critic_loss ["critic loss"]: "Mean over the batch of the sum over both critics of (Q_k(s, a) − y)² (the last term of CQL's Eq. 3).";
-    gap ["gap"]: "Mean over batch and critics of log Σ exp Q_k(s, ·) − Q_k(s, a), which the critics also descend (CQL's Eq. 4); below 0 where the data's action is worth more than all others together.";
-    actor_loss ["actor loss"]: "Mean over the batch of α·log π(a|s) − min_k Q_k(s, a) with a from the policy; while the policy is cloned, −log π of the data's action is in the place of −min_k Q_k.";
-    entropy ["entropy"]: "−mean over the batch of log π(a|s) with a from the policy; α holds it at −(dimensions of an action).";
+    q_mean held_out: "Mean over the batch of the critics' target y = r + γ·mask·min_k Q̂_k(s', a') with a' from the policy; of several a' the best.";
+    critic_loss ["critic loss"] held_out: "Mean over the batch of the sum over both critics of (Q_k(s, a) − y)² (the last term of CQL's Eq. 3).";
+    gap ["gap"] held_out: "Mean over batch and critics of log Σ exp Q_k(s, ·) − Q_k(s, a), which the critics also descend (CQL's Eq. 4); below 0 where the data's action is worth more than all others together.";
+    actor_loss ["actor loss"] held_out: "Mean over the batch of α·log π(a|s) − min_k Q_k(s, a) with a from the policy; while the policy is cloned, −log π of the data's action is in the place of −min_k Q_k.";
+    entropy ["entropy"] held_out: "−mean over the batch of log π(a|s) with a from the policy; α holds it at −(dimensions of an action).";
     alpha: "α, the weight of the entropy in the actor's loss, before its step.";
-    alpha_prime: "α', which the weight of the gap is multiplied by, before its step; rises while the gap is above the threshold. 0 without a threshold.";
+    alpha_prime: "α', which the weight of the gap is multiplied by, before its step; rises while the gap is above the threshold. Measured with a threshold only.";
 };
 
 /// CQL's hyper-parameters: the `[agent]` table of a preset.
@@ -181,7 +181,25 @@ impl Cql {
         let current = self.actor.distribution(&batch.observations)?;
         let next = self.actor.constant_distribution(&batch.next_observations)?;
 
-        // The policy towards large Q and entropy, and α so that the entropy is −(dimensions of an action).
+        // The policy, and α so that the entropy is −(dimensions of an action).
+        let (actor_loss, log_density) = self.actor_loss(step, batch, &current, noise)?;
+        self.actor.descend(&actor_loss.value, slow)?;
+        let excess = (log_density - self.context.action_dim() as f64)?;
+        self.log_alpha.descend(&(self.log_alpha.network.values().sum_all()? * excess)?.neg()?, slow)?;
+
+        let (mut critic_loss, gap) = self.critic_loss(batch, &current.detach(), &next, noise)?;
+        let (weight, alpha_prime) = self.weight(&gap.detach(), fast)?;
+        let conservative = (gap * weight)?;
+        self.critics.descend(&(&critic_loss.value + (conservative * CRITICS as f64)?)?, fast)?;
+        self.target_critics.follow(&self.critics.network, *self.config.ema_rate)?;
+        if let Some(alpha_prime) = alpha_prime {
+            critic_loss = critic_loss.with("alpha_prime", alpha_prime);
+        }
+        measured(&[actor_loss, critic_loss])
+    }
+
+    /// The policy towards large Q and entropy; and the mean of its log density, `[]`, a constant.
+    fn actor_loss(&self, step: u64, batch: &Minibatch, current: &Normal, noise: &Noise) -> Result<(Loss, Tensor)> {
         let drawn = current.draw(&noise.policy)?;
         let log_density = drawn.log_density.squeeze(1)?;
         let worth = match self.config.phases.is_cloning(step, self.context.total_steps) {
@@ -189,31 +207,18 @@ impl Cql {
             false => smaller(&self.critics.network.detach().values(&batch.observations, &drawn.actions.squeeze(1)?)?)?,
         };
         let alpha = self.log_alpha.network.values().detach().exp()?;
-        let actor_loss = (log_density.broadcast_mul(&alpha)? - worth)?.mean_all()?;
-        self.actor.descend(&actor_loss, slow)?;
+        let loss = Loss::new("actor_loss", (log_density.broadcast_mul(&alpha)? - worth)?.mean_all()?);
         let log_density = log_density.detach().mean_all()?;
-        let excess = (&log_density - self.context.action_dim() as f64)?;
-        self.log_alpha.descend(&(self.log_alpha.network.values().sum_all()? * excess)?.neg()?, slow)?;
+        Ok((loss.with("entropy", log_density.neg()?).with("alpha", alpha), log_density))
+    }
 
-        // The critics towards r + γ·Q̂(s', a'), and at s down the gap between all actions and the data's.
-        let targets = self.targets(batch, &next, &noise.target)?;
-        let (q, gaps) = self.gaps(batch, &current.detach(), &next, noise)?;
-        let critic_loss = (q.broadcast_sub(&targets)?.sqr()?.mean_all()? * CRITICS as f64)?;
+    /// The critics towards r + γ·Q̂(s', a'); and how far they also go down, the gap between all actions at s and the data's, `[]`.
+    fn critic_loss(&self, batch: &Minibatch, current: &Normal, next: &Normal, noise: &Noise) -> Result<(Loss, Tensor)> {
+        let targets = self.targets(batch, next, &noise.target)?;
+        let (q, gaps) = self.gaps(batch, current, next, noise)?;
+        let loss = (q.broadcast_sub(&targets)?.sqr()?.mean_all()? * CRITICS as f64)?;
         let gap = gaps.mean_all()?;
-        let (weight, alpha_prime) = self.weight(&gap.detach(), fast)?;
-        let conservative = (&gap * weight)?;
-        self.critics.descend(&(&critic_loss + (conservative * CRITICS as f64)?)?, fast)?;
-        self.target_critics.follow(&self.critics.network, *self.config.ema_rate)?;
-
-        measured([
-            ("q_mean", &targets.mean_all()?),
-            ("critic_loss", &critic_loss),
-            ("gap", &gap),
-            ("actor_loss", &actor_loss),
-            ("entropy", &log_density.neg()?),
-            ("alpha", &alpha),
-            ("alpha_prime", &alpha_prime),
-        ])
+        Ok((Loss::new("critic_loss", loss).with("q_mean", targets.mean_all()?).with("gap", gap.clone()), gap))
     }
 
     /// y = r + γ·mask·max_a' min_k Q̂_k(s', a') over the actions drawn with this noise, `[B, S, a]`; `[B]`.
@@ -246,16 +251,16 @@ impl Cql {
 
     /// The weight of the gap in the critics' loss, with α' if there is one (appendix, dual gradient descent), and α'. Moves α' up a
     /// gap above the threshold.
-    fn weight(&mut self, gap: &Tensor, adam: AdamStep) -> Result<(Tensor, Tensor)> {
+    fn weight(&mut self, gap: &Tensor, adam: AdamStep) -> Result<(Tensor, Option<Tensor>)> {
         let weight = f64::from(*self.config.weight);
         let (Some(learned), Some(threshold)) = (&mut self.log_alpha_prime, self.config.threshold) else {
-            return Ok(((gap.ones_like()? * weight)?, gap.zeros_like()?));
+            return Ok(((gap.ones_like()? * weight)?, None));
         };
         let alpha_prime = learned.network.values().exp()?.clamp(0.0, MOST_ALPHA_PRIME)?.sum_all()?;
         let excess = ((gap - f64::from(*threshold))? * weight)?;
         learned.descend(&(&alpha_prime * excess)?.neg()?, adam)?;
         let alpha_prime = alpha_prime.detach();
-        Ok(((&alpha_prime * weight)?, alpha_prime))
+        Ok(((&alpha_prime * weight)?, Some(alpha_prime)))
     }
 }
 
@@ -269,6 +274,15 @@ impl Algorithm for Cql {
     fn update(&mut self, step: u64, items: &[u32]) -> Result<Measured> {
         let (batch, noise) = (self.context.batch(items)?, self.noise(step)?);
         self.step(step, &batch, &noise)
+    }
+
+    fn evaluate(&self, step: u64, items: &[u32]) -> Result<Measured> {
+        let (batch, noise) = (self.context.batch(items)?, self.noise(step)?);
+        let current = self.actor.constant_distribution(&batch.observations)?;
+        let next = self.actor.constant_distribution(&batch.next_observations)?;
+        let (actor_loss, _) = self.actor_loss(step, &batch, &current, &noise)?;
+        let (critic_loss, _) = self.critic_loss(&batch, &current, &next, &noise)?;
+        measured(&[actor_loss, critic_loss])
     }
 
     /// Acts by the tanh of the mean.

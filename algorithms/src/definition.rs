@@ -15,7 +15,7 @@ pub struct Definition {
     pub name: &'static str,
     /// The file of its values for each task, `presets/NAME.toml`.
     pub settings: &'static str,
-    /// What its updates measure. What an update leaves out is 0.
+    /// What its updates measure, each what its phase has.
     pub metrics: &'static [Metric],
     /// How reports call its runs, and what they say of them beside scores.
     pub report: Reporting,
@@ -37,12 +37,22 @@ pub struct Metric {
     pub help: &'static str,
     /// What the progress display calls it; empty where it does not show it.
     pub label: &'static str,
+    /// Whether it is also measured on held-out episodes: it says something of data that is not learnt from.
+    pub held_out: bool,
 }
 
-/// A table of metrics: in each line a name, in brackets what the display calls it if it shows it, and the help.
+/// A table of metrics: in each line a name, in brackets what the display calls it if it shows it, `held_out` if it is also
+/// measured on held-out episodes, and the help.
 macro_rules! metrics {
-    ($($name:ident $([$label:literal])? : $help:expr;)*) => {
-        [$($crate::definition::Metric { name: stringify!($name), label: concat!($($label)?), help: $help }),*]
+    (@ held_out) => { true };
+    (@) => { false };
+    ($($name:ident $([$label:literal])? $($held_out:ident)? : $help:expr;)*) => {
+        [$($crate::definition::Metric {
+            name: stringify!($name),
+            help: $help,
+            label: concat!($($label)?),
+            held_out: $crate::definition::metrics!(@ $($held_out)?),
+        }),*]
     };
 }
 pub(crate) use metrics;

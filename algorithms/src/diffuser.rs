@@ -9,7 +9,7 @@
 mod golden;
 mod windows;
 
-use super::algorithm::{AgentError, Algorithm, AlgorithmError, Measured, check, measured};
+use super::algorithm::{AgentError, Algorithm, AlgorithmError, Loss, Measured, check, measured};
 use super::context::Context;
 use super::definition::{Definition, Metric, Reporting, metrics, read};
 use super::denoising::normal;
@@ -38,11 +38,11 @@ pub(super) const DEFINITION: Definition = Definition {
 };
 
 const METRICS: &[Metric] = &metrics! {
-    model_loss ["model loss"]: "Mean over batch, steps and numbers of weight·(x⁰ − model(xᵗ, t))², with a weight above 1 on the first action and 0 on the first state, which is given.";
-    first_action_loss: "Mean over the batch and the dimensions of the first action of (a⁰ − predicted)², in the data's standard deviations.";
-    value_loss ["value loss"]: "Mean over the batch of (return − V(xᵗ, t))². 0 once the value network learns no more.";
-    value_mean: "Mean over the batch of V(xᵗ, t). 0 once the value network learns no more.";
-    return_mean: "Mean over the batch of the discounted return from a window's first step to the end of its episode, with the terminal penalty.";
+    model_loss ["model loss"] held_out: "Mean over batch, steps and numbers of weight·(x⁰ − model(xᵗ, t))², with a weight above 1 on the first action and 0 on the first state, which is given.";
+    first_action_loss held_out: "Mean over the batch and the dimensions of the first action of (a⁰ − predicted)², in the data's standard deviations.";
+    value_loss ["value loss"] held_out: "As long as the value network learns: mean over the batch of (return − V(xᵗ, t))².";
+    value_mean held_out: "As long as the value network learns: mean over the batch of V(xᵗ, t).";
+    return_mean held_out: "Mean over the batch of the discounted return from a window's first step to the end of its episode, with the terminal penalty.";
 };
 
 /// Diffuser's hyper-parameters: the `[agent]` table of a preset.
@@ -175,35 +175,35 @@ impl Diffuser {
         let follow = step.is_multiple_of(*self.config.ema_every);
         let rate = if step < self.config.ema_start { 1.0 } else { *self.config.ema_rate };
 
-        // The model: the clean window, the first action above all.
-        let error = (self.model.network.clean(&noisy, &noise.t)? - &batch.windows)?.sqr()?;
-        let model_loss = error.broadcast_mul(&self.weights)?.mean_all()?;
-        self.model.descend(&model_loss, adam)?;
+        let model_loss = self.model_loss(batch, &noisy, noise)?;
+        self.model.descend(&model_loss.value, adam)?;
         if follow {
             self.target_model.follow(&self.model.network, rate)?;
         }
-        let first_action = error.narrow(1, 0, 1)?.narrow(2, 0, self.context.action_dim())?.mean_all()?;
-        let return_mean = batch.returns.mean_all()?;
         if step >= *self.config.value_updates {
-            let known =
-                [("model_loss", &model_loss), ("first_action_loss", &first_action), ("return_mean", &return_mean)];
-            return measured(known);
+            return measured(&[model_loss]);
         }
 
-        // The value network: the return, as far as the noise lets it be seen.
-        let values = self.value.network.values(&noisy, &noise.t)?;
-        let value_loss = mse(&values, &batch.returns)?;
-        self.value.descend(&value_loss, adam)?;
+        let value_loss = self.value_loss(batch, &noisy, noise)?;
+        self.value.descend(&value_loss.value, adam)?;
         if follow {
             self.target_value.follow(&self.value.network, rate)?;
         }
-        measured([
-            ("model_loss", &model_loss),
-            ("first_action_loss", &first_action),
-            ("value_loss", &value_loss),
-            ("value_mean", &values.mean_all()?),
-            ("return_mean", &return_mean),
-        ])
+        measured(&[model_loss, value_loss])
+    }
+
+    /// The model: the clean window, the first action above all.
+    fn model_loss(&self, batch: &Batch, noisy: &Tensor, noise: &Noise) -> Result<Loss> {
+        let error = (self.model.network.clean(noisy, &noise.t)? - &batch.windows)?.sqr()?;
+        let loss = Loss::new("model_loss", error.broadcast_mul(&self.weights)?.mean_all()?);
+        let first_action = error.narrow(1, 0, 1)?.narrow(2, 0, self.context.action_dim())?.mean_all()?;
+        Ok(loss.with("first_action_loss", first_action).with("return_mean", batch.returns.mean_all()?))
+    }
+
+    /// The value network: the return, as far as the noise lets it be seen.
+    fn value_loss(&self, batch: &Batch, noisy: &Tensor, noise: &Noise) -> Result<Loss> {
+        let values = self.value.network.values(noisy, &noise.t)?;
+        Ok(Loss::new("value_loss", mse(&values, &batch.returns)?).with("value_mean", values.mean_all()?))
     }
 }
 
@@ -221,6 +221,16 @@ impl Algorithm for Diffuser {
         let batch = self.windows.batch(items, &self.context.device)?;
         let noise = self.noise(step)?;
         self.step(step, &batch, &noise)
+    }
+
+    fn evaluate(&self, step: u64, items: &[u32]) -> Result<Measured> {
+        let (batch, noise) = (self.windows.batch(items, &self.context.device)?, self.noise(step)?);
+        let noisy = self.noisy(&batch.windows, &noise)?;
+        let mut losses = vec![self.model_loss(&batch, &noisy, &noise)?];
+        if step < *self.config.value_updates {
+            losses.push(self.value_loss(&batch, &noisy, &noise)?);
+        }
+        measured(&losses)
     }
 
     fn policy(&self) -> Result<(PolicyConfig, Tensors)> {

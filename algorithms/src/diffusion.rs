@@ -82,6 +82,9 @@ pub(super) trait Update: Send {
     /// The work of an update, as [`Replay::start`] wants it.
     fn work(&mut self, networks: &mut Networks, batch: &Minibatch, noise: &Self::Noise) -> Result<Computed>;
 
+    /// The losses of an update with the weights as they are, as [`Self::work`] gives them.
+    fn evaluate(&self, networks: &Networks, batch: &Minibatch, noise: &Self::Noise) -> Result<Computed>;
+
     /// What only some updates do, behind the work of all.
     fn end(&mut self, _: &mut Networks, _step: u64) -> Result<()> {
         Ok(())
@@ -143,6 +146,15 @@ impl<U: Update> Algorithm for Diffusion<U> {
             _ => self.noise(step)?,
         };
         self.step(step, &(self.networks.context.batch_on(items, &Device::Cpu)?, noise))
+    }
+
+    fn evaluate(&self, step: u64, items: &[u32]) -> Result<Measured> {
+        let Self { update, networks, .. } = self;
+        let (batch, noise) = (networks.context.batch(items)?, self.noise(step)?);
+        let (mut measured, others) =
+            update.evaluate(networks, &batch, &noise.on(&networks.context.device)?)?.read()?;
+        measured.extend(update.measure(networks, &noise, &others)?);
+        Ok(measured)
     }
 
     fn policy(&self) -> Result<(PolicyConfig, Tensors)> {

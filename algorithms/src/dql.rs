@@ -7,7 +7,7 @@
 #[path = "golden/dql.rs"]
 mod golden;
 
-use super::algorithm::{largest, smaller};
+use super::algorithm::{Loss, largest, smaller};
 use super::context::{Context, Minibatch};
 use super::definition::{Definition, Metric, Reporting, metrics, read, readable};
 use super::denoising::Denoising;
@@ -37,11 +37,11 @@ pub(super) const DEFINITION: Definition = Definition {
 const CRITICS: usize = 2;
 
 const METRICS: &[Metric] = &metrics! {
-    q_mean: "Mean over the batch of the critics' target y = r + γ·mask·min_k Q̂_k(s', a'), with a' from the target actor (Diffusion-QL's Eq. 4).";
-    critic_loss ["critic loss"]: "Sum over both critics of the mean over the batch of (Q_k(s, a) − y)² (Diffusion-QL's Eq. 4).";
-    bc_loss ["BC loss"]: "Mean over batch and dimensions of (ε − ε_θ(a^t, s, t))² (Diffusion-QL's Eq. 2). A network that always outputs 0 has loss 1.";
-    q_loss ["Q loss"]: "−mean of Q_i(s, a⁰) over the mean of |Q_j(s, a⁰)|, where the actor samples a⁰, and chance says which critic is i and which j (Diffusion-QL's Eq. 3). While the critics are alike and Q keeps its sign over the batch it is near −1 where Q is positive, near 1 where it is negative.";
-    actor_loss: "(BC loss) + η·(Q loss) (Diffusion-QL's Eq. 3).";
+    q_mean held_out: "Mean over the batch of the critics' target y = r + γ·mask·min_k Q̂_k(s', a'), with a' from the target actor (Diffusion-QL's Eq. 4).";
+    critic_loss ["critic loss"] held_out: "Sum over both critics of the mean over the batch of (Q_k(s, a) − y)² (Diffusion-QL's Eq. 4).";
+    bc_loss ["BC loss"] held_out: "Mean over batch and dimensions of (ε − ε_θ(a^t, s, t))² (Diffusion-QL's Eq. 2). A network that always outputs 0 has loss 1.";
+    q_loss ["Q loss"] held_out: "−mean of Q_i(s, a⁰) over the mean of |Q_j(s, a⁰)|, where the actor samples a⁰, and chance says which critic is i and which j (Diffusion-QL's Eq. 3). While the critics are alike and Q keeps its sign over the batch it is near −1 where Q is positive, near 1 where it is negative.";
+    actor_loss held_out: "(BC loss) + η·(Q loss) (Diffusion-QL's Eq. 3).";
     critic_gradient_norm: "Global norm of the critics' gradient before clipping.";
     actor_gradient_norm: "Global norm of the actor's gradient before clipping.";
 };
@@ -119,6 +119,22 @@ impl Config {
         let best = largest(&q.reshape((CRITICS, (), *self.samples))?, 2)?;
         batch.target(*self.gamma, &smaller(&best)?)
     }
+
+    /// Q(s, a) towards r + γ·min_k Q̂_k(s', a'), Eq. 4.
+    fn critic_loss(&self, networks: &Networks, batch: &Minibatch, noise: &Noise) -> Result<Loss> {
+        let targets = self.targets(networks, batch, &noise.next)?;
+        let error = networks.critics.network.squared_error(&batch.observations, &batch.actions, &targets)?;
+        Ok(Loss::new("critic_loss", (error * CRITICS as f64)?).with("q_mean", targets.mean_all()?))
+    }
+
+    /// The policy: cloned, Eq. 2, and moved towards what the critics value, Eq. 3.
+    fn actor_loss(&self, networks: &Networks, batch: &Minibatch, noise: &Noise) -> Result<Loss> {
+        let (_, predicted) = networks.denoise(batch, &noise.denoising)?;
+        let bc_loss = mse(&predicted, &noise.denoising.epsilon)?;
+        let q_loss = q_loss(networks, batch, noise)?;
+        let loss = (&bc_loss + (&q_loss * f64::from(*self.eta))?)?;
+        Ok(Loss::new("actor_loss", loss).with("bc_loss", bc_loss).with("q_loss", q_loss))
+    }
 }
 
 /// −E[Q_i(s, a⁰)]/E|Q_j(s, a⁰)| of actions from the whole chain, `[]`: the second term of Eq. 3, without η. Its gradient
@@ -150,31 +166,18 @@ impl Update for Config {
 
     /// One pass through Algorithm 1's loop, but for the target actor.
     fn work(&mut self, networks: &mut Networks, batch: &Minibatch, noise: &Noise) -> Result<Computed> {
-        // Q(s, a) towards r + γ·min_k Q̂_k(s', a'), Eq. 4.
-        let targets = self.targets(networks, batch, &noise.next)?;
-        let error = networks.critics.network.squared_error(&batch.observations, &batch.actions, &targets)?;
-        let critic_loss = (error * CRITICS as f64)?;
-        let critic_gradient_norm = networks.critics.descend_as_set(&critic_loss)?;
-
-        // The policy: cloned, Eq. 2, and moved towards what the critics value, Eq. 3.
-        let (_, predicted) = networks.denoise(batch, &noise.denoising)?;
-        let bc_loss = mse(&predicted, &noise.denoising.epsilon)?;
-        let q_loss = q_loss(networks, batch, noise)?;
-        let actor_loss = (&bc_loss + (&q_loss * f64::from(*self.eta))?)?;
-        let actor_gradient_norm = networks.actor.descend_as_set(&actor_loss)?;
-
+        let critic_loss = self.critic_loss(networks, batch, noise)?;
+        let critic_norm = networks.critics.descend_as_set(&critic_loss.value)?;
+        let actor_loss = self.actor_loss(networks, batch, noise)?;
+        let actor_norm = networks.actor.descend_as_set(&actor_loss.value)?;
         networks.target_critics.follow(&networks.critics.network, *self.ema_rate)?;
+        let critic_loss = critic_loss.with("critic_gradient_norm", critic_norm);
+        Computed::new(&[critic_loss, actor_loss.with("actor_gradient_norm", actor_norm)], &[])
+    }
 
-        let scalars = [
-            ("q_mean", &targets.mean_all()?),
-            ("critic_loss", &critic_loss),
-            ("bc_loss", &bc_loss),
-            ("q_loss", &q_loss),
-            ("actor_loss", &actor_loss),
-            ("critic_gradient_norm", &critic_gradient_norm),
-            ("actor_gradient_norm", &actor_gradient_norm),
-        ];
-        Computed::new(&scalars, &[])
+    fn evaluate(&self, networks: &Networks, batch: &Minibatch, noise: &Noise) -> Result<Computed> {
+        let critic_loss = self.critic_loss(networks, batch, noise)?;
+        Computed::new(&[critic_loss, self.actor_loss(networks, batch, noise)?], &[])
     }
 
     fn end(&mut self, networks: &mut Networks, step: u64) -> Result<()> {

@@ -8,7 +8,7 @@
 #[path = "golden/dtql.rs"]
 mod golden;
 
-use super::algorithm::{Algorithm, Measured, measured, smaller};
+use super::algorithm::{Algorithm, Loss, Measured, measured, smaller};
 use super::context::{Context, Minibatch};
 use super::definition::{Definition, Metric, Reporting, metrics, read, readable};
 use super::denoising::normal;
@@ -44,15 +44,15 @@ const CRITICS: usize = 2;
 const ROOM: f64 = 1.001;
 
 const METRICS: &[Metric] = &metrics! {
-    q_mean: "Mean over the batch of the critics' target y = r + γ·mask·V(s').";
-    v_mean ["V"]: "Mean over the batch of the value V(s) before its step.";
-    value_loss ["value loss"]: "Expectile loss of V: mean over the batch of |expectile − 1(u < 0)|·u² with u = min_k Q_k(s, a) − V(s).";
-    critic_loss ["critic loss"]: "Sum over both critics of the mean over the batch of (Q_k(s, a) − y)².";
-    bc_loss ["BC loss"]: "Mean over batch and dimensions of the diffusion policy's squared error at the data's actions, ((D(a + σn; s, σ) − a)/c_out)². A network that always outputs 0 has loss 1 or so.";
-    trust_loss ["trust loss"]: "The same error at the one-step policy's actions. 0 in pre-training.";
-    q_loss ["Q loss"]: "−mean over the batch of min_k Q_k(s, a) at the one-step policy's actions. 0 in pre-training.";
-    likelihood_loss: "−mean over the batch of log π(a|s) at the data's actions, without the tanh's Jacobian. 0 in pre-training, and where `likelihood` is 0.";
-    actor_loss: "α·(trust loss) + (Q loss) + `likelihood`·(likelihood loss). 0 in pre-training.";
+    q_mean held_out: "Mean over the batch of the critics' target y = r + γ·mask·V(s').";
+    v_mean ["V"] held_out: "Mean over the batch of the value V(s) before its step.";
+    value_loss ["value loss"] held_out: "Expectile loss of V: mean over the batch of |expectile − 1(u < 0)|·u² with u = min_k Q_k(s, a) − V(s).";
+    critic_loss ["critic loss"] held_out: "Sum over both critics of the mean over the batch of (Q_k(s, a) − y)².";
+    bc_loss ["BC loss"] held_out: "Mean over batch and dimensions of the diffusion policy's squared error at the data's actions, ((D(a + σn; s, σ) − a)/c_out)². A network that always outputs 0 has loss 1 or so.";
+    trust_loss ["trust loss"] held_out: "After pre-training: the same error at the one-step policy's actions.";
+    q_loss ["Q loss"] held_out: "After pre-training: −mean over the batch of min_k Q_k(s, a) at the one-step policy's actions.";
+    likelihood_loss held_out: "After pre-training, unless `likelihood` is 0: −mean over the batch of log π(a|s) at the data's actions, without the tanh's Jacobian.";
+    actor_loss held_out: "After pre-training: α·(trust loss) + (Q loss) + `likelihood`·(likelihood loss).";
     learning_rate: "The learning rate of both policies.";
 };
 
@@ -168,60 +168,60 @@ impl Dtql {
         };
         let rate = *self.config.learning_rate * decay;
         let adam = AdamStep::after(step, rate);
-        let mut measured =
-            self.learn_values(batch, AdamStep { rate: *self.config.critic_learning_rate * decay, ..adam })?;
-        measured.extend(self.clone_data(batch, &noise.cloning, adam)?);
+        let of_values = AdamStep { rate: *self.config.critic_learning_rate * decay, ..adam };
+        let [value_loss, critic_loss] = self.value_losses(batch)?;
+        self.value.descend(&value_loss.value, of_values)?;
+        self.critics.descend(&critic_loss.value, of_values)?;
+        let bc_loss = self.bc_loss(batch, &noise.cloning)?;
+        self.diffusion.descend(&bc_loss.value, adam)?;
+        let mut losses = vec![value_loss, critic_loss, bc_loss];
         if step >= pretraining {
-            measured.extend(self.improve(batch, noise, AdamStep { count: step - pretraining + 1, ..adam })?);
+            let actor_loss = self.actor_loss(batch, noise)?;
+            self.actor.descend(&actor_loss.value, AdamStep { count: step - pretraining + 1, ..adam })?;
             self.target_critics.follow(&self.critics.network, *self.config.ema_rate)?;
+            losses.push(actor_loss);
         }
+        let mut measured = measured(&losses)?;
         measured.push(("learning_rate", rate));
         Ok(measured)
     }
 
     /// V(s) towards an expectile of the smaller Q(s, a), and Q(s, a) towards r + γ·V(s'), both as they are before this step.
-    fn learn_values(&mut self, batch: &Minibatch, adam: AdamStep) -> Result<Measured> {
+    fn value_losses(&self, batch: &Minibatch) -> Result<[Loss; 2]> {
         let next = self.value.network.detach().state_values(&batch.next_observations)?.squeeze(0)?;
         let targets = batch.target(*self.config.gamma, &next)?;
         let q = self.critics.network.values(&batch.observations, &batch.actions)?;
         let v = self.value.network.state_values(&batch.observations)?.squeeze(0)?;
         let value_loss = expectile_loss(&(smaller(&q.detach())? - &v)?, *self.config.expectile)?;
         let critic_loss = (q.broadcast_sub(&targets)?.sqr()?.mean_all()? * CRITICS as f64)?;
-        self.value.descend(&value_loss, adam)?;
-        self.critics.descend(&critic_loss, adam)?;
-        measured([
-            ("q_mean", &targets.mean_all()?),
-            ("v_mean", &v.mean_all()?),
-            ("value_loss", &value_loss),
-            ("critic_loss", &critic_loss),
-        ])
+        let critic_loss = Loss::new("critic_loss", critic_loss).with("q_mean", targets.mean_all()?);
+        Ok([Loss::new("value_loss", value_loss).with("v_mean", v.mean_all()?), critic_loss])
     }
 
     /// μ_φ towards the data's actions.
-    fn clone_data(&mut self, batch: &Minibatch, noising: &Noising, adam: AdamStep) -> Result<Measured> {
+    fn bc_loss(&self, batch: &Minibatch, noising: &Noising) -> Result<Loss> {
         let loss = denoising_loss(&self.diffusion.network, &batch.observations, &batch.actions, noising)?;
-        self.diffusion.descend(&loss, adam)?;
-        measured([("bc_loss", &loss)])
+        Ok(Loss::new("bc_loss", loss))
     }
 
     /// π_θ towards actions that the critics value and that μ_φ, which is fixed, denoises well.
-    fn improve(&mut self, batch: &Minibatch, noise: &Noise, adam: AdamStep) -> Result<Measured> {
+    fn actor_loss(&self, batch: &Minibatch, noise: &Noise) -> Result<Loss> {
         let distribution = self.actor.distribution(&batch.observations)?;
         let actions = distribution.draw(&noise.policy.unsqueeze(1)?)?.actions.squeeze(1)?;
         let diffusion = self.diffusion.network.detach();
         let trust_loss = denoising_loss(&diffusion, &batch.observations, &actions, &noise.trust)?;
         let q = smaller(&self.critics.network.detach().values(&batch.observations, &actions)?)?;
         let q_loss = q.mean_all()?.neg()?;
-        let mut actor_loss = ((&trust_loss * f64::from(*self.config.alpha))? + &q_loss)?;
-        let mut measurements = Vec::new();
-        if *self.config.likelihood > 0.0 {
-            let likelihood_loss = likelihood_loss(&distribution, &batch.actions)?;
-            actor_loss = (actor_loss + (&likelihood_loss * f64::from(*self.config.likelihood))?)?;
-            measurements = measured([("likelihood_loss", &likelihood_loss)])?;
-        }
-        self.actor.descend(&actor_loss, adam)?;
-        measurements.extend(measured([("trust_loss", &trust_loss), ("q_loss", &q_loss), ("actor_loss", &actor_loss)])?);
-        Ok(measurements)
+        let loss = ((&trust_loss * f64::from(*self.config.alpha))? + &q_loss)?;
+        let loss = match *self.config.likelihood {
+            0.0 => Loss::new("actor_loss", loss),
+            weight => {
+                let likelihood_loss = likelihood_loss(&distribution, &batch.actions)?;
+                let loss = (loss + (&likelihood_loss * f64::from(weight))?)?;
+                Loss::new("actor_loss", loss).with("likelihood_loss", likelihood_loss)
+            }
+        };
+        Ok(loss.with("trust_loss", trust_loss).with("q_loss", q_loss))
     }
 
     /// The random numbers of update number `step`.
@@ -262,6 +262,16 @@ impl Algorithm for Dtql {
     fn update(&mut self, step: u64, items: &[u32]) -> Result<Measured> {
         let (batch, noise) = (self.context.batch(items)?, self.noise(step)?);
         self.step(step, &batch, &noise)
+    }
+
+    fn evaluate(&self, step: u64, items: &[u32]) -> Result<Measured> {
+        let (batch, noise) = (self.context.batch(items)?, self.noise(step)?);
+        let mut losses = Vec::from(self.value_losses(&batch)?);
+        losses.push(self.bc_loss(&batch, &noise.cloning)?);
+        if step >= self.pretraining() {
+            losses.push(self.actor_loss(&batch, &noise)?);
+        }
+        measured(&losses)
     }
 
     /// The one-step policy as it is; one of its candidates is drawn by what the target critics say of them.

@@ -9,7 +9,7 @@
 #[path = "golden/fqe.rs"]
 mod golden;
 
-use super::algorithm::{AgentError, AlgorithmError, Measured, measured};
+use super::algorithm::{AgentError, AlgorithmError, Loss, Measured, measured};
 use super::context::{Context, Minibatch};
 use super::definition::read;
 use super::hyperparameters::{NotNegative, Positive, Rate, Share};
@@ -170,9 +170,10 @@ impl Fqe {
         let targets = self.targets(&batch, &next_actions)?;
         let of_network = targets.affine(1.0 / self.units.scale, -self.units.offset / self.units.scale)?;
         let loss = self.critic.network.squared_error(&batch.observations, &batch.actions, &of_network)?;
-        self.critic.descend(&loss, AdamStep::after(step, *self.config.learning_rate))?;
+        let loss = Loss::new("critic_loss", loss).with("q_mean", targets.mean_all()?);
+        self.critic.descend(&loss.value, AdamStep::after(step, *self.config.learning_rate))?;
         self.target_critic.follow(&self.critic.network, *self.config.ema_rate)?;
-        measured([("q_mean", &targets.mean_all()?), ("critic_loss", &loss)])
+        measured(&[loss])
     }
 
     /// y = r + γ·mask·Q̂(s', a'), at most and at least what rewards allow; `[B]`.

@@ -7,7 +7,7 @@
 #[path = "golden/fql.rs"]
 mod golden;
 
-use super::algorithm::{Algorithm, Measured, measured, smaller};
+use super::algorithm::{Algorithm, Loss, Measured, measured, smaller};
 use super::context::{Context, Minibatch};
 use super::definition::{Definition, Metric, Reporting, metrics, read, readable};
 use super::denoising::normal;
@@ -36,12 +36,12 @@ pub(super) const DEFINITION: Definition = Definition {
 const CRITICS: usize = 2;
 
 const METRICS: &[Metric] = &metrics! {
-    q_mean ["Q"]: "Mean over the batch of the critics' target y = r + γ·mask·(mean or smaller of Q̂_k(s', a')), where a' is the one-step policy's action, clipped.";
-    critic_loss ["critic loss"]: "Mean over batch and critics of (Q_k(s, a) − y)² (FQL's Eq. 3).";
-    bc_loss ["BC loss"]: "The flow's loss: mean over batch and dimensions of (v(s, x_t, t) − (a − x_0))² (FQL's Eq. 4).";
-    distill_loss: "Mean over batch and dimensions of the squared distance between the one-step policy's action, not clipped, and the flow's of the same noise (FQL's Eq. 6).";
-    q_loss: "−Mean over batch and critics of Q_k(s, π(s, z)), the action clipped; divided by the mean size of the mean over critics with normalize_q.";
-    actor_loss ["actor loss"]: "alpha·distill_loss + q_loss (FQL's Eq. 7).";
+    q_mean ["Q"] held_out: "Mean over the batch of the critics' target y = r + γ·mask·(mean or smaller of Q̂_k(s', a')), where a' is the one-step policy's action, clipped.";
+    critic_loss ["critic loss"] held_out: "Mean over batch and critics of (Q_k(s, a) − y)² (FQL's Eq. 3).";
+    bc_loss ["BC loss"] held_out: "The flow's loss: mean over batch and dimensions of (v(s, x_t, t) − (a − x_0))² (FQL's Eq. 4).";
+    distill_loss held_out: "Mean over batch and dimensions of the squared distance between the one-step policy's action, not clipped, and the flow's of the same noise (FQL's Eq. 6).";
+    q_loss held_out: "−Mean over batch and critics of Q_k(s, π(s, z)), the action clipped; divided by the mean size of the mean over critics with normalize_q.";
+    actor_loss ["actor loss"] held_out: "alpha·distill_loss + q_loss (FQL's Eq. 7).";
 };
 
 /// FQL's hyper-parameters: the `[agent]` table of a preset.
@@ -109,24 +109,26 @@ impl Fql {
     /// Update number `step`. All losses are those of the networks before it, and the targets follow these.
     fn step(&mut self, step: u64, batch: &Minibatch, noise: &Noise) -> Result<Measured> {
         let adam = AdamStep::after(step, *self.config.learning_rate);
+        let [critic_loss, bc_loss, actor_loss] = self.losses(batch, noise)?;
+        let gradients = Gradients::of(&actor_loss.value)?;
+        self.target_critics.follow(&self.critics.network, *self.config.ema_rate)?;
+        self.critics.descend(&critic_loss.value, adam)?;
+        self.flow.descend(&bc_loss.value, adam)?;
+        self.actor.descend_along(&gradients, adam)?;
+        measured(&[critic_loss, bc_loss, actor_loss])
+    }
+
+    /// Those of critics, flow and policy.
+    fn losses(&self, batch: &Minibatch, noise: &Noise) -> Result<[Loss; 3]> {
         let targets = self.targets(batch, &noise.of_targets)?;
         let critic_loss = self.critics.network.squared_error(&batch.observations, &batch.actions, &targets)?;
         let bc_loss = self.flow_loss(batch, noise)?;
         let [distill_loss, q_loss] = self.actor_losses(batch, &noise.of_policy)?;
         let actor_loss = ((&distill_loss * f64::from(*self.config.alpha))? + &q_loss)?;
-
-        let gradients = Gradients::of(&actor_loss)?;
-        self.target_critics.follow(&self.critics.network, *self.config.ema_rate)?;
-        self.critics.descend(&critic_loss, adam)?;
-        self.flow.descend(&bc_loss, adam)?;
-        self.actor.descend_along(&gradients, adam)?;
-        measured([
-            ("q_mean", &targets.mean_all()?),
-            ("critic_loss", &critic_loss),
-            ("bc_loss", &bc_loss),
-            ("distill_loss", &distill_loss),
-            ("q_loss", &q_loss),
-            ("actor_loss", &actor_loss),
+        Ok([
+            Loss::new("critic_loss", critic_loss).with("q_mean", targets.mean_all()?),
+            Loss::new("bc_loss", bc_loss),
+            Loss::new("actor_loss", actor_loss).with("distill_loss", distill_loss).with("q_loss", q_loss),
         ])
     }
 
@@ -200,6 +202,10 @@ impl Algorithm for Fql {
     fn update(&mut self, step: u64, items: &[u32]) -> Result<Measured> {
         let (batch, noise) = (self.context.batch(items)?, self.noise(step)?);
         self.step(step, &batch, &noise)
+    }
+
+    fn evaluate(&self, step: u64, items: &[u32]) -> Result<Measured> {
+        measured(&self.losses(&self.context.batch(items)?, &self.noise(step)?)?)
     }
 
     /// The one-step policy, with the target critics to choose by.

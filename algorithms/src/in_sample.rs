@@ -2,7 +2,7 @@
 //! critics' smaller value, a Gaussian policy is cloned from the data with weights, and twin critics move towards r + γ·V(s').
 //! An algorithm of this kind is its [`Losses`].
 
-use super::algorithm::{AgentError, Algorithm, Measured, measured, smaller};
+use super::algorithm::{AgentError, Algorithm, Loss, Measured, measured, smaller};
 use super::context::{Context, Minibatch};
 use super::definition::{self, Metric, metrics};
 use super::gaussian::Gaussian;
@@ -34,14 +34,14 @@ pub(super) const COSINE: &str = "The actor's learning rate; falls to 0 along a c
 /// The metrics of one algorithm.
 pub(super) const fn table(helps: Helps) -> [Metric; 9] {
     metrics! {
-        q_mean: helps.targets;
-        v_mean ["V"]: "Mean over the batch of the value V(s) after its step.";
-        value_loss ["value loss"]: helps.value_loss;
-        critic_loss ["critic loss"]: helps.critic_loss;
-        actor_loss ["actor loss"]: helps.actor_loss;
-        advantage_mean: "Mean over the batch of the advantage A = min_k Q̂_k(s, a) − V(s).";
-        weight_mean: "Mean over the batch of the weights in the actor's loss.";
-        clipped_share: "Share of the batch, 0 to 1, whose weight is clipped at 100.";
+        q_mean held_out: helps.targets;
+        v_mean ["V"] held_out: "Mean over the batch of the value V(s) after its step.";
+        value_loss ["value loss"] held_out: helps.value_loss;
+        critic_loss ["critic loss"] held_out: helps.critic_loss;
+        actor_loss ["actor loss"] held_out: helps.actor_loss;
+        advantage_mean held_out: "Mean over the batch of the advantage A = min_k Q̂_k(s, a) − V(s).";
+        weight_mean held_out: "Mean over the batch of the weights in the actor's loss.";
+        clipped_share held_out: "Share of the batch, 0 to 1, whose weight is clipped at 100.";
         learning_rate: helps.learning_rate;
     }
 }
@@ -134,54 +134,72 @@ impl<L: Losses> InSample<L> {
     /// Update number `step`; `pairs` are what [`Losses::pairs`] gives.
     pub fn step(&mut self, step: u64, batch: &Minibatch, pairs: Option<(Tensor, Tensor)>) -> Result<Measured> {
         let common = self.losses.common();
-
-        // V(s) towards the smaller Q̂(s, a).
-        let q = smaller(&self.target_critics.values(&batch.observations, &batch.actions)?)?;
-        let (states, fitted) = match &pairs {
-            Some((states, actions)) => (states, smaller(&self.target_critics.values(states, actions)?)?),
-            None => (&batch.observations, q.clone()),
-        };
-        let mut value_loss = q.mean_all()?;
+        let q = self.q(&batch.observations, &batch.actions)?;
+        let fitted = self.fitted(batch, &q, pairs)?;
         let steps = self.losses.value_steps();
+        let mut value_loss = self.value_loss(&fitted)?;
         for i in 0..steps {
-            value_loss = self.losses.value_loss(&fitted, &self.value.network.state_values(states)?.squeeze(0)?)?;
+            if i > 0 {
+                value_loss = self.value_loss(&fitted)?;
+            }
             let adam = AdamStep::after(step * steps + i, *common.value_learning_rate);
-            self.value.descend(&value_loss, adam)?;
+            self.value.descend(&value_loss.value, adam)?;
         }
 
-        // The policy towards actions of the data, the more so the better they are.
-        let value = self.value.network.detach();
-        let v = value.state_values(&batch.observations)?.squeeze(0)?;
-        let advantage = (&q - &v)?;
+        let actor_loss = self.actor_loss(batch, &q)?;
+        let decay = if self.losses.actor_rate_decays() { cosine_decay(step, self.context.total_steps) } else { 1.0 };
+        let rate = *common.actor_learning_rate * decay;
+        self.actor.descend(&actor_loss.value, AdamStep::after(step, rate))?;
+
+        let critic_loss = self.critic_loss(batch)?;
+        self.critics.descend(&critic_loss.value, AdamStep::after(step, *common.critic_learning_rate))?;
+        self.target_critics.follow(&self.critics.network, *common.ema_rate)?;
+
+        let mut measured = measured(&[value_loss, actor_loss, critic_loss])?;
+        measured.push(("learning_rate", rate));
+        Ok(measured)
+    }
+
+    /// The smaller Q̂ of these actions, `[n]`.
+    fn q(&self, states: &Tensor, actions: &Tensor) -> Result<Tensor> {
+        smaller(&self.target_critics.values(states, actions)?)
+    }
+
+    /// The states that V is fitted in, and to what; `q` is the smaller Q̂ of the batch.
+    fn fitted(&self, batch: &Minibatch, q: &Tensor, pairs: Option<(Tensor, Tensor)>) -> Result<(Tensor, Tensor)> {
+        match pairs {
+            Some((states, actions)) => Ok((states.clone(), self.q(&states, &actions)?)),
+            None => Ok((batch.observations.clone(), q.clone())),
+        }
+    }
+
+    /// V(s) towards the smaller Q̂(s, a).
+    fn value_loss(&self, (states, q): &(Tensor, Tensor)) -> Result<Loss> {
+        let loss = self.losses.value_loss(q, &self.value.network.state_values(states)?.squeeze(0)?)?;
+        Ok(Loss::new("value_loss", loss))
+    }
+
+    /// The policy towards actions of the data, the more so the better they are.
+    fn actor_loss(&self, batch: &Minibatch, q: &Tensor) -> Result<Loss> {
+        let v = self.value.network.detach().state_values(&batch.observations)?.squeeze(0)?;
+        let advantage = (q - &v)?;
         let weight = self.losses.weights(&advantage)?;
         let clipped = weight.gt(MOST_WEIGHT)?.to_dtype(DType::F32)?;
         let weight = weight.clamp(0.0, MOST_WEIGHT)?;
         let log_probability = self.actor.log_probability(&batch.observations, &batch.actions)?;
-        let actor_loss = (&weight * log_probability)?.mean_all()?.neg()?;
-        let decay = if self.losses.actor_rate_decays() { cosine_decay(step, self.context.total_steps) } else { 1.0 };
-        let rate = *common.actor_learning_rate * decay;
-        self.actor.descend(&actor_loss, AdamStep::after(step, rate))?;
+        Ok(Loss::new("actor_loss", (&weight * log_probability)?.mean_all()?.neg()?)
+            .with("v_mean", v.mean_all()?)
+            .with("advantage_mean", advantage.mean_all()?)
+            .with("weight_mean", weight.mean_all()?)
+            .with("clipped_share", clipped.mean_all()?))
+    }
 
-        // Q(s, a) towards r + γ·V(s').
-        let next = value.state_values(&batch.next_observations)?.squeeze(0)?;
-        let targets = batch.target(*common.gamma, &next)?;
+    /// Q(s, a) towards r + γ·V(s').
+    fn critic_loss(&self, batch: &Minibatch) -> Result<Loss> {
+        let next = self.value.network.detach().state_values(&batch.next_observations)?.squeeze(0)?;
+        let targets = batch.target(*self.losses.common().gamma, &next)?;
         let values = self.critics.network.values(&batch.observations, &batch.actions)?;
-        let critic_loss = self.losses.critic_loss(&values, &targets)?;
-        self.critics.descend(&critic_loss, AdamStep::after(step, *common.critic_learning_rate))?;
-        self.target_critics.follow(&self.critics.network, *common.ema_rate)?;
-
-        let mut measured = measured([
-            ("q_mean", &targets.mean_all()?),
-            ("v_mean", &v.mean_all()?),
-            ("value_loss", &value_loss),
-            ("critic_loss", &critic_loss),
-            ("actor_loss", &actor_loss),
-            ("advantage_mean", &advantage.mean_all()?),
-            ("weight_mean", &weight.mean_all()?),
-            ("clipped_share", &clipped.mean_all()?),
-        ])?;
-        measured.push(("learning_rate", rate));
-        Ok(measured)
+        Ok(Loss::new("critic_loss", self.losses.critic_loss(&values, &targets)?).with("q_mean", targets.mean_all()?))
     }
 }
 
@@ -190,6 +208,13 @@ impl<L: Losses> Algorithm for InSample<L> {
         let batch = self.context.batch(items)?;
         let pairs = self.losses.pairs(&self.context, step, &batch)?;
         self.step(step, &batch, pairs)
+    }
+
+    fn evaluate(&self, step: u64, items: &[u32]) -> Result<Measured> {
+        let batch = self.context.batch(items)?;
+        let q = self.q(&batch.observations, &batch.actions)?;
+        let fitted = self.fitted(&batch, &q, self.losses.pairs(&self.context, step, &batch)?)?;
+        measured(&[self.value_loss(&fitted)?, self.actor_loss(&batch, &q)?, self.critic_loss(&batch)?])
     }
 
     fn policy(&self) -> Result<(PolicyConfig, Tensors)> {

@@ -7,7 +7,7 @@
 #[path = "golden/onestep.rs"]
 mod golden;
 
-use super::algorithm::{Algorithm, AlgorithmError, Measured, measured};
+use super::algorithm::{Algorithm, AlgorithmError, Loss, Measured, measured};
 use super::context::{Context, Minibatch};
 use super::definition::{Definition, Metric, Reporting, metrics, read, readable};
 use super::gaussian::{first_half, log_density};
@@ -37,13 +37,13 @@ const MOST_WEIGHT: f64 = 100.0;
 const LOG_STD: (f64, f64) = (-5.0, 0.0);
 
 const METRICS: &[Metric] = &metrics! {
-    behavior_loss ["behaviour loss"]: "First phase: mean over the batch of −log β(a|s). 0 in the others.";
-    critic_loss ["critic loss"]: "Second phase: mean over the batch of (Q(s, a) − y)². 0 in the others.";
-    q_mean: "Second phase: mean over the batch of the critic's target y = r + γ·mask·Q̂(s', a') with the data's next action a'. 0 in the others.";
-    actor_loss ["actor loss"]: "Third phase: mean over the batch of −weight·log π(a|s) with weight = exp(temperature·A), at most 100. 0 in the others.";
-    advantage_mean: "Third phase: mean over the batch of the advantage A = Q(s, a) − mean of Q(s, ·) over actions that β draws. 0 in the others.";
-    weight_mean: "Third phase: mean over the batch of the weights in the actor's loss. 0 in the others.";
-    clipped_share: "Third phase: share of the batch, 0 to 1, whose weight is clipped at 100. 0 in the others.";
+    behavior_loss ["behaviour loss"] held_out: "First phase: mean over the batch of −log β(a|s).";
+    critic_loss ["critic loss"] held_out: "Second phase: mean over the batch of (Q(s, a) − y)².";
+    q_mean held_out: "Second phase: mean over the batch of the critic's target y = r + γ·mask·Q̂(s', a') with the data's next action a'.";
+    actor_loss ["actor loss"] held_out: "Third phase: mean over the batch of −weight·log π(a|s) with weight = exp(temperature·A), at most 100.";
+    advantage_mean held_out: "Third phase: mean over the batch of the advantage A = Q(s, a) − mean of Q(s, ·) over actions that β draws.";
+    weight_mean held_out: "Third phase: mean over the batch of the weights in the actor's loss.";
+    clipped_share held_out: "Third phase: share of the batch, 0 to 1, whose weight is clipped at 100.";
 };
 
 /// Onestep-RL's hyper-parameters: the `[agent]` table of a preset.
@@ -133,6 +133,12 @@ impl Onestep {
         }
     }
 
+    /// The batch of some items, and its transitions.
+    fn batch(&self, items: &[u32]) -> Result<(Minibatch, Vec<u32>)> {
+        let rows: Vec<u32> = items.iter().map(|item| self.items[*item as usize]).collect();
+        Ok((self.context.batch(&rows)?, rows))
+    }
+
     /// Adam's step after so many others of its phase.
     fn adam(&self, steps: u64) -> AdamStep {
         AdamStep::after(steps, *self.config.learning_rate)
@@ -140,27 +146,44 @@ impl Onestep {
 
     /// First phase: β towards the data's actions, and π with it.
     fn clone_behavior(&mut self, batch: &Minibatch, steps: u64) -> Result<Measured> {
-        let (mean, log_std) = distribution(&self.behavior.network, &batch.observations)?;
-        let loss = log_density(&batch.actions, &mean, &log_std)?.mean_all()?.neg()?;
-        self.behavior.descend(&loss, self.adam(steps))?;
+        let loss = self.behavior_loss(batch)?;
+        self.behavior.descend(&loss.value, self.adam(steps))?;
         self.actor.network.follow(&self.behavior.network, 1.0)?; // all the way
-        measured([("behavior_loss", &loss)])
+        measured(&[loss])
     }
 
-    /// Second phase: Q(s, a) towards r + γ·Q̂(s', a'), with the action a' that the data takes next, `[B, a]`.
+    fn behavior_loss(&self, batch: &Minibatch) -> Result<Loss> {
+        let (mean, log_std) = distribution(&self.behavior.network, &batch.observations)?;
+        Ok(Loss::new("behavior_loss", log_density(&batch.actions, &mean, &log_std)?.mean_all()?.neg()?))
+    }
+
+    /// Second phase: the critic, which its target follows.
     fn evaluate_behavior(&mut self, batch: &Minibatch, next_actions: &Tensor, steps: u64) -> Result<Measured> {
-        let next = self.target_critic.values(&batch.next_observations, next_actions)?.squeeze(0)?;
-        let targets = batch.target(*self.config.gamma, &next)?;
-        let loss = self.critic.network.squared_error(&batch.observations, &batch.actions, &targets)?;
-        self.critic.descend(&loss, self.adam(steps))?;
+        let loss = self.critic_loss(batch, next_actions)?;
+        self.critic.descend(&loss.value, self.adam(steps))?;
         if (steps + 1).is_multiple_of(*self.config.ema_every) {
             self.target_critic.follow(&self.critic.network, *self.config.ema_rate)?;
         }
-        measured([("critic_loss", &loss), ("q_mean", &targets.mean_all()?)])
+        measured(&[loss])
     }
 
-    /// Third phase: π towards actions of the data, the more so the better they are than β's.
+    /// Q(s, a) towards r + γ·Q̂(s', a'), with the action a' that the data takes next, `[B, a]`.
+    fn critic_loss(&self, batch: &Minibatch, next_actions: &Tensor) -> Result<Loss> {
+        let next = self.target_critic.values(&batch.next_observations, next_actions)?.squeeze(0)?;
+        let targets = batch.target(*self.config.gamma, &next)?;
+        let loss = self.critic.network.squared_error(&batch.observations, &batch.actions, &targets)?;
+        Ok(Loss::new("critic_loss", loss).with("q_mean", targets.mean_all()?))
+    }
+
+    /// Third phase: the policy.
     fn improve(&mut self, batch: &Minibatch, noise: &Tensor, steps: u64) -> Result<Measured> {
+        let loss = self.actor_loss(batch, noise)?;
+        self.actor.descend(&loss.value, self.adam(steps))?;
+        measured(&[loss])
+    }
+
+    /// π towards actions of the data, the more so the better they are than β's.
+    fn actor_loss(&self, batch: &Minibatch, noise: &Tensor) -> Result<Loss> {
         let q = self.critic.network.detach().values(&batch.observations, &batch.actions)?.squeeze(0)?;
         let advantage = (q - self.value(&batch.observations, noise)?)?;
         let weight = (&advantage * f64::from(*self.config.temperature))?.exp()?;
@@ -168,13 +191,8 @@ impl Onestep {
         let weight = weight.minimum(MOST_WEIGHT)?;
         let (mean, log_std) = distribution(&self.actor.network, &batch.observations)?;
         let loss = (&weight * log_density(&batch.actions, &mean, &log_std)?)?.mean_all()?.neg()?;
-        self.actor.descend(&loss, self.adam(steps))?;
-        measured([
-            ("actor_loss", &loss),
-            ("advantage_mean", &advantage.mean_all()?),
-            ("weight_mean", &weight.mean_all()?),
-            ("clipped_share", &clipped.mean_all()?),
-        ])
+        let loss = Loss::new("actor_loss", loss).with("advantage_mean", advantage.mean_all()?);
+        Ok(loss.with("weight_mean", weight.mean_all()?).with("clipped_share", clipped.mean_all()?))
     }
 
     /// The mean of Q(s, ·) over actions that β draws with this noise, `[B, S, a]`, also beyond ±1; `[B]`.
@@ -212,13 +230,21 @@ impl Algorithm for Onestep {
     }
 
     fn update(&mut self, step: u64, items: &[u32]) -> Result<Measured> {
-        let rows: Vec<u32> = items.iter().map(|item| self.items[*item as usize]).collect();
-        let batch = self.context.batch(&rows)?;
+        let (batch, rows) = self.batch(items)?;
         match self.phase(step) {
             Phase::Behavior(steps) => self.clone_behavior(&batch, steps),
             Phase::Critic(steps) => self.evaluate_behavior(&batch, &self.context.next_actions(&rows)?, steps),
             Phase::Policy(steps) => self.improve(&batch, &self.noise(step)?, steps),
         }
+    }
+
+    fn evaluate(&self, step: u64, items: &[u32]) -> Result<Measured> {
+        let (batch, rows) = self.batch(items)?;
+        measured(&[match self.phase(step) {
+            Phase::Behavior(_) => self.behavior_loss(&batch)?,
+            Phase::Critic(_) => self.critic_loss(&batch, &self.context.next_actions(&rows)?)?,
+            Phase::Policy(_) => self.actor_loss(&batch, &self.noise(step)?)?,
+        }])
     }
 
     /// Acts by the mean, which comes from the first half of the last layer.

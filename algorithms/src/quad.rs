@@ -11,7 +11,7 @@ mod lambda;
 mod metrics;
 mod summary;
 
-use super::algorithm::{Measured, largest};
+use super::algorithm::{Loss, Measured, largest};
 use super::context::{Context, Minibatch};
 use super::definition::{Axis, Definition, Reporting, Variant};
 use super::denoising::Denoising;
@@ -21,6 +21,7 @@ use super::replay::{Computed, Inputs};
 use candle_core::{Device, Result, Tensor};
 use candle_nn::loss::mse;
 use config::{Eta, Guidance, Quad as Config, TargetReduce};
+use guidance::Guide;
 use metrics::METRICS;
 use quad_policy::{
     AdamStep, Choice, DiffusionPolicy, DiffusionShape, Reverse, Tensors, Weighted, cosine_decay, mean_and_variance,
@@ -65,6 +66,16 @@ struct Noise {
     denoising: Denoising,
     /// With guidance `shuffled`: the sample whose λ each takes, one of its own t, `[B]`.
     permutation: Option<Tensor>,
+}
+
+/// The actor's loss, and what it is made of.
+struct ActorLoss {
+    loss: Loss,
+    /// a^t and ε_θ − ε, `[B, a]`.
+    noisy: Tensor,
+    error: Tensor,
+    /// None without guidance.
+    guide: Option<Guide>,
 }
 
 impl Inputs for Noise {
@@ -113,6 +124,30 @@ impl Quad {
         batch.target(*self.config.gamma, &bound)
     }
 
+    /// Lines 4–7: every critic towards the lower confidence bound (Eq. 20).
+    fn critic_loss(&self, networks: &Networks, batch: &Minibatch, noise: &Noise) -> Result<Loss> {
+        let targets = self.targets(networks, batch, &noise.next)?;
+        let loss = networks.critics.network.squared_error(&batch.observations, &batch.actions, &targets)?;
+        Ok(Loss::new("critic_loss", loss).with("q_mean", targets.mean_all()?))
+    }
+
+    /// Lines 8–11: behaviour cloning, pulled along the gradients that the critics agree on (Eq. 5 and 19).
+    fn actor_loss(&self, networks: &Networks, batch: &Minibatch, noise: &Noise) -> Result<ActorLoss> {
+        let Denoising { epsilon, deviation, .. } = &noise.denoising;
+        let (noisy, predicted) = networks.denoise(batch, &noise.denoising)?;
+        let error = (&predicted - epsilon)?;
+        let bc_loss = error.sqr()?.mean_all()?;
+        let mut loss = (&bc_loss * &self.eta)?;
+        let guide = (self.config.guidance != Guidance::None)
+            .then(|| self.guide(networks, batch, &noisy, &predicted.detach(), noise))
+            .transpose()?;
+        if let Some(guide) = &guide {
+            let pull = (&guide.gradient * deviation)?.broadcast_mul(&guide.lambda.unsqueeze(1)?)?;
+            loss = (loss + (&predicted * pull)?.mean_all()?)?;
+        }
+        Ok(ActorLoss { loss: Loss::new("actor_loss", loss).with("bc_loss", bc_loss), noisy, error, guide })
+    }
+
     /// η after a step of dual ascent: `excess` is how far the BC loss is above its threshold, `[]`.
     fn ascended_eta(&self, excess: Tensor) -> Result<Tensor> {
         let Eta { rate, minimum, maximum, .. } = self.config.eta;
@@ -143,25 +178,13 @@ impl Update for Quad {
 
     /// One pass through Algorithm 1's loop, but for the target actor.
     fn work(&mut self, networks: &mut Networks, batch: &Minibatch, noise: &Noise) -> Result<Computed> {
-        // Lines 4–7: every critic towards the lower confidence bound (Eq. 20).
-        let targets = self.targets(networks, batch, &noise.next)?;
+        let critic_loss = self.critic_loss(networks, batch, noise)?;
         let Networks { critics, target_critics, .. } = networks;
-        let critic_loss = critics.network.squared_error(&batch.observations, &batch.actions, &targets)?;
-        let critic_gradient_norm = critics.descend_as_set(&critic_loss)?;
+        let critic_gradient_norm = critics.descend_as_set(&critic_loss.value)?;
         target_critics.follow(&critics.network, *self.config.ema_rate)?;
 
-        // Lines 8–11: behaviour cloning, pulled along the gradients that the critics agree on (Eq. 5 and 19).
-        let Denoising { t, epsilon, deviation, .. } = &noise.denoising;
-        let (noisy, predicted) = networks.denoise(batch, &noise.denoising)?;
-        let error = (&predicted - epsilon)?;
-        let bc_loss = error.sqr()?.mean_all()?;
-        let mut actor_loss = (&bc_loss * &self.eta)?;
-        let guide = (self.config.guidance != Guidance::None)
-            .then(|| self.guide(networks, batch, &noisy, &predicted.detach(), noise))
-            .transpose()?;
+        let ActorLoss { loss: mut actor_loss, noisy, error, guide } = self.actor_loss(networks, batch, noise)?;
         if let Some(guide) = &guide {
-            let pull = (&guide.gradient * deviation)?.broadcast_mul(&guide.lambda.unsqueeze(1)?)?;
-            actor_loss = (actor_loss + (&predicted * pull)?.mean_all()?)?;
             match &self.nu_squared {
                 Some(nu_squared) => write(nu_squared, &guide.nu_squared)?,
                 None => self.nu_squared = Some(guide.nu_squared.copy()?),
@@ -171,29 +194,29 @@ impl Update for Quad {
             }
         }
         let actor = &mut networks.actor;
-        let actor_gradient_norm = actor.descend_as_set(&actor_loss)?;
+        let actor_gradient_norm = actor.descend_as_set(&actor_loss.value)?;
 
         // Line 12: dual ascent on η, with the actor as it is now.
         if let Some(threshold) = self.config.eta.threshold
             && self.config.guidance != Guidance::None
         {
+            let Denoising { t, epsilon, .. } = &noise.denoising;
             let predicted = actor.network.detach().predict(&batch.observations, &noisy, t)?;
             write(&self.eta, &self.ascended_eta((mse(&predicted, epsilon)? - f64::from(*threshold))?)?)?;
         }
 
-        let q_mean = targets.mean_all()?;
-        let mut named = vec![
-            ("q_mean", &q_mean),
-            ("critic_loss", &critic_loss),
-            ("bc_loss", &bc_loss),
-            ("actor_loss", &actor_loss),
-            ("eta", &self.eta),
-            ("critic_gradient_norm", &critic_gradient_norm),
-            ("actor_gradient_norm", &actor_gradient_norm),
-        ];
-        named.extend(self.nu_squared.as_ref().map(|nu_squared| ("nu_squared", nu_squared)));
-        let of_guidance: Vec<_> = guide.iter().flat_map(|guide| lambda::needed(guide, &error)).collect();
-        Computed::new(&named, &of_guidance)
+        actor_loss = actor_loss.with("eta", self.eta.clone()).with("actor_gradient_norm", actor_gradient_norm);
+        if let Some(nu_squared) = &self.nu_squared {
+            actor_loss = actor_loss.with("nu_squared", nu_squared.clone());
+        }
+        let losses = [critic_loss.with("critic_gradient_norm", critic_gradient_norm), actor_loss];
+        Computed::new(&losses, &lambda::needed(guide.as_ref(), &error))
+    }
+
+    fn evaluate(&self, networks: &Networks, batch: &Minibatch, noise: &Noise) -> Result<Computed> {
+        let ActorLoss { loss, error, guide, .. } = self.actor_loss(networks, batch, noise)?;
+        let losses = [self.critic_loss(networks, batch, noise)?, loss];
+        Computed::new(&losses, &lambda::needed(guide.as_ref(), &error))
     }
 
     /// Line 12, too: the actor's EMA.

@@ -1,7 +1,7 @@
 //! The work of an update: a GPU does it once, records it in the next update, and replays it in those after that. It is hundreds
 //! of kernels, and the host takes longer to start one of them than the GPU to run it.
 
-use super::algorithm::{Measured, joined};
+use super::algorithm::{Loss, Measured, joined, scalars};
 use candle_core::{Device, Result, Tensor};
 use quad_policy::{Recording, overwrite};
 use std::thread::{ThreadId, current};
@@ -9,6 +9,15 @@ use std::thread::{ThreadId, current};
 /// Tensors that each update has of its own, always as many and in the same shapes.
 pub(super) trait Inputs: Clone {
     fn tensors(&mut self) -> Vec<&mut Tensor>;
+
+    /// They on a device.
+    fn on(&self, device: &Device) -> Result<Self> {
+        let mut inputs = self.clone();
+        for tensor in inputs.tensors() {
+            *tensor = tensor.to_device(device)?;
+        }
+        Ok(inputs)
+    }
 }
 
 impl<A: Inputs, B: Inputs> Inputs for (A, B) {
@@ -28,10 +37,17 @@ pub(super) struct Computed {
 }
 
 impl Computed {
-    /// Scalars `[]` by name, and tensors of any shape.
-    pub fn new(scalars: &[(&'static str, &Tensor)], others: &[&Tensor]) -> Result<Self> {
-        let tensors: Vec<_> = scalars.iter().map(|(_, scalar)| *scalar).chain(others.iter().copied()).collect();
-        Ok(Self { names: scalars.iter().map(|(name, _)| *name).collect(), numbers: joined(&tensors)? })
+    /// What some losses measure, and tensors of any shape.
+    pub fn new(losses: &[Loss], others: &[&Tensor]) -> Result<Self> {
+        let tensors: Vec<_> = scalars(losses).map(|(_, scalar)| scalar).chain(others.iter().copied()).collect();
+        Ok(Self { names: scalars(losses).map(|(name, _)| *name).collect(), numbers: joined(&tensors)? })
+    }
+
+    /// The scalars by name, and the other numbers; waits until they are computed.
+    pub fn read(&self) -> Result<(Measured, Vec<f32>)> {
+        let mut scalars = self.numbers.to_vec1()?;
+        let others = scalars.split_off(self.names.len());
+        Ok((self.names.iter().copied().zip(scalars).collect(), others))
     }
 }
 
@@ -59,19 +75,22 @@ impl<I: Inputs> Replay<I> {
     /// are on the CPU after the first time. It changes tensors in place; from the second time on none that it makes outlives
     /// it.
     pub fn start(&mut self, device: &Device, inputs: &I, work: impl FnOnce(&I) -> Result<Computed>) -> Result<()> {
-        let (mut inputs, thread) = (inputs.clone(), current().id());
-        let Some(mut kept) = self.0.take().filter(|kept| device.is_cuda() && kept.thread == thread) else {
-            for tensor in inputs.tensors() {
-                *tensor = tensor.to_device(device)?;
-            }
+        let thread = current().id();
+        let Some(mut kept) = self.0.take().filter(|kept| kept.thread == thread) else {
+            let inputs = inputs.on(device)?;
             let computed = Recording::rehearse(device, || work(&inputs))?;
             self.0 = Some(Kept { inputs, computed, recording: None, thread });
             return Ok(());
         };
-        for (tensor, new) in kept.inputs.tensors().into_iter().zip(inputs.tensors()) {
-            overwrite(tensor, new)?;
+        for (tensor, new) in kept.inputs.tensors().into_iter().zip(inputs.clone().tensors()) {
+            renew(tensor, new)?;
         }
         let Kept { inputs, computed, recording, .. } = &mut kept;
+        if !device.is_cuda() {
+            *computed = work(inputs)?;
+            self.0 = Some(kept);
+            return Ok(());
+        }
         let record = || computed.numbers.slice_set(&work(inputs)?.numbers, 0, 0);
         let mut recorded = match recording.take() {
             Some(recorded) => recorded,
@@ -83,11 +102,43 @@ impl<I: Inputs> Replay<I> {
         Ok(())
     }
 
-    /// The scalars by name, and the other numbers; waits until they are computed.
+    /// What the newest work computed, as [`Computed::read`] gives it.
     pub fn computed(&self) -> Result<(Measured, Vec<f32>)> {
-        let Some(Kept { computed: Computed { names, numbers }, .. }) = &self.0 else { return Ok(Default::default()) };
-        let mut scalars = numbers.to_vec1()?;
-        let others = scalars.split_off(names.len());
-        Ok((names.iter().copied().zip(scalars).collect(), others))
+        self.0.as_ref().map_or_else(|| Ok(Default::default()), |kept| kept.computed.read())
+    }
+}
+
+/// Gives a tensor of an earlier update the numbers of a new one: in place on a GPU, where recorded work reads it.
+fn renew(tensor: &mut Tensor, new: &Tensor) -> Result<()> {
+    if tensor.device().is_cuda() {
+        return overwrite(tensor, new);
+    }
+    *tensor = new.clone();
+    Ok(())
+}
+
+#[cfg(test)]
+#[allow(clippy::unwrap_used)]
+mod tests {
+    use super::*;
+
+    #[derive(Clone)]
+    struct One(Tensor);
+
+    impl Inputs for One {
+        fn tensors(&mut self) -> Vec<&mut Tensor> {
+            vec![&mut self.0]
+        }
+    }
+
+    #[test]
+    fn each_update_has_its_own_inputs() {
+        let mut replay = Replay::default();
+        for number in [1.0, 2.0, 3.0] {
+            let inputs = One(Tensor::new(number, &Device::Cpu).unwrap());
+            let work = |One(x): &One| Computed::new(&[Loss::new("x", x.clone())], &[x]);
+            replay.start(&Device::Cpu, &inputs, work).unwrap();
+            assert_eq!(replay.computed().unwrap(), (vec![("x", number)], vec![number]));
+        }
     }
 }

@@ -42,10 +42,10 @@ impl Returns {
         self.values.slice_set(&values.to_device(&Device::Cpu)?, 0, first)
     }
 
-    /// The mean of the values of some states.
-    pub fn mean_value(&self, states: Range<usize>) -> Result<f32> {
+    /// The mean of the values of some states, if there are any.
+    pub fn mean_value(&self, states: Range<usize>) -> Result<Option<f32>> {
         let values: Vec<f32> = self.values.narrow(0, states.start, states.len())?.to_vec1()?;
-        Ok(values.iter().sum::<f32>() / values.len().max(1) as f32)
+        Ok((!values.is_empty()).then(|| values.iter().sum::<f32>() / values.len() as f32))
     }
 
     /// Makes new returns with the values of all states.
@@ -107,7 +107,7 @@ mod tests {
         let values = [0.0, 6.0, 0.0, 1.0, 4.5];
         assert_eq!(returns.planned(Some(&values)), [4.0, 6.0, 1.125, 2.25, 4.5]);
         returns.keep(&Tensor::new(&values[3..], &Device::Cpu).unwrap(), 3).unwrap();
-        assert_eq!(returns.mean_value(2..5).unwrap(), 5.5 / 3.0);
+        assert_eq!(returns.mean_value(2..5).unwrap(), Some(5.5 / 3.0));
         assert!(returns.planned(Some(&[0.0, f32::NAN, 0.0, 0.0, 0.0]))[0].is_nan());
     }
 

@@ -7,7 +7,7 @@
 #[path = "golden/sfbc.rs"]
 mod golden;
 
-use super::algorithm::{AgentError, Algorithm, AlgorithmError, Measured, check, measured};
+use super::algorithm::{AgentError, Algorithm, AlgorithmError, Loss, Measured, check, measured};
 use super::context::{Context, Minibatch};
 use super::definition::{Definition, Metric, Reporting, metrics, read};
 use super::denoising::{NoiseInTime, normal};
@@ -44,10 +44,10 @@ const FIRST_TIME: f64 = 1e-5;
 const TOGETHER: usize = 256;
 
 const METRICS: &[Metric] = &metrics! {
-    bc_loss ["BC loss"]: "First phase: mean over the batch of the sum over dimensions of (ε − ε_θ(a_t, s, t))². A network that always outputs 0 has the number of dimensions as its loss. 0 in the others.";
-    critic_loss ["critic loss"]: "A critic's round: mean over the batch of (Q(s, a) − target)², of standardised returns. 0 in the others.";
-    q_mean: "A critic's round: mean over the batch of the targets, standardised returns. 0 in the others.";
-    v_mean ["V"]: "Planning: mean over the step's states of V(s) = Σ softmax(Q/planning_temperature)·Q over actions of the clone, in units of the return. 0 in the others.";
+    bc_loss ["BC loss"]: "First phase: mean over the batch of the sum over dimensions of (ε − ε_θ(a_t, s, t))². A network that always outputs 0 has the number of dimensions as its loss.";
+    critic_loss ["critic loss"]: "A critic's round: mean over the batch of (Q(s, a) − target)², of standardised returns.";
+    q_mean: "A critic's round: mean over the batch of the targets, standardised returns.";
+    v_mean ["V"]: "Planning: mean over the step's states of V(s) = Σ softmax(Q/planning_temperature)·Q over actions of the clone, in units of the return.";
 };
 
 /// SfBC's hyper-parameters: the `[agent]` table of a preset.
@@ -187,7 +187,7 @@ impl Sfbc {
         let predicted = self.actor.network.predict(&batch.observations, &noisy, &noise.t)?;
         let loss = (predicted - &noise.epsilon)?.sqr()?.sum(1)?.mean_all()?;
         self.actor.descend(&loss, AdamStep::after(steps, *self.config.actor_learning_rate))?;
-        measured([("bc_loss", &loss)])
+        measured(&[Loss::new("bc_loss", loss)])
     }
 
     /// Q(s, a) towards the returns of these items, the batch. Each round has a critic of its own, which begins as the first did.
@@ -199,7 +199,7 @@ impl Sfbc {
         let targets = self.returns.targets.index_select(&items, 0)?.to_device(&self.context.device)?;
         let loss = self.critic.network.squared_error(&batch.observations, &batch.actions, &targets)?;
         self.critic.descend(&loss, AdamStep::after(steps, *self.config.critic_learning_rate))?;
-        measured([("critic_loss", &loss), ("q_mean", &targets.mean_all()?)])
+        measured(&[Loss::new("critic_loss", loss).with("q_mean", targets.mean_all()?)])
     }
 
     /// Keeps V(s) = Σ softmax(Q/temperature)·Q over S actions of the clone, in units of the return, for the states of some
@@ -220,7 +220,7 @@ impl Sfbc {
         if items.end == self.items.len() {
             self.returns.plan()?;
         }
-        Ok(vec![("v_mean", self.returns.mean_value(items)?)])
+        Ok(self.returns.mean_value(items)?.map(|mean| ("v_mean", mean)).into_iter().collect())
     }
 
     /// The noise of a cloning step.
@@ -270,6 +270,11 @@ impl Algorithm for Sfbc {
                 self.plan(items)
             }
         }
+    }
+
+    /// Nothing: its state has a return of each transition that it learns from, and of no other.
+    fn evaluate(&self, _: u64, _: &[u32]) -> Result<Measured> {
+        Ok(Measured::new())
     }
 
     fn policy(&self) -> Result<(PolicyConfig, Tensors)> {

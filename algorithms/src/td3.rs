@@ -2,7 +2,7 @@
 //! actions. Critics move in every step, the policy and the targets in every second or so. An algorithm of this kind is its
 //! [`Near`].
 
-use super::algorithm::{AgentError, Algorithm, AlgorithmError, Measured, joined, measured, smaller};
+use super::algorithm::{AgentError, Algorithm, AlgorithmError, Loss, Measured, joined, measured, smaller};
 use super::context::{Context, Minibatch};
 use super::definition;
 use super::denoising::normal;
@@ -108,15 +108,12 @@ impl<N: Near> Td3<N> {
     /// Update number `step`, with standard normal noise of the targets' actions, `[B, a]`, and the data's next actions, where
     /// they count.
     pub fn step(&mut self, step: u64, batch: &Minibatch, noise: &Tensor, next: Option<&Tensor>) -> Result<Measured> {
-        let targets = self.targets(batch, noise, next)?;
         let Common { actor_every, ema_rate, actor_learning_rate, critic_learning_rate, .. } = self.near.common();
-        let critic_loss = self.critics.network.squared_error(&batch.observations, &batch.actions, &targets)?;
-        let critic_loss = (critic_loss * CRITICS as f64)?;
-        self.critics.descend(&critic_loss, AdamStep::after(step, **critic_learning_rate))?;
-        if step % **actor_every == N::FIRST % **actor_every {
-            let actions = gaussian_mean(&self.actor.network, &batch.observations)?;
-            let q = self.critics.network.detach().values(&batch.observations, &actions)?;
-            let [actor_loss, bc_loss] = self.near.actor_loss(&actions, &batch.actions, &q)?;
+        let mut losses = vec![self.critic_loss(batch, noise, next)?];
+        self.critics.descend(&losses[0].value, AdamStep::after(step, **critic_learning_rate))?;
+        let first = N::FIRST % **actor_every;
+        if step % **actor_every == first {
+            let [actor_loss, bc_loss] = self.actor_losses(batch)?;
             if N::LAGS {
                 self.target_actor.follow(&self.actor.network, **ema_rate)?;
             }
@@ -127,12 +124,32 @@ impl<N: Near> Td3<N> {
             self.target_critics.follow(&self.critics.network, **ema_rate)?;
             write(&self.of_actor, &joined(&[&actor_loss, &bc_loss])?.detach())?;
         }
-        measured([
-            ("q_mean", &targets.mean_all()?),
-            ("critic_loss", &critic_loss),
-            ("actor_loss", &self.of_actor.get(0)?),
-            ("bc_loss", &self.of_actor.get(1)?),
-        ])
+        if step >= first {
+            losses.push(Loss::new("actor_loss", self.of_actor.get(0)?).with("bc_loss", self.of_actor.get(1)?));
+        }
+        measured(&losses)
+    }
+
+    fn critic_loss(&self, batch: &Minibatch, noise: &Tensor, next: Option<&Tensor>) -> Result<Loss> {
+        let targets = self.targets(batch, noise, next)?;
+        let loss = self.critics.network.squared_error(&batch.observations, &batch.actions, &targets)?;
+        Ok(Loss::new("critic_loss", (loss * CRITICS as f64)?).with("q_mean", targets.mean_all()?))
+    }
+
+    /// What [`Near::actor_loss`] gives.
+    fn actor_losses(&self, batch: &Minibatch) -> Result<[Tensor; 2]> {
+        let actions = gaussian_mean(&self.actor.network, &batch.observations)?;
+        let q = self.critics.network.detach().values(&batch.observations, &actions)?;
+        self.near.actor_loss(&actions, &batch.actions, &q)
+    }
+
+    /// The batch of some items, noise and next actions, as [`Self::step`] takes them.
+    fn inputs(&self, step: u64, items: &[u32]) -> Result<(Minibatch, Tensor, Option<Tensor>)> {
+        let generator = &mut stream(self.context.seed, Purpose::Noise, step);
+        let noise = normal((self.context.batch_size, self.context.action_dim()), generator, &self.context.device)?;
+        let Some(rows) = &self.items else { return Ok((self.context.batch(items)?, noise, None)) };
+        let rows: Vec<u32> = items.iter().map(|item| rows[*item as usize]).collect();
+        Ok((self.context.batch(&rows)?, noise, Some(self.context.next_actions(&rows)?)))
     }
 
     /// y = r + γ·mask·(min_k Q̂_k(s', ã') − penalty·Σ (ã' − a')²), `[B]`, with the data's next action a'.
@@ -160,12 +177,15 @@ impl<N: Near> Algorithm for Td3<N> {
     }
 
     fn update(&mut self, step: u64, items: &[u32]) -> Result<Measured> {
-        let generator = &mut stream(self.context.seed, Purpose::Noise, step);
-        let noise = normal((self.context.batch_size, self.context.action_dim()), generator, &self.context.device)?;
-        let Some(rows) = &self.items else { return self.step(step, &self.context.batch(items)?, &noise, None) };
-        let rows: Vec<u32> = items.iter().map(|item| rows[*item as usize]).collect();
-        let next = self.context.next_actions(&rows)?;
-        self.step(step, &self.context.batch(&rows)?, &noise, Some(&next))
+        let (batch, noise, next) = self.inputs(step, items)?;
+        self.step(step, &batch, &noise, next.as_ref())
+    }
+
+    fn evaluate(&self, step: u64, items: &[u32]) -> Result<Measured> {
+        let (batch, noise, next) = self.inputs(step, items)?;
+        let [actor_loss, bc_loss] = self.actor_losses(&batch)?;
+        let critic_loss = self.critic_loss(&batch, &noise, next.as_ref())?;
+        measured(&[critic_loss, Loss::new("actor_loss", actor_loss).with("bc_loss", bc_loss)])
     }
 
     fn policy(&self) -> Result<(PolicyConfig, Tensors)> {

@@ -58,8 +58,8 @@ def measure(agent, t, weights, nu_squared, sigma_squared, gradient, error):
     fifths = FIFTHS * (t - 1) // agent["diffusion_steps"]
     cosine = (gradient * error).sum(-1) / np.linalg.norm(gradient, axis=-1) / np.linalg.norm(error, axis=-1)
     out = {f"lambda_quantile_{q}": np.quantile(weights, q / 100) for q in QUANTILES}
-    means = np.where(*group_means(weights, fifths, FIFTHS)[::-1], weights.mean())
-    out |= {f"lambda_fifth_{fifth + 1}": means[fifth] for fifth in range(FIFTHS)}
+    means, exist = group_means(weights, fifths, FIFTHS)
+    out |= {f"lambda_fifth_{fifth + 1}": means[fifth] for fifth in range(FIFTHS) if exist[fifth]}
     return out | {
         "lambda_mean": weights.mean(),
         "lambda_above_99_share": np.mean(weights > 0.99),

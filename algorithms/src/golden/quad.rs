@@ -29,7 +29,7 @@ fn check(golden: &Golden, device: &Device) {
     let eta: f32 = quad.update.eta.to_scalar().unwrap();
     let measured = quad.step(golden.count("/step") as u64, &inputs).unwrap();
     check_update(golden, METRICS, &measured, quad.parts().save().unwrap());
-    let value = |name| value(&measured, name);
+    let value = |name| value(&measured, name).unwrap();
     let guidance_loss = value("actor_loss") - eta * value("bc_loss");
     // A difference of two larger numbers, so relative to these.
     let expected = golden.expected["guidance_loss"].to_vec1::<f32>().unwrap()[0];

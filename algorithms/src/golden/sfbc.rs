@@ -108,7 +108,16 @@ fn each_phase_does_its_part() {
         if let (Phase::Planning(items), _) = sfbc.phase(step) {
             planned.extend(items);
         }
-        sfbc.update(step, &[0, 1]).unwrap();
+        let measured = sfbc.update(step, &[0, 1]).unwrap();
+        let names = Vec::from_iter(measured.iter().map(|(name, _)| *name));
+        let expected: &[&str] = match step {
+            ..6 => &["bc_loss"],
+            // Six steps plan five states: the first of them plans none.
+            10 => &[],
+            11..16 => &["v_mean"],
+            _ => &["critic_loss", "q_mean"],
+        };
+        assert_eq!(names, expected, "step {step}");
         let after = state(&sfbc);
         let moved: Vec<bool> = before.iter().zip(&after).map(|(before, after)| before != after).collect();
         assert_eq!(moved, [step < 6, (6..10).contains(&step) || step >= 16, step == 15], "step {step}");

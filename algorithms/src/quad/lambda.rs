@@ -5,11 +5,13 @@ use crate::algorithm::Measured;
 use candle_core::Tensor;
 
 /// Parts of the chain t = 1…T that have a mean of their own.
-const FIFTHS: usize = 5;
+const FIFTHS: [&str; 5] = ["lambda_fifth_1", "lambda_fifth_2", "lambda_fifth_3", "lambda_fifth_4", "lambda_fifth_5"];
 
-/// What [`measure`] has to know of a batch: ν̂² and δ's share, `[]`; λ and σ², `[B]`; ḡ and the error ε_θ − ε, `[B, a]`.
-pub(super) fn needed<'a>(guide: &'a Guide, error: &'a Tensor) -> [&'a Tensor; 6] {
-    [&guide.nu_squared, &guide.delta_share, &guide.lambda, &guide.sigma_squared, &guide.gradient, error]
+/// What [`measure`] has to know of a batch: ν̂² and δ's share, `[]`; λ and σ², `[B]`; ḡ and the error ε_θ − ε, `[B, a]`. Nothing
+/// without guidance.
+pub(super) fn needed<'a>(guide: Option<&'a Guide>, error: &'a Tensor) -> Vec<&'a Tensor> {
+    let Some(Guide { nu_squared, delta_share, lambda, sigma_squared, gradient, .. }) = guide else { return Vec::new() };
+    vec![nu_squared, delta_share, lambda, sigma_squared, gradient, error]
 }
 
 /// The metrics of guidance, of the numbers of [`needed`], one tensor after the other; none without guidance. `t` is each sample's, of
@@ -21,24 +23,21 @@ pub(super) fn measure(numbers: &[f32], t: &[u32], steps: usize, delta: f32) -> M
     let (gradient, error) = rows.split_at(rows.len() / 2);
     let lambda_mean = mean(lambda.iter().copied());
     let [low, median, high] = quantiles(lambda);
-    let [first, second, third, fourth, fifth] = by_fifth(lambda, t, steps, lambda_mean);
     let width = gradient.len() / t.len();
     let cosines = gradient.chunks(width).zip(error.chunks(width)).map(|(one, other)| cosine(one, other));
-    vec![
+    let mut measured = vec![
         ("delta_share", *delta_share),
         ("lambda_mean", lambda_mean),
         ("lambda_quantile_10", low),
         ("lambda_quantile_50", median),
         ("lambda_quantile_90", high),
-        ("lambda_fifth_1", first),
-        ("lambda_fifth_2", second),
-        ("lambda_fifth_3", third),
-        ("lambda_fifth_4", fourth),
-        ("lambda_fifth_5", fifth),
         ("lambda_above_99_share", mean(lambda.iter().map(|lambda| f32::from(*lambda > 0.99)))),
         ("variance_ratio", mean(sigma_squared.iter().copied()) / (nu_squared + delta)),
         ("guidance_cosine", mean(cosines)),
-    ]
+    ];
+    let fifths = FIFTHS.into_iter().zip(by_fifth(lambda, t, steps));
+    measured.extend(fifths.filter_map(|(name, mean)| Some((name, mean?))));
+    measured
 }
 
 fn mean(values: impl ExactSizeIterator<Item = f32>) -> f32 {
@@ -57,15 +56,15 @@ fn quantiles(values: &[f32]) -> [f32; 3] {
     })
 }
 
-/// The mean of each fifth of the chain, or `otherwise` where no sample is of it.
-fn by_fifth(lambda: &[f32], t: &[u32], steps: usize, otherwise: f32) -> [f32; FIFTHS] {
-    let mut sums = [(0.0, 0); FIFTHS];
+/// The mean of each fifth of the chain of which there is a sample.
+fn by_fifth(lambda: &[f32], t: &[u32], steps: usize) -> [Option<f32>; FIFTHS.len()] {
+    let mut sums = [(0.0, 0); FIFTHS.len()];
     for (lambda, t) in lambda.iter().zip(t) {
-        let (sum, count) = &mut sums[FIFTHS * (*t as usize - 1) / steps];
+        let (sum, count) = &mut sums[FIFTHS.len() * (*t as usize - 1) / steps];
         *sum += f64::from(*lambda);
         *count += 1;
     }
-    sums.map(|(sum, count)| if count == 0 { otherwise } else { (sum / f64::from(count)) as f32 })
+    sums.map(|(sum, count)| (count > 0).then(|| (sum / f64::from(count)) as f32))
 }
 
 /// The cosine between two vectors; 0 where one is 0.

@@ -3,21 +3,21 @@
 use crate::definition::{Metric, metrics};
 
 pub(super) const METRICS: &[Metric] = &metrics! {
-    q_mean: "Mean over the batch of the critics' target y (Eq. 20). A value that grows without end is overestimation.";
-    critic_loss ["critic loss"]: "Mean over critics and batch of (y − Q_k(s, a))² with y = r + γ·mask·Q_LCB(s', a'), Q_LCB = mean_k Q̂_k − ρ·std_k Q̂_k (Eq. 20).";
-    bc_loss ["BC loss"]: "Mean over batch and dimensions of (ε − ε_θ(a^t, s, t))², the behaviour-cloning term of Eq. 19 before η. A network that always outputs 0 has loss 1; a policy that knows the data lies well below.";
-    actor_loss: "Eq. 19: η·(BC loss) + mean of λ·w(t)·ε_θ·ḡ, where ḡ is the Q-gradient (Eq. 10) over the mean of |Q̂_k(s, a)| and w(t) = √(1 − ᾱ_t).";
+    q_mean held_out: "Mean over the batch of the critics' target y (Eq. 20). A value that grows without end is overestimation.";
+    critic_loss ["critic loss"] held_out: "Mean over critics and batch of (y − Q_k(s, a))² with y = r + γ·mask·Q_LCB(s', a'), Q_LCB = mean_k Q̂_k − ρ·std_k Q̂_k (Eq. 20).";
+    bc_loss ["BC loss"] held_out: "Mean over batch and dimensions of (ε − ε_θ(a^t, s, t))², the behaviour-cloning term of Eq. 19 before η. A network that always outputs 0 has loss 1; a policy that knows the data lies well below.";
+    actor_loss held_out: "Eq. 19: η·(BC loss) + mean of λ·w(t)·ε_θ·ḡ, where ḡ is the Q-gradient (Eq. 10) over the mean of |Q̂_k(s, a)| and w(t) = √(1 − ᾱ_t).";
     eta ["η"]: "Strength η of behaviour cloning (Eq. 19). With a threshold b it rises while the BC loss is above b and falls while it is below; without one, or without guidance, it is constant.";
-    nu_squared: "ν̂²: moving average of the variance over the batch of the critics' mean alignment (Eq. 21–23). 0 without guidance.";
+    nu_squared: "ν̂²: moving average of the variance over the batch of the critics' mean alignment (Eq. 21–23).";
     critic_gradient_norm: "Global norm of the critics' gradient before clipping.";
     actor_gradient_norm: "Global norm of the actor's gradient before clipping.";
     learning_rate: "The actor's learning rate; falls to 0 along a cosine.";
-    delta_share: "Share of the batch, 0 to 1, in which δ is more than a hundredth of the denominator of λ (Eq. 24), so that it decides λ and not the critics. 0 with guidance dac and constant, and, like all that follow, without guidance.";
-    lambda_mean ["λ"]: "Mean over the batch of λ = ν̂²/(ν̂² + σ²/τ + δ) (Eq. 24), in (0, 1]: how far the critics' gradients are trusted. With guidance constant, mean or shuffled it is what they have in its place, as in all metrics of λ; 1 with dac.";
+    delta_share: "Share of the batch, 0 to 1, in which δ is more than a hundredth of the denominator of λ (Eq. 24), so that it decides λ and not the critics. 0 with guidance dac and constant. This and all that follow are measured with guidance only.";
+    lambda_mean ["λ"] held_out: "Mean over the batch of λ = ν̂²/(ν̂² + σ²/τ + δ) (Eq. 24), in (0, 1]: how far the critics' gradients are trusted. With guidance constant, mean or shuffled it is what they have in its place, as in all metrics of λ; 1 with dac.";
     lambda_quantile_10: "A tenth of the batch has a λ below this.";
     lambda_quantile_50: "Median of λ over the batch.";
     lambda_quantile_90: "A tenth of the batch has a λ above this.";
-    lambda_fifth_1: "Mean of λ over the samples whose denoising step t is in the first fifth of 1…T, the least noisy; with T = 5, as in the paper, it is t = 1. The mean over the whole batch where it has no such sample.";
+    lambda_fifth_1: "Mean of λ over the samples whose denoising step t is in the first fifth of 1…T, the least noisy; with T = 5, as in the paper, it is t = 1.";
     lambda_fifth_2: "Mean of λ over the samples whose t is in the second fifth.";
     lambda_fifth_3: "Mean of λ over the samples whose t is in the third fifth.";
     lambda_fifth_4: "Mean of λ over the samples whose t is in the fourth fifth.";

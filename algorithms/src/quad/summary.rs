@@ -20,10 +20,12 @@ pub(super) fn of(lines: &[MetricsLine], variant: &str) -> Option<Summary> {
     let to_step = step(lines.last()?);
     let from_step = to_step / PARTS + 1;
     lines.retain(|line| step(line) >= from_step);
-    let mut means: BTreeMap<&str, f64> = BTreeMap::new();
+    let mut sums: BTreeMap<&str, (f64, u32)> = BTreeMap::new();
     for (name, value) in lines.iter().flat_map(|line| line.iter()).filter(|(name, _)| is_told(name)) {
-        *means.entry(name).or_default() += value / lines.len() as f64;
+        let (sum, count) = sums.entry(name).or_default();
+        (*sum, *count) = (*sum + value, *count + 1);
     }
+    let means: BTreeMap<_, _> = sums.into_iter().map(|(name, (sum, count))| (name, sum / f64::from(count))).collect();
     let is_dac = lines.iter().all(|line| line.get("lambda_mean").is_some_and(|mean| *mean > ONE));
     let mut text = text(&means, from_step, to_step);
     if is_dac && variant != "dac" {
@@ -37,7 +39,8 @@ pub(super) fn of(lines: &[MetricsLine], variant: &str) -> Option<Summary> {
 fn text(means: &BTreeMap<&str, f64>, from_step: u64, to_step: u64) -> String {
     let mean = |name: &str| means.get(name).copied().unwrap_or_default();
     let [low, median, high] = [10, 50, 90].map(|percent| mean(&format!("lambda_quantile_{percent}")));
-    let fifths = [1, 2, 3, 4, 5].map(|fifth| format!("{:.3}", mean(&format!("lambda_fifth_{fifth}"))));
+    let fifth = |fifth| means.get(&*format!("lambda_fifth_{fifth}"));
+    let fifths = [1, 2, 3, 4, 5].map(|of| fifth(of).map_or_else(|| "–".to_owned(), |mean| format!("{mean:.3}")));
     format!(
         "λ in steps {from_step} to {to_step}: mean {:.3}, of a batch 10 % below {low:.3}, 50 % below {median:.3}, 90 % below \
          {high:.3}; {:.1} % above {ONE}\n\

@@ -97,11 +97,11 @@ function showCharts(runs) {
   for (const run of runs) {
     for (const { name, help } of run.metrics) {
       const column = run.history.names.indexOf(name);
-      if (column < 0) continue;
+      const points = run.history.rows.map((values) => [values[0], values[2 + column]]).filter(([, value]) => Number.isFinite(value));
+      if (!points.length) continue;
       const [, stem, end] = /^(.*?)(?:_(\d+))?$/.exec(name);
       if (!groups.has(stem)) groups.set(stem, { helps: new Set(), lines: [] });
       groups.get(stem).helps.add(help);
-      const points = run.history.rows.map((values) => [values[0], values[2 + column]]);
       groups.get(stem).lines.push({ label: named(run, end ?? "") || stem, points });
     }
   }

@@ -14,7 +14,7 @@ use std::fmt::Alignment::{Left, Right};
 use anyhow::anyhow;
 use clap::CommandFactory;
 use clap_complete::Shell;
-use quad_algorithms::{ALGORITHMS, Definition, Values};
+use quad_algorithms::{ALGORITHMS, Definition, Metric, Values};
 use quad_dataset::{DatasetError, environment};
 use quad_run::config::hyperparameters;
 use quad_run::config::{Preset, tasks};
@@ -89,8 +89,9 @@ fn list_presets(args: &PresetsArgs) -> anyhow::Result<()> {
 fn print_metrics(algorithm: Option<&str>) -> anyhow::Result<()> {
     let asked = |known: &&Definition| algorithm.is_none_or(|name| known.name == name);
     let tables = ALGORITHMS.iter().filter(asked).map(|Definition { name, metrics, .. }| {
-        let mut table = Table::new(&[(*name, Left), ("what it is", Left)]);
-        metrics.iter().for_each(|metric| table.push([metric.name, metric.help].map(str::to_owned)));
+        let mut table = Table::new(&[*name, "held out", "what it is"].map(|title| (title, Left)));
+        let held_out = |metric: &Metric| if metric.held_out { "yes" } else { "" };
+        metrics.iter().for_each(|it| table.push([it.name, held_out(it), it.help].map(str::to_owned)));
         table.render(Style::Text)
     });
     print(&Vec::from_iter(tables).join("\n"))

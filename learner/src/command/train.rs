@@ -120,8 +120,7 @@ async fn run_to_its_end(
     data: Split,
 ) -> anyhow::Result<(RunDir, Ending)> {
     let steps = config.experiment.steps;
-    let (measured, has_held_out) = (config.experiment.definition()?.metrics, data.held_out.is_some());
-    let (metrics, registry) = Metrics::new(&name, steps, measured, has_held_out)?;
+    let (metrics, registry) = Metrics::new(&name, steps, config.experiment.definition()?.metrics)?;
     let health = Health::default();
     let live = Live::new(name.clone(), steps, metrics.clone(), health.clone());
     let telling = live.clone();

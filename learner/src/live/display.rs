@@ -109,7 +109,7 @@ impl Display {
             }
         }
         let shown = training.algorithm.iter().filter(|(metric, _)| !metric.label.is_empty());
-        parts.extend(shown.map(|(metric, gauge)| format!("{} {:.3}", metric.label, gauge.get())));
+        parts.extend(shown.filter_map(|(metric, gauge)| Some(format!("{} {:.3}", metric.label, gauge.get()?))));
         parts.join(", ")
     }
 

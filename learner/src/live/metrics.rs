@@ -64,18 +64,13 @@ pub(crate) struct EvaluatorMetrics {
 
 impl Metrics {
     /// Makes all metrics, in a registry that labels each with the run.
-    pub fn new(
-        run: &Name,
-        target_steps: u64,
-        measured: &'static [Metric],
-        has_held_out: bool,
-    ) -> prometheus::Result<(Self, Registry)> {
+    pub fn new(run: &Name, target_steps: u64, measured: &'static [Metric]) -> prometheus::Result<(Self, Registry)> {
         let labels = HashMap::from([("run".to_owned(), run.to_string())]);
         let registry = Registry::new_custom(None, Some(labels))?;
         registry.register(Box::new(ProcessCollector::for_self()))?;
         let make = Registrar { registry: registry.clone() };
         let metrics = Self {
-            training: TrainingMetrics::new(&make, target_steps, measured, has_held_out)?,
+            training: TrainingMetrics::new(&make, target_steps, measured)?,
             evaluation: EvaluationMetrics::new(&make)?,
             evaluators: EvaluatorMetrics::new(&make)?,
             disk: DiskMetrics::new(&make)?,

@@ -26,18 +26,20 @@ pub(super) struct History {
     /// Lines behind the last row.
     #[serde(skip)]
     lines: usize,
+    /// The metrics so far.
     names: Vec<String>,
     rows: Vec<Row>,
 }
 
-/// Means of each metric over some steps; NaN where it was not measured.
+/// Means of each metric over some lines.
 #[derive(Debug)]
 struct Row {
     /// The last of these steps.
     step: f64,
     /// Seconds of training up to it.
     seconds: f64,
-    values: Vec<f64>,
+    /// The sum of each metric, in the order of the names, and how many lines have it.
+    values: Vec<(f64, u32)>,
 }
 
 impl History {
@@ -59,13 +61,10 @@ impl History {
             while self.rows.pop_if(|last| last.step >= step).is_some() {
                 self.lines = self.stride;
             }
-            for name in line.keys() {
-                if !self.names.contains(name) {
-                    self.names.push(name.clone());
-                    self.rows.iter_mut().for_each(|row| row.values.push(f64::NAN));
-                }
-            }
-            let value = |name: &String| line.get(name).copied().flatten().unwrap_or(f64::NAN);
+            // Later phases measure other metrics.
+            self.names.extend(line.keys().filter(|name| !self.names.contains(name)).cloned().collect::<Vec<_>>());
+            self.rows.iter_mut().for_each(|row| row.values.resize(self.names.len(), (0.0, 0)));
+            let value = |name: &String| line.get(name).copied().flatten().map_or((0.0, 0), |value| (value, 1));
             self.push(Row { step, seconds, values: self.names.iter().map(value).collect() });
         }
         Ok(())
@@ -76,13 +75,13 @@ impl History {
             && let Some(last) = self.rows.last_mut()
         {
             self.lines += 1;
-            last.join(&line, 1.0 / self.lines as f64);
+            last.join(&line);
             return;
         }
         if self.rows.len() == MOST_ROWS {
             let mut pairs = std::mem::take(&mut self.rows).into_iter();
             while let (Some(mut first), Some(second)) = (pairs.next(), pairs.next()) {
-                first.join(&second, 0.5);
+                first.join(&second);
                 self.rows.push(first);
             }
             self.stride *= 2;
@@ -93,15 +92,12 @@ impl History {
 }
 
 impl Row {
-    /// Also covers what follows, which has this share of the whole.
-    fn join(&mut self, next: &Self, share: f64) {
+    /// Also covers what follows.
+    fn join(&mut self, next: &Self) {
         (self.step, self.seconds) = (next.step, next.seconds);
-        for (mean, value) in self.values.iter_mut().zip(&next.values) {
-            match (mean.is_nan(), value.is_nan()) {
-                (true, _) => *mean = *value,
-                (false, true) => {}
-                (false, false) => *mean += (value - *mean) * share,
-            }
+        for ((sum, count), (more, lines)) in self.values.iter_mut().zip(&next.values) {
+            *sum += more;
+            *count += lines;
         }
     }
 }
@@ -109,7 +105,8 @@ impl Row {
 /// As `[step, seconds, value …]`.
 impl Serialize for Row {
     fn serialize<S: Serializer>(&self, serializer: S) -> Result<S::Ok, S::Error> {
-        serializer.collect_seq([self.step, self.seconds].iter().chain(&self.values).map(|value| rounded(*value)))
+        let means = self.values.iter().map(|(sum, count)| sum / f64::from(*count));
+        serializer.collect_seq([self.step, self.seconds].into_iter().chain(means).map(rounded))
     }
 }
 

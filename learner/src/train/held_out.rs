@@ -1,43 +1,41 @@
-//! What updates measure on episodes that are kept out of training.
+//! What the algorithm measures on episodes that are kept out of training.
 
 use quad_algorithms::{Agent, AlgorithmError, Metric};
 use quad_dataset::{BatchSampler, Transitions};
 use quad_run::config::{Device, Experiment};
-use tracing::info;
+use tracing::{info, warn};
 
+use super::results::Means;
+use super::steps::STEPS_PER_ROW;
 use super::training::algorithm;
 
 /// Batches that are measured at a time, always the same.
 const BATCHES: usize = 4;
-/// Most measurements in a run.
+/// Most measurements in a run, but for the last step's.
 const MEASUREMENTS: u64 = 100;
 
-/// Whether a metric says something of data that is not learnt from: losses do, and means of values.
-pub(crate) fn is_measured(metric: &Metric) -> bool {
-    metric.name.ends_with("_loss") || metric.name.ends_with("_mean")
-}
-
-/// What such a metric is called when it is of held-out episodes.
-pub(crate) fn name(metric: &Metric) -> String {
+/// The name of a metric of held-out episodes.
+pub(super) fn name(metric: &Metric) -> String {
     format!("held_out_{}", metric.name)
 }
 
-/// The algorithm over the held-out episodes. To measure, it takes over the state of the one that trains and updates it with a
-/// held-out batch, because an update measures before it changes anything; what it changes then is forgotten.
+/// The algorithm over the held-out episodes, which takes over the state of the one that trains.
 pub(crate) struct HeldOut {
     agent: Agent,
     batches: Vec<Vec<u32>>,
     /// Steps between two measurements.
     every: u64,
-    /// The step from which the next one is due.
-    next: u64,
-    newest: Vec<f32>,
+    has_warned: bool,
 }
 
 impl HeldOut {
-    /// For the algorithm at its beginning; none where it cannot be measured on these transitions: they hold nothing that it
-    /// learns from, or its state has numbers for each transition that it trains on.
+    /// For the algorithm at its beginning; none where it cannot be measured on these transitions: nothing in its table is, or
+    /// they hold nothing that it learns from.
     pub fn new(experiment: &Experiment, device: Device, held_out: Transitions, training: &mut Agent) -> Option<Self> {
+        if !training.metrics().iter().any(|metric| metric.held_out) {
+            info!("nothing is measured on held-out episodes: {} has no metric that is", experiment.algorithm);
+            return None;
+        }
         let size = (experiment.batch_size as usize).min(held_out.len());
         let loaded = algorithm(experiment, device, held_out, size).and_then(|mut agent| {
             agent.load(&training.save()?)?;
@@ -57,35 +55,39 @@ impl HeldOut {
     pub(super) fn of(agent: Agent, size: usize, seed: u64, steps: u64) -> Self {
         let mut sampler = BatchSampler::new(agent.items(), size, seed, 0);
         let batches = (0..BATCHES).map(|_| sampler.next_items().to_vec()).collect();
-        Self { agent, batches, every: steps.div_ceil(MEASUREMENTS), next: 0, newest: Vec::new() }
+        Self { agent, batches, every: steps.div_ceil(MEASUREMENTS).next_multiple_of(STEPS_PER_ROW), has_warned: false }
     }
 
-    /// The metrics of [`is_measured`] in the order of the algorithm's, measured anew if it is time; else as they were. `state`
-    /// gives the state of the algorithm that trains.
+    /// Whether the row of this step has measurements, be it the run's last or not.
+    pub fn is_due(&self, step: u64, is_last: bool) -> bool {
+        is_last || step.is_multiple_of(self.every)
+    }
+
+    /// Measures with this state of the algorithm that trains: means over the batches, in the order of its metrics. Leaves out
+    /// what is not finite, and warns of the first.
     ///
     /// # Errors
     /// Candle fails.
-    pub fn values(
-        &mut self,
-        step: u64,
-        state: impl FnOnce() -> Result<Vec<u8>, AlgorithmError>,
-    ) -> Result<&[f32], AlgorithmError> {
-        if step >= self.next {
-            self.newest = self.measure(&state()?)?;
-            self.next = step + self.every;
-        }
-        Ok(&self.newest)
-    }
-
-    fn measure(&mut self, state: &[u8]) -> Result<Vec<f32>, AlgorithmError> {
-        let mut sums = vec![0.0; self.agent.metrics().len()];
+    pub fn measure(&mut self, state: &[u8]) -> Result<Vec<Option<f32>>, AlgorithmError> {
+        // A state of this run was loaded at the beginning, and all are alike.
+        self.agent.load(state).map_err(candle_core::Error::wrap)?;
+        let mut means = Means::new(self.agent.metrics().len());
         for batch in &self.batches {
-            // A state of this run was loaded at the beginning, and all are alike.
-            self.agent.load(state).map_err(candle_core::Error::wrap)?;
-            let values = self.agent.update(batch)?;
-            sums.iter_mut().zip(values).for_each(|(sum, value)| *sum += f64::from(value));
+            means.add(&self.agent.evaluate(batch)?);
         }
-        let of_metrics = self.agent.metrics().iter().zip(sums);
-        Ok(of_metrics.filter(|(metric, _)| is_measured(metric)).map(|(_, sum)| (sum / BATCHES as f64) as f32).collect())
+        let mut values = means.take();
+        for (metric, value) in self.agent.metrics().iter().zip(&mut values) {
+            let Some(number) = value.take_if(|number| !number.is_finite()) else { continue };
+            if !self.has_warned {
+                warn!(
+                    "at gradient step {} {} is {number} and left out: a number of the held-out episodes is too large for \
+                     32 bits, which the policy does not learn from. `learner datasets inspect` looks for outliers",
+                    self.agent.step(),
+                    name(metric),
+                );
+                self.has_warned = true;
+            }
+        }
+        Ok(values)
     }
 }

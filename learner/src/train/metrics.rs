@@ -2,7 +2,8 @@
 
 use std::time::Duration;
 
-use prometheus::core::Collector;
+use prometheus::core::{Collector, Desc};
+use prometheus::proto::MetricFamily;
 use prometheus::{
     Counter, Gauge, GaugeVec, Histogram, HistogramOpts, IntCounter, IntCounterVec, IntGauge, IntGaugeVec, Opts,
     Registry, exponential_buckets,
@@ -23,28 +24,54 @@ pub(crate) struct TrainingMetrics {
     pub saving_seconds: Counter,
     pub diverged: IntGauge,
     /// What the algorithm measures, in its order.
-    pub algorithm: Vec<(&'static Metric, Gauge)>,
-    /// Gauges of what is measured on held-out episodes.
-    held_out: Vec<Gauge>,
+    pub algorithm: Vec<(&'static Metric, MaybeGauge)>,
+    /// What it measures on held-out episodes, in its order.
+    held_out: Vec<MaybeGauge>,
+}
+
+/// A gauge that is there as long as it has a value.
+#[derive(Clone, Debug)]
+pub(crate) struct MaybeGauge(Gauge);
+
+impl MaybeGauge {
+    fn new(name: &str, help: &str) -> prometheus::Result<Self> {
+        let gauge = Gauge::new(full(name), help)?;
+        gauge.set(f64::NAN);
+        Ok(Self(gauge))
+    }
+
+    /// Its value, if it has one.
+    pub fn get(&self) -> Option<f64> {
+        Some(self.0.get()).filter(|value| !value.is_nan())
+    }
+
+    fn set(&self, value: Option<f32>) {
+        self.0.set(value.map_or(f64::NAN, f64::from));
+    }
+}
+
+impl Collector for MaybeGauge {
+    fn desc(&self) -> Vec<&Desc> {
+        self.0.desc()
+    }
+
+    fn collect(&self) -> Vec<MetricFamily> {
+        self.get().map(|_| self.0.collect()).unwrap_or_default()
+    }
 }
 
 impl TrainingMetrics {
-    /// Makes them, for a run of so many steps whose algorithm measures that, perhaps on held-out episodes, too.
-    pub fn new(
-        make: &Registrar,
-        target_steps: u64,
-        measured: &'static [Metric],
-        has_held_out: bool,
-    ) -> prometheus::Result<Self> {
+    /// Makes them, for a run of so many steps whose algorithm measures that.
+    pub fn new(make: &Registrar, target_steps: u64, measured: &'static [Metric]) -> prometheus::Result<Self> {
         let target = make.count("gradient_steps_target", "Gradient steps that this run will do")?;
         target.set(i64::try_from(target_steps).unwrap_or(i64::MAX));
         let buckets = exponential_buckets(SHORTEST_STEP, 2.0, STEP_BUCKETS)?;
         let duration = HistogramOpts::new(full("step_duration_seconds"), "Wall time of one gradient step");
         let saving = "Time that the training thread spent on copying its state and its policy instead of training";
-        let gauges = measured.iter().map(|metric| Ok((metric, make.gauge(metric.name, metric.help)?)));
-        let of_held_out = measured.iter().filter(|metric| has_held_out && held_out::is_measured(metric));
-        let held_out = of_held_out
-            .map(|metric| make.gauge(&held_out::name(metric), &format!("On held-out episodes: {}", metric.help)));
+        let gauge = |name: &str, help: &str| make.add(MaybeGauge::new(name, help));
+        let gauges = measured.iter().map(|metric| Ok((metric, gauge(metric.name, metric.help)?)));
+        let help = |metric: &Metric| format!("On held-out episodes, with the weights as they are: {}", metric.help);
+        let held_out = measured.iter().map(|metric| gauge(&held_out::name(metric), &help(metric)));
         Ok(Self {
             held_out: held_out.collect::<prometheus::Result<_>>()?,
             gradient_steps: make.counter("gradient_steps_total", "Gradient steps done")?,
@@ -56,17 +83,17 @@ impl TrainingMetrics {
     }
 
     /// Takes in one gradient step: what it measured, in the algorithm's order.
-    pub fn observe(&self, values: &[f32], duration: Duration) {
+    pub fn observe(&self, values: &[Option<f32>], duration: Duration) {
         self.gradient_steps.inc();
         self.step_duration.observe(duration.as_secs_f64());
         for ((_, gauge), value) in self.algorithm.iter().zip(values) {
-            gauge.set(f64::from(*value));
+            gauge.set(*value);
         }
     }
 
     /// Takes in what was measured on held-out episodes.
-    pub fn observe_held_out(&self, values: &[f32]) {
-        self.held_out.iter().zip(values).for_each(|(gauge, value)| gauge.set(f64::from(*value)));
+    pub fn observe_held_out(&self, values: &[Option<f32>]) {
+        self.held_out.iter().zip(values).for_each(|(gauge, value)| gauge.set(*value));
     }
 }
 

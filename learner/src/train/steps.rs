@@ -12,13 +12,13 @@ use quad_run::run::Checkpoint;
 use quad_runtime::Beat;
 use tracing::debug;
 
-use super::held_out::{self, HeldOut};
+use super::held_out::HeldOut;
 use super::metrics::TrainingMetrics;
 use super::outbox::Outbox;
-use super::results::{Outcome, Row, TrainedPolicy};
+use super::results::{Means, Outcome, Row, TrainedPolicy, measured};
 
 /// Gradient steps that a line of `metrics.jsonl` averages over.
-const STEPS_PER_ROW: u64 = 100;
+pub(super) const STEPS_PER_ROW: u64 = 100;
 /// Least time of training that is spent between two checkpoints for each second that one takes: saving costs at most 1 %.
 const TRAINING_PER_SAVING: u32 = 100;
 
@@ -88,7 +88,7 @@ pub(crate) fn train(
     outlets: &Outlets<'_>,
 ) -> Result<Outcome, TrainError> {
     let start = Instant::now();
-    let mut mean = RowMean::new(agent.metrics());
+    let mut means = Means::new(agent.metrics().len());
     let mut next_checkpoint = start + plan.checkpoint_every;
     while agent.step() < plan.schedule.steps {
         let begin = Instant::now();
@@ -98,15 +98,19 @@ pub(crate) fn train(
         let updated = Instant::now();
         outlets.beat.alive();
         outlets.metrics.observe(&values, updated - begin);
-        mean.add(&values);
+        means.add(&values);
 
         let last = step == plan.schedule.steps;
         let stopped = !last && outlets.stop.load(Ordering::Relaxed);
         if step.is_multiple_of(STEPS_PER_ROW) || last || stopped {
             let seconds = plan.seconds_before + start.elapsed().as_secs_f64();
-            let row = mean.take(step, seconds);
-            let held_out = held_out.as_mut().map(|held_out| measure(held_out, agent, outlets)).transpose()?;
-            outlets.outbox.row(Row { held_out: held_out.unwrap_or_default(), ..row });
+            let mut row = Row { step, seconds, metrics: agent.metrics(), values: means.take(), held_out: Vec::new() };
+            if let Some(held_out) = held_out.as_deref_mut().filter(|held_out| held_out.is_due(step, last)) {
+                let values = agent.save().and_then(|state| held_out.measure(&state));
+                row.held_out = values.map_err(|source| TrainError::at(step, source))?;
+                outlets.metrics.observe_held_out(&row.held_out);
+            }
+            outlets.outbox.row(row);
         }
         hand_over_policy(agent, plan.schedule, outlets)?;
         if last || stopped || updated >= next_checkpoint {
@@ -118,19 +122,6 @@ pub(crate) fn train(
         }
     }
     Ok(Outcome::Completed)
-}
-
-/// What the algorithm measures on held-out episodes, by name.
-fn measure(held_out: &mut HeldOut, agent: &mut Agent, outlets: &Outlets<'_>) -> Result<Vec<(String, f32)>, TrainError> {
-    let (step, metrics) = (agent.step(), agent.metrics());
-    let values = held_out.values(step, || agent.save()).map_err(|source| TrainError::at(step, source))?;
-    outlets.metrics.observe_held_out(values);
-    let names = metrics.iter().filter(|metric| held_out::is_measured(metric)).map(held_out::name);
-    let named = Vec::from_iter(names.zip(values.iter().copied()));
-    match named.iter().find(|(_, value)| !value.is_finite()) {
-        Some((name, value)) => Err(TrainError::Diverged { step, what: format!("{name} is {value}") }),
-        None => Ok(named),
-    }
 }
 
 /// Hands over the policy if it is to be evaluated, or if it is the last.
@@ -157,34 +148,9 @@ fn hand_over_state(agent: &mut Agent, outlets: &Outlets<'_>) -> Result<Duration,
     Ok(took)
 }
 
-fn check_finite(step: u64, metrics: &[Metric], values: &[f32]) -> Result<(), TrainError> {
-    match metrics.iter().zip(values).find(|(_, value)| !value.is_finite()) {
+fn check_finite(step: u64, metrics: &[Metric], values: &[Option<f32>]) -> Result<(), TrainError> {
+    match measured(metrics, values).find(|(_, value)| !value.is_finite()) {
         Some((metric, value)) => Err(TrainError::Diverged { step, what: format!("{} is {value}", metric.name) }),
         None => Ok(()),
-    }
-}
-
-/// Sums in f64.
-struct RowMean {
-    metrics: &'static [Metric],
-    sums: Vec<f64>,
-    count: u64,
-}
-
-impl RowMean {
-    fn new(metrics: &'static [Metric]) -> Self {
-        Self { metrics, sums: vec![0.0; metrics.len()], count: 0 }
-    }
-
-    fn add(&mut self, values: &[f32]) {
-        self.count += 1;
-        self.sums.iter_mut().zip(values).for_each(|(sum, value)| *sum += f64::from(*value));
-    }
-
-    fn take(&mut self, step: u64, seconds: f64) -> Row {
-        let metrics = self.metrics;
-        let Self { sums, count, .. } = std::mem::replace(self, Self::new(metrics));
-        let values = sums.iter().map(|sum| (sum / count.max(1) as f64) as f32).collect();
-        Row { step, seconds, metrics, values, held_out: Vec::new() }
     }
 }

@@ -1,18 +1,20 @@
 //! The training loop: what it hands over and when, and how it ends.
 
+use std::collections::BTreeSet;
 use std::sync::Arc;
 use std::sync::atomic::AtomicBool;
 use std::time::Duration;
 
 use candle_core::Device;
-use quad_algorithms::{Agent, Algorithm, Context, Definition, Measured, Parts, Reporting};
-use quad_dataset::{BatchSampler, ReadOptions, RewardRule, Scale, Transitions, environment};
-use quad_policy::{PolicyConfig, Precision, Tensors};
+use quad_algorithms::{Agent, Algorithm, Context, Definition, Measured, Metric, Parts, Reporting};
+use quad_dataset::{Arrays, BatchSampler, ReadOptions, RewardRule, Scale, Transitions, environment};
+use quad_policy::{GaussianShape, MlpConfig, PolicyConfig, Precision, Tensors};
 use quad_protocol::Origin;
 use quad_run::config::hyperparameters::algorithm as definition;
 use quad_run::config::{Schedule, resolve};
 use quad_run::run::Checkpoint;
 use quad_runtime::{Beat, Health};
+use serde_json::Value;
 
 use super::held_out::HeldOut;
 use super::outbox::{Outbox, Work};
@@ -25,6 +27,8 @@ use super::{Registrar, TrainingMetrics};
 mod hopper;
 use hopper::write_hopper;
 
+mod held_out;
+
 /// What a run has handed over.
 struct Result {
     outcome: std::result::Result<Outcome, TrainError>,
@@ -33,6 +37,8 @@ struct Result {
     checkpoint: Option<Checkpoint>,
     rows: Vec<results::Row>,
     metrics: TrainingMetrics,
+    /// Names of the gauges and counters that have a value at the end.
+    gauges: BTreeSet<String>,
 }
 
 fn beat() -> Beat {
@@ -93,21 +99,27 @@ fn run_of(
     table: &toml::Table,
     stop: bool,
 ) -> Result {
-    let definition = definition(algorithm).unwrap();
-    let mut agent = Agent::new(definition, table, context(total_steps)).unwrap();
+    let mut agent = Agent::new(definition(algorithm).unwrap(), table, context(total_steps)).unwrap();
     if let Some(checkpoint) = from {
         agent.load(&checkpoint.state).unwrap();
     }
+    run_agent(agent, None, plan, stop)
+}
+
+/// A run of this agent to the plan's end.
+fn run_agent(mut agent: Agent, mut held_out: Option<HeldOut>, plan: Plan, stop: bool) -> Result {
     let mut sampler = BatchSampler::new(agent.items(), 4, 0, agent.step());
     let make = Registrar { registry: prometheus::Registry::new() };
-    let metrics = TrainingMetrics::new(&make, plan.schedule.steps, definition.metrics, false).unwrap();
+    let metrics = TrainingMetrics::new(&make, plan.schedule.steps, agent.metrics()).unwrap();
     let outbox = Outbox::default();
     let origin = Origin { environment: "hopper".to_owned(), seed: 0, step: 0, episodes: 10 };
     let (stop, beat) = (&AtomicBool::new(stop), &beat());
     let outlets = Outlets { metrics: &metrics, outbox: &outbox, origin: &origin, stop, beat };
     // Nothing takes what it hands over, as with a disk that hangs: training must end all the same.
-    let outcome = train(&mut agent, &mut sampler, None, plan, &outlets);
-    let mut result = Result { outcome, snapshots: Vec::new(), checkpoint: None, rows: Vec::new(), metrics };
+    let outcome = train(&mut agent, &mut sampler, held_out.as_mut(), plan, &outlets);
+    let families = make.registry.gather();
+    let gauges = families.iter().map(|family| family.name().trim_start_matches("quad_learner_").to_owned()).collect();
+    let mut result = Result { outcome, snapshots: Vec::new(), checkpoint: None, rows: Vec::new(), metrics, gauges };
     outbox.close();
     while let Some(work) = outbox.next(beat) {
         match work {
@@ -220,11 +232,15 @@ impl Algorithm for InPhases {
         if (25..75).contains(&step) {
             std::thread::sleep(Duration::from_millis(20));
         }
-        Ok(Measured::new())
+        Ok(vec![(if step < 150 { "first" } else { "second" }, step as f32)])
+    }
+
+    fn evaluate(&self, _: u64, _: &[u32]) -> candle_core::Result<Measured> {
+        unreachable!("nothing is held out")
     }
 
     fn policy(&self) -> candle_core::Result<(PolicyConfig, Tensors)> {
-        unreachable!("nothing asks for it")
+        Ok((PolicyConfig::Gaussian { shape: GaussianShape { observation_dim: 1, action_dim: 1, actor: MlpConfig::default() } }, Tensors::new()))
     }
 
     fn parts(&mut self) -> Parts<'_> {
@@ -232,31 +248,39 @@ impl Algorithm for InPhases {
     }
 }
 
-#[test]
-fn the_estimate_of_a_step_is_the_mean_over_all_phases() {
+const fn metric(name: &'static str) -> Metric {
+    Metric { name, help: "What a phase measures.", label: "", held_out: false }
+}
+
+fn in_phases() -> Agent {
     let definition = Definition {
         name: "in-phases",
         settings: "",
-        metrics: &[],
+        metrics: const { &[metric("first"), metric("second")] },
         report: Reporting::PLAIN,
         check: |_| Ok(()),
         start: |_, _| Ok(Box::new(InPhases)),
     };
-    let mut agent = Agent::new(definition, &toml::Table::new(), context(100)).unwrap();
-    let mut sampler = BatchSampler::new(agent.items(), 4, 0, 0);
-    assert!(mean_step(&mut agent, &mut sampler, 100).unwrap() >= 0.01, "the second phase is not in it");
+    Agent::new(definition, &toml::Table::new(), context(100)).unwrap()
 }
 
 #[test]
-fn measuring_on_held_out_episodes_changes_nothing() {
-    let agent = || Agent::new(definition("quad").unwrap(), &small("quad"), context(20)).unwrap();
-    let ([mut alone, mut measured], mut held_out) = ([agent(), agent()], HeldOut::of(agent(), 4, 0, 20));
-    for step in 1..=5 {
-        let items = [0, 1, 2, 3];
-        assert_eq!(alone.update(&items).unwrap(), measured.update(&items).unwrap());
-        let values = held_out.values(step, || measured.save()).unwrap().to_vec();
-        assert!(values.iter().all(|value| value.is_finite() && *value != 0.0), "{values:?}");
-        assert_eq!(values, held_out.values(step, || panic!("it is not time again")).unwrap());
-    }
-    assert_eq!(alone.save().unwrap(), measured.save().unwrap());
+fn a_row_has_what_its_steps_measured_and_means_of_these_alone() {
+    let result = run_agent(in_phases(), None, plan(300, 0), false);
+    assert_eq!(result.outcome.unwrap(), Outcome::Completed);
+    let rows = Vec::from_iter(result.rows.iter().map(|row| serde_json::to_value(row).unwrap()));
+    let means = |row: &Value| ["first", "second"].map(|name| row.get(name).map(|mean| mean.as_f64().unwrap()));
+    assert_eq!(rows.iter().map(means).collect::<Vec<_>>(), [
+        [Some(49.5), None],
+        [Some(124.5), Some(174.5)],
+        [None, Some(249.5)],
+    ]);
+    assert!(!result.gauges.contains("first") && result.gauges.contains("second"), "{:?}", result.gauges);
+}
+
+#[test]
+fn the_estimate_of_a_step_is_the_mean_over_all_phases() {
+    let mut agent = in_phases();
+    let mut sampler = BatchSampler::new(agent.items(), 4, 0, 0);
+    assert!(mean_step(&mut agent, &mut sampler, 100).unwrap() >= 0.01, "the second phase is not in it");
 }

@@ -43,9 +43,10 @@ def metrics(folder: str | PathLike[str]) -> list[dict[str, float]]:
 
     folder: a run folder.
 
-    Each dictionary has `step`. Where the run's metrics.jsonl has that step, it has `seconds` (of training) and each metric, as
-    `train/NAME`. Where all episodes of an evaluation of that step are scored, it has `evaluation/score`,
-    `evaluation/score_std` (if there are several episodes), `evaluation/return` and `evaluation/length`. Steps ascend.
+    Each dictionary has `step`. Where the run's metrics.jsonl has that step, it has `seconds` (of training) and, as `train/NAME`,
+    each metric that was measured there. Where all episodes of an evaluation of that step are scored, it has
+    `evaluation/score`, `evaluation/score_std` (if there are several episodes), `evaluation/return` and `evaluation/length`.
+    Steps ascend.
 
     A learner may be writing the folder. Raises FileNotFoundError if it holds no metrics.jsonl, RuntimeError if a file is
     not what a learner writes.

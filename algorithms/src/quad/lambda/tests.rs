@@ -15,9 +15,11 @@ fn quantiles_and_means_of_fifths_are_numpys() {
     close(&quantiles(&LAMBDA), &[0.26, 0.5, 0.997]);
     close(&quantiles(&[0.5]), &[0.5; 3]);
     // No t is in the fourth fifth of 1…7.
-    close(&by_fifth(&LAMBDA, &T, 7, 0.61), &[0.698_333_3, 0.4, 0.4, 0.61, 1.0]);
+    let fifths = by_fifth(&LAMBDA, &T, 7);
+    close(&Vec::from_iter(fifths.into_iter().flatten()), &[0.698_333_3, 0.4, 0.4, 1.0]);
+    assert_eq!(fifths[3], None);
     let each = [1, 2, 3, 4, 5].map(|t| t as f32 / 10.0);
-    close(&by_fifth(&each, &[1, 2, 3, 4, 5], 5, 0.0), &each);
+    assert_eq!(by_fifth(&each, &[1, 2, 3, 4, 5], 5), each.map(Some));
 }
 
 #[test]
@@ -30,4 +32,6 @@ fn a_batch_is_measured_in_one_pass() {
     // σ²/(ν̂² + δ); the mean of the cosine 0.6 and, of a gradient that is 0, of 0.
     let names = ["delta_share", "lambda_mean", "lambda_above_99_share", "variance_ratio", "guidance_cosine"];
     close(&names.map(value), &[0.25, 0.7475, 0.5, 0.4, 0.3]);
+    let fifths = Vec::from_iter(found.into_iter().filter(|(name, _)| name.starts_with("lambda_fifth")));
+    assert_eq!(fifths, [("lambda_fifth_1", 0.995), ("lambda_fifth_3", 0.5)]);
 }

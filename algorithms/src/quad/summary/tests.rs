@@ -34,7 +34,7 @@ fn lambda_is_summarised_after_the_first_tenth() {
     for words in [
         "steps 201 to 2000: mean 0.625, of a batch 10 % below 0.125",
         "50.0 % above 0.99",
-        " 0.250 ",
+        "t = 1…T: – 0.250 – – –\n",
         "σ²/ν̂² 2.000, cosine of guidance and behaviour cloning -0.500",
     ] {
         assert!(text.contains(words), "{words} is missing in\n{text}");

@@ -9,7 +9,7 @@ fn name(number: usize) -> Name {
 
 #[test]
 fn many_that_come_and_go_are_told_in_one_line_and_bounded() {
-    let (metrics, _) = Metrics::new(&Name::new("run").unwrap(), 1, &[], false).unwrap();
+    let (metrics, _) = Metrics::new(&Name::new("run").unwrap(), 1, &[]).unwrap();
     let now = Instant::now();
     let mut evaluators = Evaluators::new(metrics.evaluators, now);
     for number in 0..2 * MOST_EVALUATORS {

@@ -92,11 +92,40 @@ fn a_long_run_is_thinned_and_not_cut() {
     assert_eq!(rows.last().unwrap().step, 2_000_000.0);
     // Means: each line counts once, and η is 0 and 1 in turn.
     let whole = &rows[..rows.len() - 1];
-    assert!(whole.iter().all(|row| (row.values[0] - 0.5).abs() < 1e-9), "{:?}", rows.first());
-    let (first, mean) = (rows[0].step as u64 / 100, rows[0].values[1]);
+    let mean = |row: &Row, metric: usize| row.values[metric].0 / f64::from(row.values[metric].1);
+    assert!(whole.iter().all(|row| (mean(row, 0) - 0.5).abs() < 1e-9), "{:?}", rows.first());
+    let (first, mean) = (rows[0].step as u64 / 100, mean(&rows[0], 1));
     let expected = (1..=first).map(|n| 1.0 / n as f64).sum::<f64>() / first as f64;
     assert!((mean - expected).abs() < 1e-9, "{mean} is not {expected}, of {first} lines");
     assert!(shown(&history).to_string().len() < 50_000);
+}
+
+/// Phases measure different metrics; a mean is of the lines that have it.
+#[test]
+fn what_a_line_does_not_have_is_nothing() {
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("metrics.jsonl");
+    let line = |n: u64| match n {
+        ..=700 => json!({ "step": n, "seconds": 1, "first": 1 }),
+        701..=1400 => json!({ "step": n, "seconds": 1, "second": 2, "both": n % 2 }),
+        _ => json!({ "step": n, "seconds": 1, "third": 3, "second": 4 }),
+    };
+    let mut history = History::of(path.clone());
+    fs::write(&path, Vec::from_iter((1..=2).map(|n| line(n).to_string() + "\n")).concat()).unwrap();
+    history.refresh().unwrap();
+    assert_eq!((&shown(&history)["names"], &shown(&history)["rows"][1]), (&json!(["first"]), &json!([2.0, 1.0, 1.0])));
+    fs::write(&path, Vec::from_iter((1..=2100).map(|n| line(n).to_string() + "\n")).concat()).unwrap();
+    history.refresh().unwrap();
+    let shown = shown(&history);
+    assert_eq!(shown["names"], json!(["first", "both", "second", "third"]));
+    let rows = shown["rows"].as_array().unwrap();
+    assert!(rows.len() < 600 && rows.iter().all(|row| row.as_array().unwrap().len() == 6));
+    let values = |row: &Value| [2, 3, 4, 5].map(|column| row[column].as_f64());
+    assert_eq!(values(&rows[0]), [Some(1.0), None, None, None]);
+    assert_eq!(values(&rows[rows.len() / 2]), [None, Some(0.5), Some(2.0), None]);
+    assert_eq!(values(rows.last().unwrap()), [None, None, Some(4.0), Some(3.0)]);
+    // A row across both phases: no zeros are mixed in.
+    assert!(rows.iter().all(|row| values(row)[0].is_none_or(|first| first == 1.0)), "{rows:?}");
 }
 
 #[test]
