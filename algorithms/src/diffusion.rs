@@ -151,8 +151,7 @@ impl<U: Update> Algorithm for Diffusion<U> {
     fn evaluate(&self, step: u64, items: &[u32]) -> Result<Measured> {
         let Self { update, networks, .. } = self;
         let (batch, noise) = (networks.context.batch(items)?, self.noise(step)?);
-        let (mut measured, others) =
-            update.evaluate(networks, &batch, &noise.on(&networks.context.device)?)?.read()?;
+        let (mut measured, others) = update.evaluate(networks, &batch, &noise.on(&networks.context.device)?)?.read()?;
         measured.extend(update.measure(networks, &noise, &others)?);
         Ok(measured)
     }

@@ -46,7 +46,7 @@ candidates = {candidates}
 actor.hidden = [{hidden}, {hidden}, {hidden}]
 critic.hidden = [{hidden}, {hidden}, {hidden}]
 critics = 2
-diffusion_steps = 2
+diffusion_steps = 5
 actor_ema_start = 10
 "#
         )

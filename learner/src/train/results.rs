@@ -48,7 +48,10 @@ impl Serialize for Row {
 }
 
 /// The metrics that have a value, with it.
-pub(super) fn measured<'a>(metrics: &'a [Metric], values: &'a [Option<f32>]) -> impl Iterator<Item = (&'a Metric, f32)> {
+pub(super) fn measured<'a>(
+    metrics: &'a [Metric],
+    values: &'a [Option<f32>],
+) -> impl Iterator<Item = (&'a Metric, f32)> {
     metrics.iter().zip(values).filter_map(|(metric, value)| Some((metric, (*value)?)))
 }
 

@@ -240,7 +240,12 @@ impl Algorithm for InPhases {
     }
 
     fn policy(&self) -> candle_core::Result<(PolicyConfig, Tensors)> {
-        Ok((PolicyConfig::Gaussian { shape: GaussianShape { observation_dim: 1, action_dim: 1, actor: MlpConfig::default() } }, Tensors::new()))
+        Ok((
+            PolicyConfig::Gaussian {
+                shape: GaussianShape { observation_dim: 1, action_dim: 1, actor: MlpConfig::default() },
+            },
+            Tensors::new(),
+        ))
     }
 
     fn parts(&mut self) -> Parts<'_> {
@@ -270,11 +275,10 @@ fn a_row_has_what_its_steps_measured_and_means_of_these_alone() {
     assert_eq!(result.outcome.unwrap(), Outcome::Completed);
     let rows = Vec::from_iter(result.rows.iter().map(|row| serde_json::to_value(row).unwrap()));
     let means = |row: &Value| ["first", "second"].map(|name| row.get(name).map(|mean| mean.as_f64().unwrap()));
-    assert_eq!(rows.iter().map(means).collect::<Vec<_>>(), [
-        [Some(49.5), None],
-        [Some(124.5), Some(174.5)],
-        [None, Some(249.5)],
-    ]);
+    assert_eq!(
+        rows.iter().map(means).collect::<Vec<_>>(),
+        [[Some(49.5), None], [Some(124.5), Some(174.5)], [None, Some(249.5)],]
+    );
     assert!(!result.gauges.contains("first") && result.gauges.contains("second"), "{:?}", result.gauges);
 }
 

@@ -2,9 +2,10 @@
 
 use super::*;
 
-/// An agent of this algorithm over other episodes than those that are learnt from, whose first reward is as given.
-fn beside(algorithm: &str, reward: f32, total_steps: u64) -> Agent {
-    let (n, context) = (30, context(total_steps));
+/// An agent of this algorithm, of such batches, over 30 other transitions than those that are learnt from, whose first reward is
+/// as given.
+fn beside(algorithm: &str, batch_size: usize, reward: f32) -> Agent {
+    let (n, context) = (30, context(250));
     let (o, a) = (context.transitions.observation_dim(), context.transitions.action_dim());
     let numbers = |count: usize| (0..count).map(|i| (i as f32).sin() / 2.0).collect::<Vec<_>>();
     let arrays = Arrays {
@@ -17,7 +18,7 @@ fn beside(algorithm: &str, reward: f32, total_steps: u64) -> Agent {
         terminals: vec![false; n],
         timeouts: (1..=n).map(|row| row == n).collect(),
     };
-    let context = Context { transitions: Arc::new(Transitions::of(arrays).unwrap()), batch_size: n, ..context };
+    let context = Context { transitions: Arc::new(Transitions::of(arrays).unwrap()), batch_size, ..context };
     Agent::new(definition(algorithm).unwrap(), &small(algorithm), context).unwrap()
 }
 
@@ -27,7 +28,7 @@ fn held_out_episodes_are_measured_and_not_learnt_from() {
     for algorithm in ["quad", "iql"] {
         let agent = || Agent::new(definition(algorithm).unwrap(), &small(algorithm), context(20)).unwrap();
         let ([mut alone, mut measured], mut held_out) =
-            ([agent(), agent()], HeldOut::of(beside(algorithm, 1.0, 20), 8, 0, 20));
+            ([agent(), agent()], HeldOut::of(beside(algorithm, 8, 1.0), 8, 0, 20));
         let mut before = Vec::new();
         for _ in 0..5 {
             assert_eq!(alone.update(&[0, 1, 2, 3]).unwrap(), measured.update(&[0, 1, 2, 3]).unwrap());
@@ -39,7 +40,7 @@ fn held_out_episodes_are_measured_and_not_learnt_from() {
             let batches = Vec::from_iter((0..4).map(|_| sampler.next_items().to_vec()));
             let mut sums = vec![0.0; values.len()];
             for batch in batches.iter().rev() {
-                let mut fresh = beside(algorithm, 1.0, 20);
+                let mut fresh = beside(algorithm, 8, 1.0);
                 fresh.load(&state).unwrap();
                 let values = fresh.evaluate(batch).unwrap();
                 sums.iter_mut().zip(values).for_each(|(sum, value)| *sum += f64::from(value.unwrap_or_default()));
@@ -57,7 +58,7 @@ fn held_out_episodes_are_measured_and_not_learnt_from() {
 #[test]
 fn an_outlier_in_a_held_out_episode_costs_the_metrics_that_it_is_in() {
     let agent = || Agent::new(definition("iql").unwrap(), &small("iql"), context(250)).unwrap();
-    let held_out = HeldOut::of(beside("iql", 3e19, 250), 30, 0, 250);
+    let held_out = HeldOut::of(beside("iql", 30, 3e19), 30, 0, 250);
     let result = run_agent(agent(), Some(held_out), plan(250, 0), false);
     assert_eq!(result.outcome.unwrap(), Outcome::Completed);
     for (row, step) in result.rows.iter().zip([100, 200, 250]) {
@@ -76,7 +77,7 @@ fn an_outlier_in_a_held_out_episode_costs_the_metrics_that_it_is_in() {
 /// A row has measurements or has none: it does not repeat those of another.
 #[test]
 fn held_out_episodes_are_measured_a_hundred_times_in_a_run_and_at_its_end() {
-    let held_out = |steps| HeldOut::of(beside("iql", 1.0, steps), 8, 0, steps);
+    let held_out = |steps| HeldOut::of(beside("iql", 8, 1.0), 8, 0, steps);
     let due = |steps: u64, rows: &[u64]| -> Vec<u64> {
         let held_out = held_out(steps);
         rows.iter().copied().filter(|step| held_out.is_due(*step, *step == steps)).collect()
