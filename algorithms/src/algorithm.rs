@@ -137,9 +137,9 @@ impl Loss {
         Self { scalars: vec![(name, value.clone())], value }
     }
 
-    /// Also measures this scalar `[]`, or a number `[1]`.
-    pub fn with(mut self, name: &'static str, scalar: Tensor) -> Self {
-        self.scalars.push((name, scalar));
+    /// Also measures this scalar `[]` or `[1]`, if there is one.
+    pub fn with(mut self, name: &'static str, scalar: impl Into<Option<Tensor>>) -> Self {
+        self.scalars.extend(scalar.into().map(|scalar| (name, scalar)));
         self
     }
 }

@@ -180,22 +180,18 @@ impl Cql {
         let (slow, fast) = (adam(*self.config.actor_learning_rate), adam(*self.config.critic_learning_rate));
         let current = self.actor.distribution(&batch.observations)?;
         let next = self.actor.constant_distribution(&batch.next_observations)?;
-
         // The policy, and α so that the entropy is −(dimensions of an action).
         let (actor_loss, log_density) = self.actor_loss(step, batch, &current, noise)?;
         self.actor.descend(&actor_loss.value, slow)?;
         let excess = (log_density - self.context.action_dim() as f64)?;
         self.log_alpha.descend(&(self.log_alpha.network.values().sum_all()? * excess)?.neg()?, slow)?;
 
-        let (mut critic_loss, gap) = self.critic_loss(batch, &current.detach(), &next, noise)?;
+        let (critic_loss, gap) = self.critic_loss(batch, &current.detach(), &next, noise)?;
         let (weight, alpha_prime) = self.weight(&gap.detach(), fast)?;
         let conservative = (gap * weight)?;
         self.critics.descend(&(&critic_loss.value + (conservative * CRITICS as f64)?)?, fast)?;
         self.target_critics.follow(&self.critics.network, *self.config.ema_rate)?;
-        if let Some(alpha_prime) = alpha_prime {
-            critic_loss = critic_loss.with("alpha_prime", alpha_prime);
-        }
-        measured(&[actor_loss, critic_loss])
+        measured(&[actor_loss, critic_loss.with("alpha_prime", alpha_prime)])
     }
 
     /// The policy towards large Q and entropy; and the mean of its log density, `[]`, a constant.

@@ -212,16 +212,14 @@ impl Dtql {
         let trust_loss = denoising_loss(&diffusion, &batch.observations, &actions, &noise.trust)?;
         let q = smaller(&self.critics.network.detach().values(&batch.observations, &actions)?)?;
         let q_loss = q.mean_all()?.neg()?;
-        let loss = ((&trust_loss * f64::from(*self.config.alpha))? + &q_loss)?;
-        let loss = match *self.config.likelihood {
-            0.0 => Loss::new("actor_loss", loss),
-            weight => {
-                let likelihood_loss = likelihood_loss(&distribution, &batch.actions)?;
-                let loss = (loss + (&likelihood_loss * f64::from(weight))?)?;
-                Loss::new("actor_loss", loss).with("likelihood_loss", likelihood_loss)
-            }
-        };
-        Ok(loss.with("trust_loss", trust_loss).with("q_loss", q_loss))
+        let mut loss = ((&trust_loss * f64::from(*self.config.alpha))? + &q_loss)?;
+        let likelihood = (*self.config.likelihood > 0.0).then(|| likelihood_loss(&distribution, &batch.actions));
+        let likelihood = likelihood.transpose()?;
+        if let Some(likelihood) = &likelihood {
+            loss = (loss + (likelihood * f64::from(*self.config.likelihood))?)?;
+        }
+        let loss = Loss::new("actor_loss", loss).with("trust_loss", trust_loss).with("q_loss", q_loss);
+        Ok(loss.with("likelihood_loss", likelihood))
     }
 
     /// The random numbers of update number `step`.

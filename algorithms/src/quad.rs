@@ -183,7 +183,7 @@ impl Update for Quad {
         let critic_gradient_norm = critics.descend_as_set(&critic_loss.value)?;
         target_critics.follow(&critics.network, *self.config.ema_rate)?;
 
-        let ActorLoss { loss: mut actor_loss, noisy, error, guide } = self.actor_loss(networks, batch, noise)?;
+        let ActorLoss { loss: actor_loss, noisy, error, guide } = self.actor_loss(networks, batch, noise)?;
         if let Some(guide) = &guide {
             match &self.nu_squared {
                 Some(nu_squared) => write(nu_squared, &guide.nu_squared)?,
@@ -205,10 +205,8 @@ impl Update for Quad {
             write(&self.eta, &self.ascended_eta((mse(&predicted, epsilon)? - f64::from(*threshold))?)?)?;
         }
 
-        actor_loss = actor_loss.with("eta", self.eta.clone()).with("actor_gradient_norm", actor_gradient_norm);
-        if let Some(nu_squared) = &self.nu_squared {
-            actor_loss = actor_loss.with("nu_squared", nu_squared.clone());
-        }
+        let actor_loss = actor_loss.with("eta", self.eta.clone()).with("nu_squared", self.nu_squared.clone());
+        let actor_loss = actor_loss.with("actor_gradient_norm", actor_gradient_norm);
         let losses = [critic_loss.with("critic_gradient_norm", critic_gradient_norm), actor_loss];
         Computed::new(&losses, &lambda::needed(guide.as_ref(), &error))
     }
