@@ -28,7 +28,7 @@ fn many_that_come_and_go_are_told_in_one_line_and_bounded() {
 /// A run that is trained waits for an evaluator which is at a long job of another run, and not for one that can do nothing here.
 #[test]
 fn an_evaluator_may_do_the_work_until_it_asks_for_other_work() {
-    let (metrics, _) = Metrics::new(&Name::new("run").unwrap(), 1, &[], false).unwrap();
+    let (metrics, _) = Metrics::new(&Name::new("run").unwrap(), 1, &[]).unwrap();
     let mut evaluators = Evaluators::new(metrics.evaluators, Instant::now());
     let fits = |evaluators: &Evaluators| evaluators.present().map(|(_, fits, _)| fits).collect::<Vec<_>>();
     evaluators.asks(&name(1), true);
