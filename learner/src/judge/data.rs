@@ -71,7 +71,7 @@ impl Data {
             environment: environment::find(&first.config.experiment.environment).ok(),
             task: ogbench::maze_task(&first.config.experiment.environment),
             reward: RewardRule::AsIs,
-            scale: Scale { actions: true, states: true },
+            scale: Scale { actions: true, states: true, rewards: false },
         };
         let split = Transitions::read_split(&dataset.path, &options, hold_out);
         let split = split.hint_of(DatasetError::hint)?;
