@@ -147,7 +147,7 @@ impl Transitions {
         let rewards = reward.scaling(&recording.trajectory_returns()).ok_or(Problem::SameReturns)?;
         let scaling = scale.of(&recording, rewards);
         let held_out = held_out.map(|held_out| Self::new(held_out, environment, rewards, scaling.clone()));
-        let doubts = doubts::doubts(&recording, scale, rewards);
+        let doubts = doubts::doubts(&recording, scale, reward);
         let training = Self { doubts, ..Self::new(recording, environment, rewards, scaling) };
         Ok(Split { training, held_out: held_out.filter(|held_out| !held_out.rows.is_empty()), episodes })
     }

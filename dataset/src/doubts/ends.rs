@@ -72,7 +72,7 @@ fn time_limit(recording: &Recording) -> Option<String> {
     let longest = lengths.iter().copied().max().filter(|longest| *longest >= SHORTEST_LIMIT)?;
     let at = lengths.iter().filter(|length| **length == longest).count();
     // Without a limit, there are more that are a little shorter.
-    let below = lengths.iter().filter(|length| (longest - longest / 5..longest).contains(*length)).count();
+    let below = lengths.iter().filter(|length| (longest - longest / 10..longest).contains(*length)).count();
     let is_limit = at >= FEWEST_AT_LIMIT && at * SHARE_AT_LIMIT >= lengths.len() && at > 2 * below;
     is_limit.then(|| {
         format!(

@@ -14,14 +14,14 @@ mod rewards;
 mod sizes;
 
 use crate::recording::{Recording, RowKind};
-use crate::reward::RewardScaling;
+use crate::reward::RewardRule;
 use crate::scale::Scale;
 
 /// Rows that tell enough of a recording: so many of them, evenly spread.
 const ENOUGH: usize = 20_000;
 
-/// One sentence for each doubt. `scale` is what of it is scaled, `rule` what rewards are learnt from.
-pub(crate) fn doubts(recording: &Recording, scale: Scale, rule: RewardScaling) -> Vec<String> {
+/// One sentence for each doubt. `scale` is what of it is scaled, `rule` what becomes of rewards.
+pub(crate) fn doubts(recording: &Recording, scale: Scale, rule: RewardRule) -> Vec<String> {
     let mut doubts = of_ends(recording);
     doubts.extend(of_numbers(recording, scale, rule));
     doubts
@@ -36,14 +36,16 @@ pub(crate) fn of_ends(recording: &Recording) -> Vec<String> {
 }
 
 /// Doubts about the numbers of rows.
-pub(crate) fn of_numbers(recording: &Recording, scale: Scale, rule: RewardScaling) -> Vec<String> {
+pub(crate) fn of_numbers(recording: &Recording, scale: Scale, rule: RewardRule) -> Vec<String> {
     let copied = copied::actions(recording);
     let rest = rest::observations(recording);
     let late = if copied.is_some() || rest.is_some() { None } else { late::observations(recording) };
     let mut doubts = Vec::from_iter(rewards::alike(recording));
     if doubts.is_empty() {
         doubts.extend(rewards::after_goal(recording));
-        doubts.extend(if scale.rewards { None } else { rewards::size(recording, rule) });
+        // Whoever chose another rule has seen to it.
+        let is_own = rule == RewardRule::AsIs && !scale.rewards;
+        doubts.extend(if is_own { rewards::size(recording) } else { None });
     }
     doubts.extend(copied.into_iter().chain(rest).chain(late));
     doubts.extend(sizes::columns(recording, scale));

@@ -31,8 +31,8 @@ pub(crate) fn out_of_step(recording: &Recording) -> Vec<String> {
     let longest = (CANDIDATES * ends.len()).min(lengths.len() / STEPS_BETWEEN_RESETS);
     let limit = *lengths.clone().select_nth_unstable_by(lengths.len() - 1 - longest, f64::total_cmp).1;
     let (timeouts, terminals): (Vec<usize>, _) = ends.iter().partition(|&&row| recording.timeouts[row]);
-    let judged =
-        [(recording.terminal_array, terminals), ("timeouts", timeouts)].map(|(name, flags)| judge(name, &flags, &lengths, limit));
+    let judged = [(recording.terminal_array, terminals), ("timeouts", timeouts)]
+        .map(|(name, flags)| judge(name, &flags, &lengths, limit));
     judged.into_iter().flatten().collect()
 }
 

@@ -17,7 +17,8 @@ pub(super) fn observations(recording: &Recording) -> Option<String> {
     let acting: Vec<usize> = (0..recording.rows()).filter(acts).collect();
     let at_rest = |next: &dyn Fn(usize) -> bool| {
         let count = acting.iter().filter(|row| next(**row)).count();
-        (acting.len() >= FEWEST && count as f64 > MOST_AT_REST * acting.len() as f64).then(|| percent(count, acting.len()))
+        (acting.len() >= FEWEST && count as f64 > MOST_AT_REST * acting.len() as f64)
+            .then(|| percent(count, acting.len()))
     };
     if let Some(share) = at_rest(&|row| recording.observation(row + 1) == recording.observation(row)) {
         return Some(format!(

@@ -33,7 +33,6 @@ pub(super) fn findings(source: &Source, recording: &Recording, environment: Opti
     let outside = checks::actions_outside(recording);
     findings.extend(outside.map(|problem| format!("{problem}; `learner train --scale actions` trains on it")));
     let rule = environment.map_or(RewardRule::AsIs, |environment| environment.reward);
-    let rule = rule.scaling(&recording.trajectory_returns()).unwrap_or_default();
     findings.extend(doubts::of_numbers(recording, Scale::default(), rule));
     findings
 }

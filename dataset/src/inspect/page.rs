@@ -23,7 +23,11 @@ impl fmt::Display for Inspection {
         writeln!(f, "  observations  {} numbers{of_observations}", self.observation_dim)?;
         let of_actions = constant(&self.constant_actions, &self.action_names);
         writeln!(f, "  actions       {} numbers{of_actions}", self.action_dim)?;
-        writeln!(f, "  rewards       of size {:.4} (root mean square); methods are made for about 1", self.reward_size)?;
+        writeln!(
+            f,
+            "  rewards       of size {:.4} (root mean square); methods are made for about 1",
+            self.reward_size
+        )?;
 
         let wide = self.action_names.iter().map(|name| name.chars().count() + 1).fold(14, usize::max);
         writeln!(f, "\n  {:<wide$}{:>12}{:>12}{:>12}", "", "min", "mean", "max")?;

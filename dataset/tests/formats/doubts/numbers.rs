@@ -29,7 +29,10 @@ fn observations_too_large_or_too_small_to_train_on_as_they_are() {
     let doubts = cart.doubts(true);
     let [large, small] = &doubts[..] else { panic!("{doubts:?}") };
     assert!(large.starts_with("array `observations`: far from ±1 in column 1, of size 999980, which"), "{large}");
-    assert!(small.starts_with("array `observations`: hardly changes in column 2, by a standard deviation of"), "{small}");
+    assert!(
+        small.starts_with("array `observations`: hardly changes in column 2, by a standard deviation of"),
+        "{small}"
+    );
     assert!(large.contains("--scale states") && small.contains("--scale states"), "{doubts:?}");
     assert_eq!(scaled(&cart, Scale { states: true, ..Scale::default() }), [""; 0]);
     cart.observe(|row| (row[1], row[2]) = (1e-6 * (row[1] - 1e6), 0.0));
@@ -96,7 +99,8 @@ fn an_array_that_was_rounded_is_in_step_with_the_other() {
     let half = |x: &f32| f32::from_bits((x.to_bits() + 0x1000) & !0x1fff);
     let decimals = |x: &f32| (x * 1e3).round() / 1e3;
     for (round, own) in [(half as fn(&f32) -> f32, false), (half, true), (decimals, false), (decimals, true)] {
-        let rounded = Cart { next_observations: cart.next_observations.iter().map(round).collect(), ..Cart::new(false) };
+        let rounded =
+            Cart { next_observations: cart.next_observations.iter().map(round).collect(), ..Cart::new(false) };
         let folder = tempdir().unwrap();
         let path = folder.path().join("cart.hdf5");
         rounded.write(&path, own);

@@ -30,7 +30,7 @@ fn observations_that_rest_while_actions_change() {
     for own in [false, true] {
         let chunks = moved(&mass(60, 0.1), |row, number| row - number % 10);
         let doubt = chunks.doubt(own);
-        assert!(doubt.starts_with("array `observations`: does not change in 8"), "{doubt}");
+        assert!(doubt.starts_with("array `observations`: does not change in 90."), "{doubt}");
         assert!(doubt.contains("a chunk's start"), "{doubt}");
         let pairs = moved(&mass(60, 0.1), |row, number| row - number % 2);
         assert!(pairs.doubt(own).starts_with("array `observations`: does not change in"));
@@ -46,7 +46,11 @@ fn next_observations_that_are_the_rows_own() {
     let mut cart = mass(60, 0.1);
     cart.next_observations = cart.observations.clone();
     let doubts = cart.doubts_of_inspect();
-    assert!(doubts.iter().any(|doubt| doubt.starts_with("array `next_observations`: is the observation of its own row in 100 %")));
+    assert!(
+        doubts
+            .iter()
+            .any(|doubt| doubt.starts_with("array `next_observations`: is the observation of its own row in 100 %"))
+    );
 }
 
 #[test]
@@ -58,7 +62,8 @@ fn actions_that_are_the_state() {
             action.copy_from_slice(&[unit * observation[1], unit * observation[0]]);
         }
         let doubts = cart.doubts_of_inspect_in(own);
-        let expected = "array `actions`: columns 0, 1 copied from columns 1, 0 of the same row's observation (in 100.0 %";
+        let expected =
+            "array `actions`: columns 0, 1 copied from columns 1, 0 of the same row's observation (in 100.0 %";
         assert!(doubts.iter().any(|doubt| doubt.starts_with(expected)), "{doubts:?}");
     }
     // The state of the next row is a command like others.
