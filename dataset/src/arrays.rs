@@ -10,6 +10,7 @@ use crate::error::{DatasetError, Problem};
 use crate::formats::{ACTION_NAMES, OBSERVATION_NAMES, OWN_LAYOUT};
 use crate::new_file::{Column, NewFile};
 use crate::recording::{Recording, RowKind};
+use crate::rounding::Rounding;
 
 /// What a source calls the numbers of its rows. An empty list where they have no names.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
@@ -62,6 +63,7 @@ impl Arrays {
         }
         let ends = self.terminals.iter().zip(&self.timeouts).map(|(terminal, timeout)| *terminal || *timeout);
         Ok(Recording {
+            rounding: Rounding::between(&self.observations, &self.next_observations),
             observation_dim: o,
             action_dim: a,
             kinds: vec![RowKind::Transition; rows],
@@ -71,6 +73,7 @@ impl Arrays {
             rewards: self.rewards,
             next_observations: Some(self.next_observations),
             terminals: self.terminals,
+            terminal_array: "terminals",
             timeouts: self.timeouts,
             ..Recording::default()
         })

@@ -170,7 +170,10 @@ impl Problem {
             }
             Self::Missing { .. } => "docs/data.md says which arrays each kind of file must have",
             Self::Numbers { .. } => "all arrays need the same number of rows, which is that of `rewards`",
-            Self::Type { .. } | Self::Axes { .. } | Self::Shape { .. } | Self::NotBoolean { .. } => {
+            Self::NotBoolean { .. } => {
+                "a flag is 0 or 1: of a discount, write 1 where it is 0, and else 0 (docs/data.md says what each flag means)"
+            }
+            Self::Type { .. } | Self::Axes { .. } | Self::Shape { .. } => {
                 "docs/data.md says which shape and type each array must have; all arrays need the same number of rows"
             }
             Self::Episodes { .. } => "the dataset is incomplete: fetch it again",

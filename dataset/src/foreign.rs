@@ -71,10 +71,16 @@ pub(crate) fn of_folder(folder: &Path) -> Problem {
     }
 }
 
-/// What an HDF5 file is that has another layout, by what its group `data` holds.
-pub(crate) fn of_group(members: &[String]) -> Option<Problem> {
-    let demonstrations = members.iter().any(|name| name.starts_with("demo_"));
-    demonstrations.then(|| foreign("a robomimic file", "quad-convert FILE --observations KEY …"))
+/// What an HDF5 file is that has another layout, by what its group `data` holds, and what `within` says that a group there holds.
+pub(crate) fn of_group(members: &[String], within: impl Fn(&str) -> Vec<String>) -> Option<Problem> {
+    let demonstration = members.iter().find(|name| name.starts_with("demo_"))?;
+    Some(match within(demonstration).iter().any(|name| name == "rewards") {
+        true => foreign("a robomimic file", "quad-convert FILE --observations KEY …"),
+        false => foreign(
+            "a file in robomimic's layout without rewards, as Isaac Lab's recorder writes it",
+            "quad-convert FILE --observations KEY … --reward success-at-end --success all",
+        ),
+    })
 }
 
 /// What a zip archive of these files is, if none of them is a NumPy array.

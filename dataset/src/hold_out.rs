@@ -92,9 +92,10 @@ impl Recording {
 
     /// No rows, of the same sizes.
     fn like(&self) -> Recording {
-        let Recording { observation_dim, action_dim, goal, .. } = *self;
+        let Recording { observation_dim, action_dim, goal, rounding, terminal_array, .. } = *self;
         let (names, next_observations) = (self.names.clone(), self.next_observations.as_ref().map(|_| Vec::new()));
-        Recording { observation_dim, action_dim, goal, names, next_observations, ..Recording::default() }
+        let sizes = Recording { observation_dim, action_dim, goal, rounding, terminal_array, ..Recording::default() };
+        Recording { names, next_observations, ..sizes }
     }
 
     fn extend(&mut self, from: &Recording, rows: Range<usize>) {

@@ -6,7 +6,7 @@
 //! simulate it; `task` is one that may be unknown. `hdf5_file` and `npz_file` read one `array` of a file and check everything
 //! about its form; `foreign` names what is not read here. `formats` has a file for each format, which turns arrays into a
 //! `recording`. `transitions` are what is learnt from, unless `checks` has objections, with `reward`, `scale` and `statistics`
-//! beside it; `doubts` and `resets` are what makes learning from them doubtful; `sampler` draws mini-batches; `inspect`
+//! beside it; `doubts` are what makes learning from them doubtful, `rounding` what does not; `sampler` draws mini-batches; `inspect`
 //! describes a source to people, whatever is wrong with it. `recorded` is a D4RL file as it was recorded, row by row; `writer`
 //! writes such a file, and `arrays` one of the custom layout, both by `new_file`. [`catalogue`] lists the files that can be
 //! asked for by name, [`ogbench`] what OGBench's names mean; `error` is what can go wrong with any of them.
@@ -32,8 +32,8 @@ mod npz_file;
 pub mod ogbench;
 mod recorded;
 mod recording;
-mod resets;
 mod reward;
+mod rounding;
 mod sampler;
 mod scale;
 mod simulated;

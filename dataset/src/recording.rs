@@ -1,6 +1,7 @@
 //! What every format is read into: rows as they were recorded, not judged yet.
 
 use crate::arrays::Names;
+use crate::rounding::Rounding;
 use crate::statistics::{Episode, returns};
 
 /// Two rows whose observations differ by more than this do not follow one another.
@@ -34,10 +35,14 @@ pub(crate) struct Recording {
     pub next_observations: Option<Vec<f32>>,
     /// N × o, where a D4RL file stores them although the following row's observation is the next one.
     pub unused_next_observations: Option<Vec<f32>>,
+    /// What was done to observations and not to the next ones that are stored, or the other way round.
+    pub rounding: Rounding,
     /// N.
     pub kinds: Vec<RowKind>,
     /// Whether a row is terminal, so that its mask is 0 and the critics do not bootstrap; N.
     pub terminals: Vec<bool>,
+    /// The array, or those of its parts, that says so.
+    pub terminal_array: &'static str,
     /// Whether the episode was cut off after a row; N.
     pub timeouts: Vec<bool>,
     /// Whether a row is the last step of its episode; N.
@@ -57,6 +62,10 @@ impl Recording {
 
     pub(crate) fn observation(&self, row: usize) -> &[f32] {
         &self.observations[row * self.observation_dim..(row + 1) * self.observation_dim]
+    }
+
+    pub(crate) fn action(&self, row: usize) -> &[f32] {
+        &self.actions[row * self.action_dim..(row + 1) * self.action_dim]
     }
 
     /// Numbers of the rows to learn from, in order.
@@ -119,13 +128,13 @@ impl Recording {
 
     /// Whether `following`, the next row to learn from after `row`, continues where that one led to.
     fn continues(&self, row: usize, following: usize) -> bool {
-        following == row + 1 || !differ(self.observation(following), self.observation(row + 1))
+        following == row + 1 || !differ(self.observation(following), self.observation(row + 1), Rounding::default())
     }
 
     /// Whether a row's stored next observation is not where the following row starts.
     pub(crate) fn jumps(&self, next_observations: &[f32], row: usize) -> bool {
         let next = &next_observations[row * self.observation_dim..(row + 1) * self.observation_dim];
-        row + 1 < self.rows() && differ(next, self.observation(row + 1))
+        row + 1 < self.rows() && differ(next, self.observation(row + 1), self.rounding)
     }
 
     /// The name of the array that holds row `row` of a column, and the row's number there.
@@ -138,8 +147,9 @@ impl Recording {
 }
 
 /// Whether two observations are more than rounding apart.
-fn differ(a: &[f32], b: &[f32]) -> bool {
-    a.iter().zip(b).map(|(a, b)| f64::from(a - b).powi(2)).sum::<f64>().sqrt() > SAME_OBSERVATION
+fn differ(a: &[f32], b: &[f32], rounding: Rounding) -> bool {
+    let apart = a.iter().zip(b).filter(|(a, b)| !rounding.explains(**a, **b));
+    apart.map(|(a, b)| f64::from(a - b).powi(2)).sum::<f64>().sqrt() > SAME_OBSERVATION
 }
 
 #[cfg(test)]

@@ -2,6 +2,8 @@
 
 use serde::{Deserialize, Serialize};
 
+use crate::recording::Recording;
+
 /// What happens to the rewards of a file. Statistics and scores are always of the rewards as they were recorded.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 pub enum RewardRule {
@@ -33,7 +35,21 @@ pub(crate) struct RewardScaling {
     times: f64,
 }
 
+impl Default for RewardScaling {
+    fn default() -> Self {
+        Self { subtract: 0.0, times: 1.0 }
+    }
+}
+
 impl RewardScaling {
+    /// The root mean square of what is learnt from.
+    pub(crate) fn size(self, recording: &Recording) -> f64 {
+        let squares = recording.transitions().map(|row| f64::from(self.apply(recording.rewards[row as usize])).powi(2));
+        let (count, sum) =
+            squares.filter(|x| x.is_finite()).fold((0.0, 0.0), |(count, sum), square| (count + 1.0, sum + square));
+        if count > 0.0 { f64::sqrt(sum / count) } else { 0.0 }
+    }
+
     pub(crate) fn apply(self, reward: f32) -> f32 {
         ((f64::from(reward) - self.subtract) * self.times) as f32
     }
@@ -51,7 +67,7 @@ impl RewardRule {
                 }
                 (0.0, 1000.0 / (max - min))
             }
-            Self::AsIs => (0.0, 1.0),
+            Self::AsIs => return Some(RewardScaling::default()),
             Self::Subtract1 => (1.0, 1.0),
             Self::CentreTimes4 => (0.5, 4.0),
             Self::CentreTimes10 => (0.5, 10.0),

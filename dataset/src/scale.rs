@@ -1,9 +1,10 @@
-//! What networks see of observations and actions: a recording's own numbers, or these scaled by what the data holds.
+//! What networks see of observations, actions and rewards: a recording's own numbers, or these scaled by what the data holds.
 
 use quad_kernels::scaling::{Affine, Scaling};
 use serde::{Deserialize, Serialize};
 
 use crate::recording::{Recording, RowKind};
+use crate::reward::RewardScaling;
 
 /// What is scaled before training; a file has it as a list of [`Scaled`], in any order.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
@@ -13,6 +14,8 @@ pub struct Scale {
     pub actions: bool,
     /// Each number of an observation, so that those of the data have mean 0 and standard deviation 1.
     pub states: bool,
+    /// Rewards, so that the mean of their squares is 1 after the reward rule.
+    pub rewards: bool,
 }
 
 /// What can be scaled, by its name.
@@ -23,17 +26,20 @@ pub enum Scaled {
     Actions,
     /// Observations.
     States,
+    /// Rewards.
+    Rewards,
 }
 
 impl From<Vec<Scaled>> for Scale {
     fn from(names: Vec<Scaled>) -> Self {
-        Self { actions: names.contains(&Scaled::Actions), states: names.contains(&Scaled::States) }
+        let has = |name| names.contains(&name);
+        Self { actions: has(Scaled::Actions), states: has(Scaled::States), rewards: has(Scaled::Rewards) }
     }
 }
 
 impl From<Scale> for Vec<Scaled> {
-    fn from(Scale { actions, states }: Scale) -> Self {
-        [(actions, Scaled::Actions), (states, Scaled::States)]
+    fn from(Scale { actions, states, rewards }: Scale) -> Self {
+        [(actions, Scaled::Actions), (states, Scaled::States), (rewards, Scaled::Rewards)]
             .into_iter()
             .filter_map(|(is, name)| is.then_some(name))
             .collect()
@@ -42,14 +48,16 @@ impl From<Scale> for Vec<Scaled> {
 
 impl Scale {
     /// The maps for a recording whose numbers are finite. Observations count where a transition begins, actions wherever one
-    /// was taken.
-    pub(crate) fn of(self, recording: &Recording) -> Scaling {
+    /// was taken, rewards where there is a transition.
+    pub(crate) fn of(self, recording: &Recording, rule: RewardScaling) -> Scaling {
         let Recording { observation_dim, action_dim, observations, actions, kinds, .. } = recording;
         let is_transition = |row: usize| kinds[row] == RowKind::Transition;
         let is_step = |row: usize| kinds[row] != RowKind::LastState;
         Scaling {
             observations: self.states.then(|| affine(observations, *observation_dim, is_transition, standard)),
             actions: self.actions.then(|| affine(actions, *action_dim, is_step, unit_range)),
+            // Rewards that are all 0 have no size.
+            rewards: self.rewards.then(|| rule.size(recording) as f32).filter(|size| *size > 0.0),
         }
     }
 }
@@ -76,8 +84,8 @@ fn affine(values: &[f32], width: usize, counts: impl Fn(usize) -> bool, of: fn(&
         let values = values.iter().skip(column).step_by(width).enumerate();
         let values: Vec<f64> = values.filter(|(row, _)| counts(*row)).map(|(_, value)| f64::from(*value)).collect();
         let (offset, scale) = of(&values);
-        // 0 where all are the same, or differ by less than a float32 can say.
-        (offset as f32, if scale as f32 > 0.0 { scale as f32 } else { 1.0 })
+        // The scale is 0 where all are the same, or differ by less than a float32 can say.
+        (offset as f32, scale as f32)
     };
     let (offset, scale) = (0..width).map(column).unzip();
     Affine { offset, scale }

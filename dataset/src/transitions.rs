@@ -15,7 +15,7 @@ use crate::recording::Recording;
 use crate::reward::{RewardRule, RewardScaling};
 use crate::scale::{self, Scale};
 use crate::statistics::Statistics;
-use crate::{checks, doubts, resets};
+use crate::{checks, doubts};
 
 /// Actions are kept this far within ±1, where policies that squash can still reach them.
 const ACTION_LIMIT: f32 = 1.0 - 1e-5;
@@ -127,8 +127,7 @@ impl Transitions {
         let error = |problem| DatasetError::new("arrays in memory", problem);
         let recording = arrays.into_recording().map_err(error)?;
         let options = ReadOptions { environment: None, task: None, reward: RewardRule::AsIs, scale: Scale::default() };
-        let split = Self::split(recording, &options, HoldOut::NONE).map_err(error)?;
-        Ok(split.training)
+        Ok(Self::split(recording, &options, HoldOut::NONE).map_err(error)?.training)
     }
 
     fn split(recording: Recording, options: &ReadOptions, hold_out: HoldOut<'_>) -> Result<Split, Problem> {
@@ -146,9 +145,10 @@ impl Transitions {
             }
         };
         let rewards = reward.scaling(&recording.trajectory_returns()).ok_or(Problem::SameReturns)?;
-        let scaling = scale.of(&recording);
+        let scaling = scale.of(&recording, rewards);
         let held_out = held_out.map(|held_out| Self::new(held_out, environment, rewards, scaling.clone()));
-        let training = Self::new(recording, environment, rewards, scaling);
+        let doubts = doubts::doubts(&recording, scale, reward);
+        let training = Self { doubts, ..Self::new(recording, environment, rewards, scaling) };
         Ok(Split { training, held_out: held_out.filter(|held_out| !held_out.rows.is_empty()), episodes })
     }
 
@@ -162,12 +162,10 @@ impl Transitions {
         let statistics = Statistics::new(environment, rows.len(), &recording.episodes());
         let goes_on = (0..recording.rows()).map(|row| recording.goes_on(row)).collect();
         let past_goal = recording.past_goal();
-        let mut doubts = doubts::doubts(&recording, scaling.observations.is_some());
-        doubts.extend(resets::out_of_step(&recording));
         scale::apply(&scaling, &mut recording);
         let Recording { observation_dim, action_dim, observations, mut actions, mut rewards, .. } = recording;
         actions.iter_mut().for_each(|action| *action = action.clamp(-ACTION_LIMIT, ACTION_LIMIT));
-        rewards.iter_mut().for_each(|reward| *reward = of_rewards.apply(*reward));
+        rewards.iter_mut().for_each(|reward| *reward = of_rewards.apply(*reward) / scaling.rewards.unwrap_or(1.0));
         Self {
             observation_dim,
             action_dim,
@@ -180,7 +178,7 @@ impl Transitions {
             goes_on,
             past_goal,
             statistics,
-            doubts,
+            doubts: Vec::new(),
             scaling,
             names: recording.names,
         }
@@ -202,7 +200,7 @@ impl Transitions {
         self.action_dim
     }
 
-    /// How the observations and actions here, which are the networks', follow from those of the recording.
+    /// How the numbers here, which are the networks', follow from those of the recording; rewards after the reward rule.
     pub fn scaling(&self) -> &Scaling {
         &self.scaling
     }
@@ -213,12 +211,13 @@ impl Transitions {
     }
 
     /// Units in which the observations and actions that are learnt from have mean 0 and standard deviation 1, number by number;
-    /// one that never changes keeps its size.
+    /// one that never changes has scale 0.
     pub fn standard_units(&self) -> Scaling {
         let counts = |row: usize| self.rows.binary_search(&(row as u32)).is_ok();
         Scaling {
             observations: Some(scale::standard_units(&self.observations, self.observation_dim, counts)),
             actions: Some(scale::standard_units(&self.actions, self.action_dim, counts)),
+            rewards: None,
         }
     }
 

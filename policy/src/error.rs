@@ -33,7 +33,9 @@ pub enum PolicyError {
         value: usize,
     },
     /// A map to the user's units that does not fit the policy.
-    #[error("the scaling of {what} in the file is not {columns} finite offsets and as many finite scales above 0")]
+    #[error(
+        "the scaling of {what} in the file is not {columns} finite offsets and as many finite scales, none below 0"
+    )]
     Scaling {
         /// Observations or actions.
         what: &'static str,

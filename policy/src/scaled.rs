@@ -118,6 +118,7 @@ mod tests {
         Scaling {
             observations: affine(&[100.0, -3.0, 0.5, 0.0], &[8.0, 0.5, 1.0, 4.0]),
             actions: affine(&[30.0, -1.0], &[16.0, 0.25]),
+            rewards: None,
         }
     }
 
@@ -163,12 +164,33 @@ mod tests {
     }
 
     #[test]
+    fn a_number_that_never_changed_is_given_exactly_and_not_seen() {
+        let observations = affine(&[100.0, -3.0, 0.1, 0.0], &[8.0, 0.5, 0.0, 4.0]);
+        let constant = Scaling { observations, actions: affine(&[30.0, 0.1], &[16.0, 0.0]), rewards: Some(200.0) };
+        let [plain, scaled] = pair(constant).map(Result::unwrap);
+        let begin = || [plain.begin(4)];
+        let mut acted = [vec![0.0; 2], vec![0.0; 2]];
+        for (third, actions) in [0.1, 90.0].into_iter().zip(&mut acted) {
+            scaled.act(&[108.0, -2.5, third, -4.0], &mut begin(), actions).unwrap();
+        }
+        assert_eq!(acted[0], acted[1]);
+        assert_eq!(acted[0][1], 0.1);
+        let sampled = scaled.sample(&[108.0, -2.5, 0.1, -4.0], &mut begin()).unwrap();
+        assert!(sampled.actions.chunks_exact(2).all(|action| action[1] == 0.1));
+        let mut ours = vec![0.0; 2];
+        plain.act(&[1.0, 1.0, 0.0, -1.0], &mut begin(), &mut ours).unwrap();
+        assert!((acted[0][0] - (30.0 + 16.0 * ours[0])).abs() < 1e-5 && ours[1] != 0.0, "{acted:?} {ours:?}");
+        let value = scaled.value(&[108.0, -2.5, 0.1, -4.0], &[38.0, 0.1]).unwrap();
+        assert_eq!(value, plain.value(&[1.0, 1.0, 0.0, -1.0], &[0.5, 0.0]).unwrap());
+    }
+
+    #[test]
     fn a_map_that_does_not_fit_is_refused() {
         let good = scaling();
         let refused = |scaling| matches!(&pair(scaling)[1], Err(PolicyError::Scaling { .. }));
         assert!(!refused(good.clone()) && !refused(Scaling { observations: None, ..good.clone() }));
         assert!(refused(Scaling { observations: affine(&[0.0; 3], &[1.0; 3]), ..good.clone() }));
-        assert!(refused(Scaling { actions: affine(&[0.0; 2], &[1.0, 0.0]), ..good.clone() }));
+        assert!(refused(Scaling { actions: affine(&[0.0; 2], &[1.0, -1.0]), ..good.clone() }));
         assert!(refused(Scaling { actions: affine(&[0.0; 2], &[1.0]), ..good }));
     }
 

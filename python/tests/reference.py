@@ -113,7 +113,8 @@ class Reference:
         return q.mean(0) if (reduce or self.choice["value"]) == "mean" else q.min(0)
 
     def to_network(self, name, x):
-        return (x - self.maps[name]["offset"]) / self.maps[name]["scale"]
+        scale = self.maps[name]["scale"]
+        return (x - self.maps[name]["offset"]) / np.where(scale == 0, np.inf, scale)
 
     def to_user(self, actions):
         return self.maps["actions"]["offset"] + self.maps["actions"]["scale"] * actions

@@ -8,7 +8,7 @@ import numpy as np
 import onnx
 import onnxruntime
 import pytest
-from conftest import OBSERVATION, train
+from conftest import OBSERVATION, arrays, train
 
 import quad_rl
 from quad_rl import Policy, export_onnx
@@ -144,6 +144,25 @@ def test_plans_of_all_kinds(data, flags, tmp_path):
     given = [part for flag in flags for part in ("--agent", flag)]
     run = train(tmp_path / "run", data, *OWN, "--algorithm", "diffuser", "--scale", "states,actions", *given, layers=False)
     compare(Policy.load(run), tmp_path / "policy.onnx")
+
+
+@pytest.mark.parametrize("algorithm", ["iql", "quad", "diffuser"])
+def test_numbers_that_never_change_are_exact_and_not_seen(algorithm, tmp_path):
+    given = arrays()
+    given["observations"][:, 4], given["actions"][:, 1] = 90.0, 0.1
+    quad_rl.Dataset.from_arrays(**given).save(tmp_path / "data.hdf5")
+    units = ["--scale", "states,actions,rewards"]
+    policy = Policy.load(train(tmp_path / "run", tmp_path / "data.hdf5", *OWN, "--algorithm", algorithm, *units, layers=False))
+    compare(policy, tmp_path / "policy.onnx")
+    session, states = onnxruntime.InferenceSession(tmp_path / "policy.onnx"), batches()[2]
+    drawn = policy.noise(len(states), seed=1)
+    for other in (90.0, 0.0):
+        states[:, 4] = other
+        actions = session.run(["actions"], {"observations": states, **drawn})[0]
+        assert (actions[:, 1] == np.float32(0.1)).all() and (policy.act(states, seed=1)[:, 1] == np.float32(0.1)).all()
+        first = actions if other else first
+        assert np.array_equal(actions, first)
+    assert policy.about["scaling"]["rewards"] > 0
 
 
 def test_the_page_s_example_runs(snapshots, tmp_path, monkeypatch):

@@ -4,6 +4,7 @@ use crate::environment::EnvironmentSpec;
 use crate::error::Problem;
 use crate::hdf5_file::Hdf5File;
 use crate::recording::{Recording, RowKind};
+use crate::rounding::Rounding;
 
 /// Reads `observations`, `actions`, `rewards`, `terminals` and, if there, `timeouts` by the rules of D4RL's
 /// `qlearning_dataset`: the next observation is the following row's, whatever the file stores; timeouts and the last row
@@ -29,19 +30,23 @@ pub(super) fn read(file: &Hdf5File, environment: Option<&EnvironmentSpec>) -> Re
         true => RowKind::Dropped,
         false => RowKind::Transition,
     };
+    let unused_next_observations = match file.has("next_observations") {
+        true => Some(file.table("next_observations", rows, observations.width)?),
+        false => None,
+    };
+    let stored: Option<&Vec<f32>> = unused_next_observations.as_ref();
     Ok(Recording {
+        rounding: stored.map(|stored| Rounding::between(&observations.values, stored)).unwrap_or_default(),
         observation_dim: observations.width,
         action_dim: actions.width,
         observations: observations.values,
         actions: actions.values,
         rewards: file.table("rewards", rows, 1)?,
-        unused_next_observations: match file.has("next_observations") {
-            true => Some(file.table("next_observations", rows, observations.width)?),
-            false => None,
-        },
+        unused_next_observations,
         kinds: timeouts.iter().enumerate().map(kind).collect(),
         ends: ends.collect(),
         terminals,
+        terminal_array: "terminals",
         timeouts,
         goal,
         ..Recording::default()

@@ -69,7 +69,7 @@ impl Metadata {
 /// Reads all episodes. Every step is a transition, to the observation that its episode has for the following one; a mask
 /// is 0 where `terminations` is 1. An observation that is a Dict or a Tuple becomes a row by [`parts`].
 pub(super) fn read(file: &Hdf5File, metadata: &Metadata) -> Result<Recording, Problem> {
-    let mut recording = Recording::default();
+    let mut recording = Recording { terminal_array: "terminations", ..Recording::default() };
     let episodes = episodes(file);
     if let Some(expected) = metadata.total_episodes.filter(|&expected| expected != episodes) {
         return Err(Problem::Episodes { found: episodes, expected });

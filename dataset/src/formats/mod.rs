@@ -61,7 +61,8 @@ impl Source {
             Some(found) => return Err(DatasetError::new(file.path(), Problem::UnknownLayout { found })),
             None => {}
         }
-        if let Some(problem) = file.members("data").and_then(|members| foreign::of_group(&members)) {
+        let within = |group: &str| file.members(&format!("data/{group}")).unwrap_or_default();
+        if let Some(problem) = file.members("data").and_then(|members| foreign::of_group(&members, within)) {
             return Err(DatasetError::new(file.path(), problem));
         }
         let is_minari = file.path().ends_with(minari::DATA_FILE) || file.has("episode_0");

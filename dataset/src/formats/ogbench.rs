@@ -4,6 +4,7 @@ use crate::error::Problem;
 use crate::npz_file::NpzFile;
 use crate::ogbench::MazeTask;
 use crate::recording::{Recording, RowKind};
+use crate::rounding::Rounding;
 
 /// Reads `observations`, `actions`, `terminals`, `rewards` unless they follow from a `task`, and, if there, `masks`.
 ///
@@ -36,7 +37,9 @@ pub(super) fn read(file: &mut NpzFile, task: Option<MazeTask>) -> Result<Recordi
     };
     let ends: Vec<bool> = (0..rows).map(is_last).collect();
     let kind = |&last: &bool| if last { RowKind::LastState } else { RowKind::Transition };
+    let stored: Option<&Vec<f32>> = next_observations.as_ref();
     Ok(Recording {
+        rounding: stored.map(|stored| Rounding::between(&observations.values, stored)).unwrap_or_default(),
         observation_dim,
         action_dim: actions.width,
         observations: observations.values,
@@ -47,6 +50,7 @@ pub(super) fn read(file: &mut NpzFile, task: Option<MazeTask>) -> Result<Recordi
         },
         kinds: last_states.iter().map(kind).collect(),
         terminals: masks.iter().zip(&last_states).map(|(&mask, &last)| !mask && !last).collect(),
+        terminal_array: "masks",
         timeouts: (0..rows).map(|row| ends[row] && masks[row]).collect(),
         ends,
         next_observations,

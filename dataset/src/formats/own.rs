@@ -3,6 +3,7 @@
 use crate::error::Problem;
 use crate::hdf5_file::Hdf5File;
 use crate::recording::{Recording, RowKind};
+use crate::rounding::Rounding;
 
 /// The value of the root attribute `layout` that tells this layout from D4RL's.
 pub(crate) const LAYOUT: &str = "transitions";
@@ -20,6 +21,7 @@ pub(super) fn read(file: &Hdf5File) -> Result<Recording, Problem> {
     let actions = file.actions("actions")?.of_rows(rows)?;
     let next_observations = file.table("next_observations", rows, observation_dim)?;
     let mut recording = Recording {
+        rounding: Rounding::between(&observations.values, &next_observations),
         observation_dim,
         action_dim: actions.width,
         observations: observations.values,
@@ -27,6 +29,7 @@ pub(super) fn read(file: &Hdf5File) -> Result<Recording, Problem> {
         rewards: file.table("rewards", rows, 1)?,
         kinds: vec![RowKind::Transition; rows],
         terminals: file.flags("terminals", rows)?,
+        terminal_array: "terminals",
         timeouts: match file.has("timeouts") {
             true => file.flags("timeouts", rows)?,
             false => vec![false; rows],

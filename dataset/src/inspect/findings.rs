@@ -4,7 +4,9 @@ use crate::environment::EnvironmentSpec;
 use crate::error::such_rows;
 use crate::formats::Source;
 use crate::recording::Recording;
-use crate::{checks, doubts, resets};
+use crate::reward::RewardRule;
+use crate::scale::Scale;
+use crate::{checks, doubts};
 
 /// Nothing that walks through a maze comes further in one step of a tenth of a second.
 const LONGEST_STEP: f32 = 1.0;
@@ -21,16 +23,17 @@ pub(super) fn findings(source: &Source, recording: &Recording, environment: Opti
             None => "no array `timeouts`: only a terminal is taken to end an episode".to_owned(),
         });
     }
-    let out_of_step = resets::out_of_step(recording);
-    if out_of_step.is_empty() {
+    let of_ends = doubts::of_ends(recording);
+    if of_ends.is_empty() {
         let strays = checks::strays(recording).filter(|(_, refused)| !refused);
         findings.extend(strays.map(|(problem, _)| format!("{problem}; is a timeout missing?")));
         findings.extend(leaps(recording));
     }
-    findings.extend(out_of_step);
+    findings.extend(of_ends);
     let outside = checks::actions_outside(recording);
     findings.extend(outside.map(|problem| format!("{problem}; `learner train --scale actions` trains on it")));
-    findings.extend(doubts::doubts(recording, false));
+    let rule = environment.map_or(RewardRule::AsIs, |environment| environment.reward);
+    findings.extend(doubts::of_numbers(recording, Scale::default(), rule));
     findings
 }
 

@@ -16,6 +16,7 @@ use crate::error::{DatasetError, Problem};
 use crate::formats::Source;
 use crate::ogbench;
 use crate::recording::RowKind;
+use crate::reward::RewardScaling;
 use crate::statistics::Extent;
 
 pub use histogram::Histogram;
@@ -57,6 +58,12 @@ pub struct Inspection {
     pub observation_names: Vec<String>,
     /// Names of the numbers of an action.
     pub action_names: Vec<String>,
+    /// Numbers of an observation that never change, from 0.
+    pub constant_observations: Vec<usize>,
+    /// Those of an action.
+    pub constant_actions: Vec<usize>,
+    /// Root mean square of the rewards; methods are made for about 1.
+    pub reward_size: f64,
     /// Smallest and largest reward.
     pub reward_range: Range,
     /// Smallest and largest number in an action.
@@ -116,6 +123,11 @@ impl Range {
         (0..width).map(column).collect()
     }
 
+    /// The columns that have but one value.
+    fn constant(ranges: &[Self]) -> Vec<usize> {
+        (0..ranges.len()).filter(|&i| ranges[i].min == ranges[i].max).collect()
+    }
+
     fn over(ranges: &[Self]) -> Self {
         let min = ranges.iter().map(|range| range.min).fold(f64::NAN, f64::min);
         let max = ranges.iter().map(|range| range.max).fold(f64::NAN, f64::max);
@@ -170,6 +182,9 @@ pub fn inspect(
             mean_score: spec.normalised_score(sum.mean),
             max_score: spec.normalised_score(sum.max),
         }),
+        constant_observations: Range::constant(&observation_ranges),
+        constant_actions: Range::constant(&action_ranges),
+        reward_size: RewardScaling::default().size(&recording),
         observation_names: recording.names.observations,
         action_names: recording.names.actions,
         reward_range: Range::over(&reward_ranges),

@@ -3,6 +3,7 @@
 use std::fmt;
 
 use super::{Inspection, Range};
+use crate::doubts::named;
 
 impl fmt::Display for Inspection {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
@@ -14,8 +15,19 @@ impl fmt::Display for Inspection {
         writeln!(f, "  episodes      {}", self.episodes)?;
         writeln!(f, "  terminals     {:.3} % of the steps", 100.0 * self.terminals)?;
         writeln!(f, "  timeouts      {:.3} % of the steps", 100.0 * self.timeouts)?;
-        writeln!(f, "  observations  {} numbers", self.observation_dim)?;
-        writeln!(f, "  actions       {} numbers", self.action_dim)?;
+        let constant = |columns: &[usize], names: &[String]| match columns {
+            [] => String::new(),
+            _ => format!("; constant: {}", named(columns, names)),
+        };
+        let of_observations = constant(&self.constant_observations, &self.observation_names);
+        writeln!(f, "  observations  {} numbers{of_observations}", self.observation_dim)?;
+        let of_actions = constant(&self.constant_actions, &self.action_names);
+        writeln!(f, "  actions       {} numbers{of_actions}", self.action_dim)?;
+        writeln!(
+            f,
+            "  rewards       of size {:.4} (root mean square); methods are made for about 1",
+            self.reward_size
+        )?;
 
         let wide = self.action_names.iter().map(|name| name.chars().count() + 1).fold(14, usize::max);
         writeln!(f, "\n  {:<wide$}{:>12}{:>12}{:>12}", "", "min", "mean", "max")?;

@@ -91,8 +91,18 @@ fn archives_without_arrays_are_named() {
 fn a_robomimic_file_is_named() {
     let folder = tempdir().unwrap();
     let path = folder.path().join("low_dim.hdf5");
-    hdf5::File::create(&path).unwrap().create_group("data").unwrap().create_group("demo_0").unwrap();
+    let demonstration = |rewards: bool| {
+        let group = hdf5::File::create(&path).unwrap().create_group("data").unwrap().create_group("demo_0").unwrap();
+        for array in ["actions", "rewards"].into_iter().filter(|array| rewards || *array == "actions") {
+            group.new_dataset::<f32>().shape(3).create(array).unwrap();
+        }
+    };
+    demonstration(true);
     assert_eq!(foreign(&path), "a robomimic file");
+    demonstration(false);
+    assert_eq!(foreign(&path), "a file in robomimic's layout without rewards, as Isaac Lab's recorder writes it");
+    let hint = error(&path).hint();
+    assert!(hint.contains("quad-convert FILE --observations KEY … --reward success-at-end --success all"), "{hint}");
 }
 
 /// A file in D4RL's layout whose arrays `write` writes.

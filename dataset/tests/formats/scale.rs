@@ -2,7 +2,7 @@
 
 use std::path::PathBuf;
 
-use quad_dataset::{Arrays, Batch, Names, ReadOptions, RewardRule, Scale, Transitions, write_own};
+use quad_dataset::{Arrays, Batch, HoldOut, Names, ReadOptions, RewardRule, Scale, Transitions, write_own};
 use tempfile::{TempDir, tempdir};
 
 use crate::{all, assert_close};
@@ -30,10 +30,12 @@ fn file() -> (TempDir, PathBuf) {
     (folder, path)
 }
 
+fn options(scale: Scale) -> ReadOptions {
+    ReadOptions { environment: None, task: None, reward: RewardRule::AsIs, scale }
+}
+
 fn scaled(actions: bool, states: bool) -> Transitions {
-    let options =
-        ReadOptions { environment: None, task: None, reward: RewardRule::AsIs, scale: Scale { actions, states } };
-    Transitions::read(file().1, &options).unwrap()
+    Transitions::read(file().1, &options(Scale { actions, states, rewards: false })).unwrap()
 }
 
 /// The expected numbers are NumPy's: (x - x.mean(0)) / x.std(0), in float64.
@@ -47,13 +49,13 @@ fn states_have_mean_0_and_deviation_1() {
         -0.392_232_27, -1.566_698_9, 0.0,
         0.0, 0.174_077_66, 0.0,
         1.568_929_1, 0.174_077_66, 0.0,
-        2.353_393_6, -1.218_543_6, 0.4,
+        2.353_393_6, -1.218_543_6, 0.0,
     ];
     assert_close("observations", &observations, &expected[..12]);
     assert_close("next observations", &next_observations, &expected[3..]);
     let affine = transitions.scaling().observations.clone().unwrap();
     assert_eq!(affine.offset, [1_000_003.0, 3.5, 0.1]);
-    assert_eq!(affine.scale, [2.549_509_8, 2.872_281_3, 1.0], "a constant column keeps its unit");
+    assert_eq!(affine.scale, [2.549_509_8, 2.872_281_3, 0.0], "a column that never changes is not seen");
 }
 
 #[test]
@@ -64,7 +66,7 @@ fn actions_reach_from_least_to_largest() {
     assert_close("actions", &batch.actions, &[-0.999_99, 0.0, 0.0, 0.0, -0.25, 0.0, 0.999_99, 0.0]);
     let scaling = transitions.scaling();
     let affine = scaling.actions.clone().unwrap();
-    assert_eq!((affine.offset, affine.scale), (vec![10.0, 0.25], vec![40.0, 1.0]));
+    assert_eq!((affine.offset, affine.scale), (vec![10.0, 0.25], vec![40.0, 0.0]));
     assert_eq!((batch.observations, &scaling.observations), (arrays().observations, &None), "as they are");
     assert_eq!(batch.rewards, arrays().rewards);
     // What follows what is told by the numbers of the file.
@@ -74,9 +76,31 @@ fn actions_reach_from_least_to_largest() {
 
 #[test]
 fn states_alone_leave_the_range_of_actions_to_be_checked() {
-    let scale = Scale { actions: false, states: true };
-    let options = ReadOptions { environment: None, task: None, reward: RewardRule::AsIs, scale };
     let (_folder, path) = file();
-    let error = Transitions::read(path, &options).err().unwrap();
+    let error = Transitions::read(path, &options(Scale { states: true, ..Scale::default() })).err().unwrap();
     assert!(error.to_string().contains("the action -30 is outside [-1, 1]"), "{error}");
+}
+
+#[test]
+fn rewards_have_a_mean_square_of_1() {
+    let (_folder, path) = file();
+    let scale = Scale { actions: true, states: false, rewards: true };
+    let transitions = Transitions::read(&path, &options(scale)).unwrap();
+    let size = 7.5_f32.sqrt(); // of 1, 2, 3 and 4
+    assert_eq!(transitions.scaling().rewards, Some(size));
+    assert_close("rewards", &all(&transitions).rewards, &[1.0, 2.0, 3.0, 4.0].map(|reward| reward / size));
+    assert_eq!(transitions.statistics().return_mean, 10.0, "as they were recorded");
+    // After the rule of the task.
+    let rule = ReadOptions { reward: RewardRule::CentreTimes4, ..options(scale) };
+    let ruled = Transitions::read(&path, &rule).unwrap();
+    assert_close("ruled", &all(&ruled).rewards, &[2.0, 6.0, 10.0, 14.0].map(|reward| reward / 84_f32.sqrt()));
+    write_own(&path, Arrays { rewards: vec![0.0; 4], ..arrays() }, Names::default()).unwrap();
+    assert_eq!(Transitions::read(&path, &options(scale)).unwrap().scaling().rewards, None, "0 has no size");
+    // What is held out is in the same unit.
+    let whole = Arrays { timeouts: vec![false, true, false, true], ..arrays() };
+    write_own(&path, whole, Names::default()).unwrap();
+    let split = Transitions::read_split(&path, &options(scale), HoldOut::Episodes(&[1])).unwrap();
+    let size = 2.5_f32.sqrt(); // of 1 and 2
+    assert_eq!(split.training.scaling().rewards, Some(size));
+    assert_close("held out", &all(&split.held_out.unwrap()).rewards, &[3.0 / size, 4.0 / size]);
 }

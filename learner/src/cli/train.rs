@@ -53,9 +53,9 @@ pub struct TrainArgs {
     /// [default: the task's]
     #[arg(long, value_name = "FILE|NAME")]
     dataset: Option<String>,
-    /// Scale actions from their least and largest value to ±1, states to mean 0 and standard deviation 1, or both; the policy
-    /// still takes and gives the data's own units
-    #[arg(long, value_name = "actions,states", value_delimiter = ',', value_parser = ["actions", "states"], hide_possible_values = true)]
+    /// Scale some of these: actions from their least and largest value to ±1, states to mean 0 and standard deviation 1, rewards to
+    /// a mean square of 1; the policy still takes and gives the data's own units
+    #[arg(long, value_name = "actions,states,rewards", value_delimiter = ',', value_parser = ["actions", "states", "rewards"], hide_possible_values = true)]
     scale: Vec<String>,
     /// Share of the episodes to keep out of training; losses and values on them are in the metrics, as held_out_… [default: the
     /// task's, 0.1 for own-data, else 0]

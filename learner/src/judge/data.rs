@@ -82,7 +82,7 @@ impl Data {
             environment: environment::find(environment).ok(),
             task: ogbench::maze_task(environment),
             reward: RewardRule::AsIs,
-            scale: Scale { actions: true, states: true },
+            scale: Scale { actions: true, states: true, rewards: false },
         };
         let split = Transitions::read_split(&dataset.path, &options, hold_out);
         Self::of_split(split.hint_of(DatasetError::hint)?, dataset.sha256, environment.clone())

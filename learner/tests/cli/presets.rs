@@ -182,7 +182,10 @@ fn a_file_changes_its_task_and_takes_its_environments_reward_rule() {
         assert_eq!(value(&preset(path), "reward"), Some(rule.into()));
     }
     for (text, words) in [
-        ("task = \"own-data\"\nscale = [\"reward\"]", "unknown variant `reward`, expected `actions` or `states`"),
+        (
+            "task = \"own-data\"\nscale = [\"reward\"]",
+            "unknown variant `reward`, expected one of `actions`, `states`, `rewards`",
+        ),
         ("steps = 1", "names neither a task nor an environment"),
         ("task = \"hoper-demo\"", "did you mean hopper-demo"),
         ("task = 3", "no task named 3"),

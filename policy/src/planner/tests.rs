@@ -18,7 +18,7 @@ fn shape(replan_every: usize) -> PlannerShape {
         diffusion_steps: 3,
         guidance: Guidance { steps: 2, scale: 0.5, stop: 1 },
         replan_every,
-        units: Scaling { observations: affine(DIMS.0), actions: affine(DIMS.1) },
+        units: Scaling { observations: affine(DIMS.0), actions: affine(DIMS.1), rewards: None },
     }
 }
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
+import numpy as np
 from onnx import ModelProto
 
 from quad_rl._quad_rl import Policy
@@ -19,7 +20,9 @@ DRAW = {"diffusion": diffusion.draw, "one-step": one_step.draw, "score": score.d
 def to_network(file: File, observations: Value) -> Value:
     for units in file.units:
         if of := units.get("observations"):
-            observations = (observations - of["offset"]) / of["scale"]
+            scale = np.array(of["scale"])
+            # A number that never changes has scale 0: the network sees 0.
+            observations = (observations - of["offset"]) / np.where(scale == 0, np.inf, scale)
     return observations
 
 

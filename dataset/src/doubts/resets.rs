@@ -31,8 +31,8 @@ pub(crate) fn out_of_step(recording: &Recording) -> Vec<String> {
     let longest = (CANDIDATES * ends.len()).min(lengths.len() / STEPS_BETWEEN_RESETS);
     let limit = *lengths.clone().select_nth_unstable_by(lengths.len() - 1 - longest, f64::total_cmp).1;
     let (timeouts, terminals): (Vec<usize>, _) = ends.iter().partition(|&&row| recording.timeouts[row]);
-    let judged =
-        [("terminals", terminals), ("timeouts", timeouts)].map(|(name, flags)| judge(name, &flags, &lengths, limit));
+    let judged = [(recording.terminal_array, terminals), ("timeouts", timeouts)]
+        .map(|(name, flags)| judge(name, &flags, &lengths, limit));
     judged.into_iter().flatten().collect()
 }
 
@@ -51,7 +51,7 @@ fn judge(name: &str, flags: &[usize], lengths: &[f64], limit: f64) -> Option<Str
     let is_proof = beside >= FEWEST && beside * SMALLEST_SHARE >= flags.len() && at * EXCEPTION <= beside;
     is_proof.then(|| {
         format!(
-            "{name} are one row {late}, out of step with the resets: states jump at the row {side} ({beside} of {}), \
+            "array `{name}`: one row {late}, out of step with the resets: states jump at the row {side} ({beside} of {}), \
              which ends no episode, and not at their own, so that resets are learnt as steps; move them one row {up}",
             flags.len()
         )

@@ -1,0 +1,84 @@
+//! What can be trained on, though nothing good may come of it: each doubt is written here once, for every format, for who
+//! inspects data and for who trains on it.
+//!
+//! `ends` is what flags may really be, and `resets` whether they stand in the right row; `copied` is actions that are the
+//! state, `rest` observations that do not move, `late` such that are a row late; `rewards` and `sizes` are about the numbers.
+//! A sentence names the array, the share or number of rows, what it may be, and what to do.
+
+mod copied;
+mod ends;
+mod late;
+mod resets;
+mod rest;
+mod rewards;
+mod sizes;
+
+use crate::recording::{Recording, RowKind};
+use crate::reward::RewardRule;
+use crate::scale::Scale;
+
+/// Rows that tell enough of a recording: so many of them, evenly spread.
+const ENOUGH: usize = 20_000;
+
+/// One sentence for each doubt. `scale` is what of it is scaled, `rule` what becomes of rewards.
+pub(crate) fn doubts(recording: &Recording, scale: Scale, rule: RewardRule) -> Vec<String> {
+    let mut doubts = of_ends(recording);
+    doubts.extend(of_numbers(recording, scale, rule));
+    doubts
+}
+
+/// Doubts about where episodes end.
+pub(crate) fn of_ends(recording: &Recording) -> Vec<String> {
+    match ends::meaning(recording) {
+        Some(doubt) => vec![doubt],
+        None => resets::out_of_step(recording),
+    }
+}
+
+/// Doubts about the numbers of rows.
+pub(crate) fn of_numbers(recording: &Recording, scale: Scale, rule: RewardRule) -> Vec<String> {
+    let copied = copied::actions(recording);
+    let rest = rest::observations(recording);
+    let late = if copied.is_some() || rest.is_some() { None } else { late::observations(recording) };
+    let mut doubts = Vec::from_iter(rewards::alike(recording));
+    if doubts.is_empty() {
+        doubts.extend(rewards::after_goal(recording));
+        // Whoever chose another rule has seen to it.
+        let is_own = rule == RewardRule::AsIs && !scale.rewards;
+        doubts.extend(if is_own { rewards::size(recording) } else { None });
+    }
+    doubts.extend(copied.into_iter().chain(rest).chain(late));
+    doubts.extend(sizes::columns(recording, scale));
+    doubts
+}
+
+/// Columns by their numbers and, where they have some, their names.
+pub(crate) fn named(columns: &[usize], names: &[String]) -> String {
+    let one = |column: &usize| match names.get(*column) {
+        Some(name) => format!("{column} ({name})"),
+        None => column.to_string(),
+    };
+    let word = if columns.len() == 1 { "column" } else { "columns" };
+    format!("{word} {}", Vec::from_iter(columns.iter().map(one)).join(", "))
+}
+
+/// A number with two digits or so.
+fn short(x: f64) -> String {
+    if x == 0.0 || x.abs() >= 0.1 { format!("{x:.1}") } else { format!("{x:.1e}") }
+}
+
+fn percent(part: usize, whole: usize) -> String {
+    format!("{:.3}", 100.0 * part as f64 / whole as f64).trim_end_matches('0').trim_end_matches('.').to_owned() + " %"
+}
+
+impl Recording {
+    fn is_step(&self, row: usize) -> bool {
+        self.kinds.get(row).is_some_and(|kind| *kind != RowKind::LastState)
+    }
+
+    /// Rows that the next row continues, at most [`ENOUGH`].
+    fn some_that_go_on(&self) -> Vec<usize> {
+        let apart = self.rows().div_ceil(ENOUGH).max(1);
+        (0..self.rows()).step_by(apart).filter(|&row| self.goes_on(row)).collect()
+    }
+}
