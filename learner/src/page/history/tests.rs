@@ -66,8 +66,8 @@ fn what_was_not_measured_at_a_step_leaves_its_other_numbers_and_other_steps_alon
     assert_eq!((&shown(&history)["names"], &shown(&history)["rows"]), (&json!(["loss", "held_out_loss"]), &expected));
     let mut rows = history.rows.into_iter();
     let mut first = rows.next().unwrap();
-    rows.for_each(|row| first.join(&row, 0.5));
-    assert_eq!(first.values, [1.5, 6.0], "means of what there is");
+    rows.for_each(|row| first.join(&row));
+    assert_eq!(first.values, [(3.0, 2), (12.0, 2)], "sums of what there is, and of how many lines");
 }
 
 #[test]
