@@ -123,8 +123,11 @@ mod tests {
     #[test]
     fn a_policy_sees_and_gives_the_datas_units_and_the_evaluation_its_own() {
         let affine = |offset: [f32; 2], scale: [f32; 2]| Some(Affine { offset: offset.into(), scale: scale.into() });
-        let scaling =
-            Scaling { observations: affine([100.0, -3.0], [10.0, 2.0]), actions: affine([90.0, 0.0], [20.0, 1.0]) };
+        let scaling = Scaling {
+            observations: affine([100.0, -3.0], [10.0, 2.0]),
+            actions: affine([90.0, 0.0], [20.0, 1.0]),
+            ..Scaling::default()
+        };
         let actions = act(&Echo, &scaling, &[0.0, 0.0, -1.5, 2.0], 0).unwrap();
         assert_eq!(actions, [100.0, -3.0, 85.0, 1.0]);
         assert_eq!(to_evaluation(&scaling, actions), [0.5, -1.0, -0.25, 1.0]);

@@ -244,7 +244,7 @@ mod tests {
             environment: environment::find("hopper").ok(),
             task: None,
             reward: RewardRule::AsIs,
-            scale: Scale { actions: true, states: true },
+            scale: Scale { actions: true, states: true, rewards: false },
         };
         let split = Transitions::read_split(&path, &options, HoldOut::Episodes(&[1, 2])).unwrap();
         let data = Data::of_split(split, String::new(), String::new()).unwrap();
