@@ -56,7 +56,9 @@ fn episodes_of_one_step() {
             let one = made(
                 1,
                 |random| {
-                    (0..seed).for_each(|_| drop(context(random)));
+                    (0..seed).for_each(|_| {
+                        context(random);
+                    });
                     context(random)
                 },
                 |random, state| {
