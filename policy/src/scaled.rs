@@ -161,6 +161,7 @@ mod tests {
         let of_one = scaled.with_choice(Choice::best_of(1)).unwrap();
         assert_eq!(act(&*of_one, &theirs), to_user(&act(&*plain.with_choice(Choice::best_of(1)).unwrap(), &ours)));
         assert!(scaled.memory(3) > plain.memory(3));
+        assert_eq!((scaled.noise(), scaled.choice()), (vec![2, 6, 2], plain.choice()));
     }
 
     #[test]

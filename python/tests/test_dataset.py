@@ -135,3 +135,10 @@ def test_what_cannot_be_is_refused(tmp_path):
         with pytest.raises(ValueError, match=message):
             call()
     assert not list(tmp_path.iterdir())
+
+
+def test_a_row_with_several_bad_numbers_counts_once():
+    good = arrays(n=200)
+    good["observations"][7, 2:5] = np.nan
+    with pytest.raises(ValueError, match=r"row 7: number 2 is nan, .* \(1 such rows\)"):
+        Dataset.from_arrays(**good)

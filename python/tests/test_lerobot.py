@@ -197,3 +197,21 @@ def test_what_cannot_be_is_refused(tmp_path):
         Dataset.from_lerobot(folder, **STATE)
     with pytest.raises(ValueError, match="no LeRobot dataset"):
         Dataset.from_lerobot(tmp_path, **STATE)
+
+
+def test_a_shift_is_suspected_only_where_all_successes_have_it(tmp_path):
+    given = episodes(simulated=True)
+    for one in given:
+        one["next.reward"] = np.zeros(len(one["action"]))
+        one["next.reward"][-1] = 1.0
+    given[0]["next.reward"] = np.roll(given[0]["next.reward"], -1)
+    assert "shifted" not in "\n".join(Dataset.from_lerobot(write(tmp_path / "data", given), **STATE).notes)
+
+
+def test_names_may_be_given_by_their_places(tmp_path):
+    folder = write(tmp_path / "data", episodes())
+    info = json.loads((folder / "meta/info.json").read_text())
+    info["features"]["action"]["names"] = {"lift": 1, "pan": 0}
+    (folder / "meta/info.json").write_text(json.dumps(info))
+    dataset = Dataset.from_lerobot(folder, **STATE, reward="step-cost", success="all")
+    assert dataset.action_names == ["action.pan", "action.lift"]

@@ -289,3 +289,20 @@ def test_d3rlpy():
     episodes[0].actions = np.zeros((5, 1), int)
     with pytest.raises(ValueError, match="whole numbers"):
         Dataset.from_d3rlpy(SimpleNamespace(episodes=episodes[:1]))
+
+
+def test_robomimics_flags_are_in_the_order_of_its_numbers(demonstrations):
+    by_flags, by_rewards = (Dataset.from_robomimic(demonstrations, observations=["object"], success=success)
+                            for success in ([i < 8 for i in range(12)], "rewards"))
+    with h5py.File(demonstrations) as file:
+        actions = np.concatenate([file[f"data/demo_{i}/actions"] for i in range(12)])
+    assert np.array_equal(rows(by_flags)[1], actions.astype(np.float32))
+    assert np.array_equal(rows(by_flags)[4], rows(by_rewards)[4])
+
+
+def test_images_of_one_color_are_images():
+    from quad_rl.readers.minari import _parts
+
+    for shape in [(5, 8, 8), (5, 8, 8, 3)]:
+        with pytest.raises(ValueError, match="holds images"):
+            _parts("observations", None, np.zeros(shape, np.uint8))

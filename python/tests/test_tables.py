@@ -253,3 +253,32 @@ def test_extras_are_what_the_hints_say():
     of_project = {extra: [re.split("[>=]", package)[0] for package in packages]
                   for extra, packages in project["optional-dependencies"].items()}
     assert of_project == EXTRAS
+
+
+def test_episodes_keep_their_names_and_their_order(tmp_path):
+    frame = table(runs=("b", "c", "a"))
+    dataset = Dataset.from_frame(frame, **COLUMNS, reward="step-cost", success=["c"])
+    kept = np.setdiff1d(np.arange(60), [19, 59])  # The last steps of b and a.
+    assert np.array_equal(dataset._rows.observations, frame[["x", "v"]].to_numpy(np.float32)[kept])
+    assert np.flatnonzero(dataset._rows.terminals).tolist() == [38]
+    frame["won"] = np.arange(60) == 25  # In the middle of c.
+    by_column = Dataset.from_frame(frame, **COLUMNS, reward="step-cost", success="won")
+    assert all(np.array_equal(array, other) for array, other in zip(rows(dataset), rows(by_column)))
+
+
+@pytest.mark.parametrize("delimiter", [",", ";", "\t"])
+def test_a_csv_may_have_any_delimiter(tmp_path, delimiter):
+    frame = table()
+    frame.to_csv(tmp_path / "log.csv", index=False, sep=delimiter)
+    read, right = (Dataset.from_frame(source, **COLUMNS, reward="gain") for source in (tmp_path / "log.csv", frame))
+    assert all(np.array_equal(array, other) for array, other in zip(rows(read), rows(right)))
+
+
+@pytest.mark.parametrize("message, x", [
+    ("column 'x' has lists of several lengths, 1 to 3", [[1.0, 2.0], [1.0], [1.0, 2.0, 3.0], [1.0, 2.0]]),
+    ("column 'x', row 2 is empty", [[1.0, 2.0], [1.0, 2.0], [1.0, None], [1.0, 2.0]]),
+])
+def test_lists_that_make_no_rows_are_refused(message, x):
+    columns = pa.table({"x": x, "torque": [0.1] * 4, "run": [0, 0, 1, 1]})
+    with pytest.raises(ValueError, match=message):
+        Dataset.from_frame(columns, observations=["x"], actions=["torque"], reward="torque", episode="run")

@@ -58,6 +58,16 @@ fn an_episode_ends_at_the_goal_although_the_recording_goes_on() {
 }
 
 #[test]
+fn an_episode_after_one_that_reached_its_goal_is_one_of_the_recording() {
+    let mut recording = recording(&[Transition, Transition, Dropped, Transition, Transition, Dropped]);
+    recording.goal = true;
+    (recording.terminals[0], recording.ends[2], recording.ends[5]) = (true, true, true);
+    let transitions = transitions(recording);
+    assert_eq!(transitions.episodes(), [0..1, 1..2, 2..4]);
+    assert_eq!(transitions.recorded_episodes(), [0..1, 2..4]);
+}
+
+#[test]
 fn rows_with_next_observations_of_their_own_follow_one_another_where_these_say_so() {
     let mut recording = recording(&[Transition; 4]);
     recording.next_observations = Some(vec![1.0, 9.0, 3.0, 4.0]);

@@ -5,7 +5,7 @@ use std::path::Path;
 use quad_dataset::{EnvironmentSpec, RewardRule, environment, recorded_environment};
 use tempfile::tempdir;
 
-use crate::{all, compare, generated, hopper, peers, read, shared, try_read};
+use crate::{all, compare, generated, hopper, peers, put, read, shared, try_read};
 
 /// Compares a file with what `peers.py reference` finds in it.
 fn compare_with_rules(path: &Path, environment: Option<&'static EnvironmentSpec>) {
@@ -72,4 +72,24 @@ fn recorded_files() {
             compare_with_rules(&path, Some(environment::find(environment).unwrap()));
         }
     }
+}
+
+#[test]
+fn a_recording_with_a_goal_goes_on_after_it_in_whatever_environment() {
+    let folder = tempdir().unwrap();
+    let path = folder.path().join("goal.hdf5");
+    let file = hdf5::File::create(&path).unwrap();
+    let flags = |rows: &[usize]| std::array::from_fn::<_, 8, _>(|row| rows.contains(&row));
+    put(&file, "observations", &[8, 2], &std::array::from_fn::<f32, 16, _>(|i| i as f32));
+    put(&file, "actions", &[8, 1], &[0.5f32; 8]);
+    put(&file, "rewards", &[8], &flags(&[2, 3, 6]).map(f32::from));
+    put(&file, "terminals", &[8], &flags(&[2, 3, 6]));
+    put(&file, "timeouts", &[8], &flags(&[4, 7]));
+    assert_eq!(try_read(&path, None).unwrap().statistics().episodes, 5);
+    file.create_group("infos").unwrap();
+    put(&file, "infos/goal", &[8, 2], &[0.0f32; 16]);
+    drop(file);
+    let transitions = try_read(&path, None).unwrap();
+    // In each episode the goal is reached, and what comes after it is in no return.
+    assert_eq!((transitions.statistics().episodes, transitions.statistics().return_max), (2, 1.0));
 }

@@ -185,6 +185,21 @@ fn arrays_that_lie_elsewhere() {
 }
 
 #[test]
+fn an_array_whose_numbers_are_another_file_s_is_not_read() {
+    let folder = tempdir().unwrap();
+    let secret = folder.path().join("secret");
+    fs::write(&secret, [7; 4 * ROWS * 3]).unwrap();
+    let external = |file: &hdf5::File, name: &str, values: Array2<f32>| {
+        let bytes = 4 * values.len();
+        let builder = file.new_dataset::<f32>().shape(values.dim());
+        builder.external(secret.to_str().unwrap(), 0, bytes).create(name).unwrap();
+    };
+    let (_folder, path) = file(external);
+    let error = error(&path);
+    assert!(matches!(&error.problem, Problem::Elsewhere { array } if array == "observations"), "{error}");
+}
+
+#[test]
 fn a_file_whose_writer_never_closed_it() {
     let folder = tempdir().unwrap();
     let path = folder.path().join("log.hdf5");
@@ -198,8 +213,8 @@ fn a_file_whose_writer_never_closed_it() {
     drop(file);
 }
 
-#[test]
-fn an_archive_of_short_numbers_is_read() {
+/// Eight rows as OGBench stores them, the last of which is a trajectory's last state, in short numbers.
+fn write_archive(path: &Path, masks: [u32; 8]) {
     fn put<T: npyz::AutoSerialize>(archive: &mut ZipWriter<fs::File>, name: &str, values: Vec<T>) {
         let mut bytes = Vec::new();
         let mut array = npyz::WriteOptions::new().default_dtype().shape(&[8]).writer(&mut bytes).begin_nd().unwrap();
@@ -208,17 +223,33 @@ fn an_archive_of_short_numbers_is_read() {
         archive.start_file(format!("{name}.npy"), SimpleFileOptions::default()).unwrap();
         archive.write_all(&bytes).unwrap();
     }
-    let folder = tempdir().unwrap();
-    let path = folder.path().join("log.npz");
-    let mut archive = ZipWriter::new(fs::File::create(&path).unwrap());
+    let mut archive = ZipWriter::new(fs::File::create(path).unwrap());
     put(&mut archive, "observations", (0..8).map(|i| f16::from_f32(i as f32 / 4.0)).collect());
     put(&mut archive, "actions", vec![f16::from_f32(0.5); 8]);
     put(&mut archive, "rewards", (0..8).map(|i| -3 * i).collect::<Vec<i16>>());
     put(&mut archive, "terminals", (0..8).map(|i| u16::from(i == 7)).collect());
-    put(&mut archive, "masks", vec![1_u32; 8]);
+    put(&mut archive, "masks", masks.to_vec());
     put(&mut archive, "valids", (0..8).map(|i| u64::from(i < 7)).collect());
     archive.finish().unwrap();
+}
+
+#[test]
+fn an_archive_of_short_numbers_is_read() {
+    let folder = tempdir().unwrap();
+    let path = folder.path().join("log.npz");
+    write_archive(&path, [1; 8]);
     let batch = all(&read(&path, None, RewardRule::AsIs));
     assert_eq!(batch.next_observations, [0.25, 0.5, 0.75, 1.0, 1.25, 1.5, 1.75]);
     assert_eq!(batch.rewards, [0.0, -3.0, -6.0, -9.0, -12.0, -15.0, -18.0]);
+}
+
+#[test]
+fn a_trajectory_that_ends_where_nothing_more_is_to_be_gained_is_not_cut_off() {
+    let folder = tempdir().unwrap();
+    let path = folder.path().join("log.npz");
+    for (last, terminals, timeouts) in [(0, 1.0 / 7.0, 0.0), (1, 0.0, 1.0 / 7.0)] {
+        write_archive(&path, [1, 1, 1, 1, 1, 1, last, last]);
+        let inspection = inspect(&path, None).unwrap();
+        assert_eq!((inspection.terminals, inspection.timeouts), (terminals, timeouts));
+    }
 }

@@ -51,7 +51,7 @@ fn try_read(path: &Path, environment: Option<&'static EnvironmentSpec>) -> Resul
 }
 
 /// Writes an array.
-fn put<T: H5Type>(file: &hdf5::File, array: &str, shape: &[usize], data: &[T]) {
+fn put<T: H5Type>(file: &hdf5::Group, array: &str, shape: &[usize], data: &[T]) {
     let view = ArrayViewD::from_shape(shape, data).unwrap();
     file.new_dataset_builder().with_data(view).create(array).unwrap();
 }

@@ -5,7 +5,7 @@ use std::path::{Path, PathBuf};
 use quad_dataset::{DatasetError, EnvironmentSpec, Transitions, environment, recorded_environment};
 use tempfile::{TempDir, tempdir};
 
-use crate::{compare, hopper, peers_in, shared, try_read};
+use crate::{all, compare, hopper, peers_in, put, shared, try_read};
 
 /// A folder that Minari takes for its own, with one dataset in it.
 struct Root(TempDir);
@@ -102,4 +102,29 @@ fn damaged_metadata_and_missing_episodes() {
     hdf5::File::open_rw(&data).unwrap().unlink("episode_3").unwrap();
     let text = root.error().to_string();
     assert!(text.ends_with(": 3 episodes, but metadata.json says 4"), "{text}");
+}
+
+/// One episode of two steps whose observations are a Tuple of eleven numbers.
+fn write_tuple(path: &Path) {
+    let file = hdf5::File::create(path).unwrap();
+    let observations = file.create_group("episode_0").unwrap().create_group("observations").unwrap();
+    for number in 0..11 {
+        put(&observations, &format!("_index_{number}"), &[3, 1], &[number as f32; 3]);
+    }
+    put(&file, "episode_0/actions", &[2, 1], &[0.5f32; 2]);
+    put(&file, "episode_0/rewards", &[2], &[1.0f32, 2.0]);
+    put(&file, "episode_0/terminations", &[2], &[false, true]);
+    put(&file, "episode_0/truncations", &[2], &[false; 2]);
+}
+
+#[test]
+fn a_long_tuple_keeps_its_order_whatever_its_file_is_called() {
+    let folder = tempdir().unwrap();
+    for name in ["main_data.hdf5", "renamed.hdf5"] {
+        let path = folder.path().join(name);
+        write_tuple(&path);
+        let batch = all(&try_read(&path, None).unwrap());
+        assert_eq!(batch.observations[..11], Vec::from_iter((0..11).map(|number| number as f32)), "{name}");
+        assert_eq!(batch.rewards, [1.0, 2.0]);
+    }
 }

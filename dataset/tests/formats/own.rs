@@ -2,10 +2,10 @@
 
 use std::path::Path;
 
-use quad_dataset::{Arrays, DatasetError, Names, RewardRule, Transitions, inspect, write_own};
+use quad_dataset::{Arrays, DatasetError, HoldOut, Names, RewardRule, Transitions, inspect, write_own};
 use tempfile::tempdir;
 
-use crate::{all, peers, peers_in, read, try_read};
+use crate::{all, options, peers, peers_in, read, try_read};
 
 /// The Python of docs/data.md that writes a file.
 fn lines_of_the_page() -> String {
@@ -156,4 +156,21 @@ fn arrays_that_would_be_refused_are_not_written() {
     let without_actions = Arrays { action_dim: 0, actions: Vec::new(), ..arrays() };
     assert!(refused(without_actions).starts_with("array `actions` has shape [6, 0]"));
     assert_eq!(std::fs::read_dir(folder.path()).unwrap().count(), 0);
+}
+
+#[test]
+fn rows_in_any_order_are_learnt_from_with_the_next_observations_of_their_own() {
+    let strange = Arrays { next_observations: vec![7.0; 18], actions: vec![0.25; 12], ..arrays() };
+    assert_eq!(all(&Transitions::of(strange).unwrap()).next_observations, [7.0; 18]);
+}
+
+#[test]
+fn episodes_that_are_held_out_keep_their_next_observations() {
+    let folder = tempdir().unwrap();
+    let path = folder.path().join("own.hdf5");
+    write_own(&path, Arrays { actions: vec![0.25; 12], ..arrays() }, Names::default()).unwrap();
+    let split = Transitions::read_split(&path, &options(None, RewardRule::AsIs), HoldOut::Episodes(&[0])).unwrap();
+    let next = arrays().next_observations;
+    assert_eq!(all(&split.held_out.unwrap()).next_observations, next[..9]);
+    assert_eq!(all(&split.training).next_observations, next[9..]);
 }

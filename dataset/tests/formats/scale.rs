@@ -5,7 +5,7 @@ use std::path::PathBuf;
 use quad_dataset::{Arrays, Batch, HoldOut, Names, ReadOptions, RewardRule, Scale, Transitions, write_own};
 use tempfile::{TempDir, tempdir};
 
-use crate::{all, assert_close};
+use crate::{all, assert_close, put};
 
 /// Four rows. A large number with a small spread, a small one, and one that is always the same; actions of one number from
 /// -30 to 50, and one that is always the same.
@@ -56,6 +56,24 @@ fn states_have_mean_0_and_deviation_1() {
     let affine = transitions.scaling().observations.clone().unwrap();
     assert_eq!(affine.offset, [1_000_003.0, 3.5, 0.1]);
     assert_eq!(affine.scale, [2.549_509_8, 2.872_281_3, 0.0], "a column that never changes is not seen");
+}
+
+#[test]
+fn rows_that_are_not_learnt_from_do_not_count() {
+    let folder = tempdir().unwrap();
+    let path = folder.path().join("d4rl.hdf5");
+    let file = hdf5::File::create(&path).unwrap();
+    put(&file, "observations", &[4, 1], &[0.0f32, 100.0, 2.0, 77.0]);
+    put(&file, "actions", &[4, 1], &[0.5f32; 4]);
+    put(&file, "rewards", &[4], &[1.0f32, 2.0, 3.0, 4.0]);
+    put(&file, "terminals", &[4], &[false; 4]);
+    put(&file, "timeouts", &[4], &[false, true, false, false]);
+    drop(file);
+    let scale = Scale { states: true, ..Scale::default() };
+    let options = ReadOptions { environment: None, task: None, reward: RewardRule::AsIs, scale };
+    // Neither the timeout nor the last row makes a transition.
+    let affine = Transitions::read(&path, &options).unwrap().scaling().observations.clone().unwrap();
+    assert_eq!((affine.offset, affine.scale), (vec![1.0], vec![1.0]));
 }
 
 #[test]

@@ -80,3 +80,22 @@ fn about(report: &RunReport, step: u64, license: Option<&str>) -> Value {
         "judgement": report.judgements.iter().find(|judgement| judgement.step == step),
     })
 }
+
+#[cfg(test)]
+#[allow(clippy::unwrap_used)]
+mod tests {
+    use super::*;
+    use crate::fixtures::config;
+
+    #[test]
+    fn a_license_that_is_named_stands_before_the_datasets_own() {
+        let folder = tempfile::tempdir().unwrap();
+        let mut config = config("run", 0);
+        config.experiment.dataset = Some("hopper-medium-v2".to_owned());
+        RunDir::create(&folder.path().join("run"), &config).unwrap();
+        let report = RunReport::scored(&folder.path().join("run")).unwrap();
+        let license = |named| about(&report, 20, named)["data"]["license"].clone();
+        assert_eq!(license(Some("mine")), "mine");
+        assert!(license(None).as_str().is_some_and(|own| own != "mine"));
+    }
+}

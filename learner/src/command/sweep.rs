@@ -163,7 +163,10 @@ fn conclude(folder: &Path, count: usize, ended: Ended) -> anyhow::Result<()> {
 
 #[cfg(test)]
 mod tests {
+    use clap::Parser;
+
     use super::*;
+    use crate::cli::{Cli, Command};
 
     #[test]
     fn learners_and_evaluators_share_the_cores_however_many_threads_are_asked_for() {
@@ -172,5 +175,22 @@ mod tests {
         assert_eq!(shares(1, 1, None, 20), (1, 1));
         assert_eq!(shares(16, 1, Some(40), 20), (20, 1));
         assert_eq!(shares(16, usize::MAX, Some(2), 20), (2, 1));
+    }
+
+    #[test]
+    fn shards_share_the_runs_that_the_command_line_keeps_to() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("mine.toml");
+        let text = "about = 'x'\nrun = { task = 'hopper-demo', dataset = 'x.hdf5' }\n\
+                    axes = { seed = [0, 1, 2], batch_size = [8, 16] }";
+        fs::write(&path, text).unwrap();
+        let path = path.to_str().unwrap();
+        let of_shard = |shard: &str| {
+            let words = ["learner", "sweep", path, "--only", "batch_size=16", "--shard", shard];
+            let Command::Sweep(args) = Cli::try_parse_from(words).unwrap().command else { panic!("{words:?}") };
+            let study = Study::read(&args.study, &args.only, &args.set).unwrap();
+            Vec::from_iter(chosen(&study, &args, folder.path()).unwrap().iter().map(|(run, _)| run.index))
+        };
+        assert_eq!([of_shard("1/2"), of_shard("2/2")], [vec![1, 5], vec![3]]);
     }
 }

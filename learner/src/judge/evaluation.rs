@@ -154,3 +154,33 @@ pub(super) fn estimate<'a>(traces: impl IntoIterator<Item = &'a Trace>, units: &
     }
     estimate
 }
+
+#[cfg(test)]
+#[allow(clippy::unwrap_used)]
+mod tests {
+    use super::*;
+
+    const UNITS: Units = Units { offset: 0.0, scale: 10.0, least: 0.0, most: 100.0 };
+
+    /// The estimate of an evaluation whose last notes have one value and loss, and those before them another.
+    fn estimated(values: [f64; 2], losses: [f64; 2]) -> Estimate {
+        let notes = |[before, last]: [f64; 2]| [vec![before; NOTES - LAST], vec![last; LAST]].concat();
+        estimate([&Trace { values: notes(values), losses: notes(losses) }], &UNITS)
+    }
+
+    #[test]
+    fn an_estimate_is_where_it_ends_and_doubtful_where_it_is_not_settled() {
+        let settled = estimated([50.5, 50.0], [1.0, 1.5]);
+        assert_eq!((settled.values, settled.doubts), (vec![50.0], vec![]));
+        for (values, losses, doubt) in [
+            ([50.0, 52.0], [1.0; 2], "still moves, from 50.00 to 52.00"),
+            ([52.0, 50.0], [1.0; 2], "still moves, from 52.00 to 50.00"),
+            ([50.0; 2], [1.0, 3.0], "the loss grows, from 1.000 to 3.000"),
+            ([-3.0; 2], [1.0; 2], "-3.00 is beyond what rewards allow"),
+            ([103.0; 2], [1.0; 2], "103.00 is beyond what rewards allow"),
+        ] {
+            let found = estimated(values, losses);
+            assert_eq!((found.values, found.doubts), (vec![values[1]], vec![format!("seed 0: {doubt}")]));
+        }
+    }
+}

@@ -87,3 +87,22 @@ fn configuration(run: &PlannedRun) -> String {
     settings.remove("seed");
     format!("{settings:?} {:?}", run.source)
 }
+
+#[cfg(test)]
+#[allow(clippy::unwrap_used)]
+mod tests {
+    use super::super::Study;
+    use super::*;
+
+    #[test]
+    fn seeds_cost_the_same() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("mine.toml");
+        let text = "about = 'x'\nrun = { task = 'hopper-demo', dataset = 'x.hdf5' }\n\
+                    axes = { seed = [0, 1], batch_size = [8, 16] }";
+        std::fs::write(&path, text).unwrap();
+        let runs = Study::read(&path, &[], &[]).unwrap().runs;
+        let [one, other, again, _] = [0, 1, 2, 3].map(|index| configuration(&runs[index]));
+        assert!(one == again && one != other, "{one}");
+    }
+}

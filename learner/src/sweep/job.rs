@@ -160,3 +160,34 @@ async fn ended(learner: &mut Child) -> io::Result<ExitStatus> {
 fn log(dir: &Path) -> PathBuf {
     dir.join("learner.log")
 }
+
+#[cfg(test)]
+#[allow(clippy::unwrap_used)]
+mod tests {
+    use std::os::unix::process::ExitStatusExt;
+
+    use super::*;
+    use crate::sweep::Study;
+
+    #[test]
+    fn a_learner_is_not_blamed_for_what_an_earlier_one_has_logged() {
+        let folder = tempfile::tempdir().unwrap();
+        let file = folder.path().join("mine.toml");
+        let text = "about = 'x'\nrun = { task = 'hopper-demo', dataset = 'x.hdf5' }\naxes = { seed = [0] }";
+        fs::write(&file, text).unwrap();
+        let run = Study::read(&file, &[], &[]).unwrap().runs.remove(0);
+        let job = Job::new(run, State::NotBegun, folder.path());
+        fs::create_dir_all(&job.dir).unwrap();
+        let earlier = "error: the disk is full\n";
+        let killed = || Ok(ExitStatus::from_raw(9));
+        for (log, reason) in [
+            (earlier.to_owned(), "the learner ended by signal: 9"),
+            (format!("{earlier}error: a loose cable\n"), "a loose cable"),
+        ] {
+            fs::write(super::log(&job.dir), log).unwrap();
+            let End::Failed(said) = job.conclude(killed(), false, earlier.len() as u64) else { panic!("{reason}") };
+            assert!(said.starts_with(&format!("seed0: {reason}")), "{said}");
+        }
+        assert!(matches!(job.conclude(killed(), true, 0), End::Unfinished), "it was told to stop");
+    }
+}

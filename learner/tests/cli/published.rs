@@ -144,3 +144,9 @@ fn what_others_publish_stands_beside_runs_of_their_tasks() {
     reported.has_row(&["hopper-medium-v2", " - [1] ", " 60.4 ± 3.5 a ", " 102.3 ± 0.2 b"]);
     assert!(!reported.text.contains("Table 1"), "{}", reported.text);
 }
+
+#[test]
+fn a_complete_run_stands_in_the_table_before_one_that_is_not() {
+    let runs = [paper(HOPPER, 400_000, |_| 30.0), paper(HOPPER, 2_000_000, |_| 50.0)].concat();
+    report(&runs).has_row(&[HOPPER, " 51.50 ± 1.29 (1.12) [1]"]);
+}

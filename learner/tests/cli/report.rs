@@ -220,3 +220,33 @@ fn a_page_holds_all_that_is_shown_and_takes_nothing_for_html() {
         assert!(page.contains(words), "{words} is missing in\n{page}");
     }
 }
+
+#[test]
+fn the_last_steps_of_a_run_do_not_reach_back_to_the_evaluation_before_them() {
+    let numbers = [("experiment.steps", 100_000), ("experiment.eval_interval", 10_000), ("experiment.episodes", 2)];
+    let mut run = Run::new("hopper-demo", 0).set(&numbers.map(|(key, number)| (key, number.into())));
+    for n in 1..=10 {
+        (0..2).for_each(|episode| run.score(10_000 * n, episode, n as f64, "00"));
+    }
+    // 6 to 10: the evaluation after 50,000 steps is none of the last 50,000.
+    assert_eq!(report(&[run]).json["runs"][0]["mean_last_50000_steps"], json!(8.0));
+}
+
+#[test]
+fn of_equally_good_evaluations_the_last_is_the_best() {
+    let mut run = small(0, 0.0);
+    (0..2).for_each(|episode| run.score(7000, episode, 10.0, "00"));
+    let text = report_with(&[run], &["--select", "best"]).text;
+    assert!(text.contains("best evaluation, after 7000 steps: 10.00"), "{text}");
+}
+
+#[test]
+fn a_part_of_an_evaluation_is_in_no_curve() {
+    let runs = [small(0, 0.0), small(1, 1.0)];
+    let without_part = runs.clone().map(|mut run| {
+        run.scores.pop();
+        run
+    });
+    let [with, without] = [report(&runs), report(&without_part)];
+    assert_eq!(with.svg("curve-hopper-demo.svg"), without.svg("curve-hopper-demo.svg"));
+}

@@ -165,3 +165,42 @@ fn figures_and_tables_come_in_the_formats_of_papers() {
         );
     }
 }
+
+/// What the report has of these runs, each of a task, a seed and a score, by QUAD, or by DAC if the name says so.
+fn report_of(runs: &[(&str, &str, u64, f64)]) -> (Value, String) {
+    let folder = tempfile::tempdir().unwrap();
+    for (name, task, seed, score) in runs {
+        let guidance = if name.starts_with("dac") { "dac" } else { "quad" };
+        let run = match *task {
+            "my-robot" => Run::new("own-data", *seed)
+                .set(&[("experiment.environment", "my-robot".into()), ("run.preset", "my-robot".into())]),
+            known => Run::new(known, *seed),
+        };
+        complete(run.set(&[("experiment.agent.guidance", guidance.into())]), *score).write(&folder.path().join(name));
+    }
+    (study(folder.path()), printed(&["report", folder.path().to_str().unwrap()]))
+}
+
+#[test]
+fn runs_are_compared_with_those_of_their_own_seed() {
+    let [task, _] = TASKS;
+    let runs = [("dac-a", task, 2, 31.0), ("dac-b", task, 1, 22.0), ("dac-c", task, 3, 5.0)];
+    let against = [("quad-a", task, 0, 10.0), ("quad-b", task, 1, 20.0), ("quad-c", task, 2, 30.0)];
+    let (report, _) = report_of(&[against, runs].concat());
+    let comparison = report["comparisons"].as_array().unwrap().iter().find(|one| one["p"].is_number()).unwrap();
+    let of_first = if comparison["against"] == "quad" { 1.5 } else { -1.5 };
+    assert_eq!((&comparison["pairs"], &comparison["mean_difference"]), (&json!(2), &json!(of_first)), "{report}");
+}
+
+#[test]
+fn a_robot_without_reference_returns_is_in_no_mean_with_one_that_has_them() {
+    let (report, _) = report_of(&[("a", TASKS[0], 0, 40.0), ("b", "my-robot", 0, 900.0)]);
+    let means = report["study"].as_array().unwrap().iter().map(|one| one["mean"]["value"].as_f64().unwrap());
+    assert_eq!(Vec::from_iter(means), [40.0, 900.0]);
+}
+
+#[test]
+fn a_task_of_a_single_seed_is_named_though_another_has_more() {
+    let (_, text) = report_of(&[("a", TASKS[0], 0, 40.0), ("b", TASKS[1], 0, 50.0), ("c", TASKS[1], 1, 52.0)]);
+    assert!(text.contains("1 to 2") && text.contains("No interval for quad: of a single seed in a task"), "{text}");
+}

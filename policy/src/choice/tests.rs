@@ -123,3 +123,12 @@ fn a_choice_out_of_range_is_refused() {
     let of_none = Choice { rule: Rule::Average { temperature: 1.0, actions: 0 }, ..Choice::best_of(2) };
     assert!(matches!(of_none.check(), Err(PolicyError::Range { .. })));
 }
+
+#[test]
+fn a_choice_says_how_many_uniform_numbers_it_takes() {
+    let uniforms = |candidates, rule| Choice { rule, ..Choice::best_of(candidates) }.uniforms();
+    let average = |actions| Rule::Average { temperature: 1.0, actions };
+    assert_eq!([uniforms(4, average(3)), uniforms(4, average(9)), uniforms(1, average(3))], [3, 4, 0]);
+    let softmax = Rule::Softmax { temperature: 1.0 };
+    assert_eq!([uniforms(4, softmax), uniforms(1, softmax), uniforms(4, Rule::Best)], [1, 0, 0]);
+}

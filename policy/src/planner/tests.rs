@@ -100,6 +100,18 @@ fn guidance_raises_values() {
 }
 
 #[test]
+fn the_last_denoising_steps_so_many_are_not_guided() {
+    let values = |scale: f32, stop: usize| {
+        let guidance = Guidance { steps: 2, scale, stop };
+        let policy = load_policy(&file(PlannerShape { guidance, ..shape(1) }, 4), Precision::F32).unwrap();
+        policy.sample(&[0.3; DIMS.0], &mut [policy.begin(0)]).unwrap().values
+    };
+    let unguided = values(0.0, 0);
+    assert_eq!(values(5.0, 3), unguided, "of three steps");
+    assert_ne!(values(5.0, 2), unguided);
+}
+
+#[test]
 fn a_shape_out_of_range_is_refused() {
     let refused = |change: fn(&mut PlannerShape)| {
         let mut shape = shape(2);

@@ -125,3 +125,20 @@ fn an_exported_policy_says_what_it_has_learnt_from_and_acts_alike() {
     let nowhere = learner("export", &[&quad], &["--out", "/nowhere/policy"]);
     assert_refused(&nowhere, "cannot export to /nowhere/policy", "");
 }
+
+#[test]
+fn of_a_runs_snapshots_the_last_is_judged_and_exported() {
+    let scratch = tempfile::tempdir().unwrap();
+    let (data, run) = (scratch.path().join("robot.hdf5"), scratch.path().join("run"));
+    write_log(&data, 1.0);
+    said(&train(&data, &run, &["--algorithm", "quad"]), 0);
+    // An earlier one: what is in it does not matter.
+    let snapshot = |step: u64| run.join(format!("snapshots/step_{step:09}.safetensors"));
+    fs::copy(snapshot(20), snapshot(10)).unwrap();
+    let out = scratch.path().join("policy.safetensors");
+    let exported = learner("export", &[&run], &["--out", out.to_str().unwrap()]);
+    said(&exported, 0);
+    assert!(String::from_utf8(exported.stdout).unwrap().contains("run @ 20, "));
+    let judged = json(&learner("judge", &[&run], &["--json", "--steps", "100"]));
+    assert_eq!(judged["policies"][0]["step"], 20);
+}

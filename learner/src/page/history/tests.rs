@@ -136,3 +136,16 @@ fn numbers_have_five_digits() {
     assert!(rounded(numbers[5]).is_some_and(|tiny| tiny < 1e-300));
     assert_eq!((rounded(numbers[6]), rounded(numbers[7])), (None, None));
 }
+
+#[test]
+fn steps_that_are_done_again_join_no_row_that_was_whole() {
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("metrics.jsonl");
+    // The last line begins a row of two.
+    let last = MOST_ROWS as u64 + 1;
+    fs::write(&path, lines((1..=last).chain([last]))).unwrap();
+    let mut history = History::of(path);
+    history.refresh().unwrap();
+    let [.., before, again] = &history.rows[..] else { panic!("{history:?}") };
+    assert_eq!((before.step, again.step), (100.0 * (last - 1) as f64, 100.0 * last as f64));
+}

@@ -26,3 +26,14 @@ fn a_run_that_took_the_folder_of_another_is_shown_alone() {
         RunDir::at(&dir).set_aside().unwrap();
     }
 }
+
+#[test]
+fn of_many_episodes_the_newest_are_shown() {
+    let folder = tempfile::tempdir().unwrap();
+    let dir = folder.path().join("run");
+    let (_, mut scores) = RunDir::create(&dir, &config("run", 1)).unwrap();
+    scores.append(&Vec::from_iter((1..=25).map(|n| line(100 * n, 1, n as f64)))).unwrap();
+    let shown = RunPage::of(&dir).read().unwrap();
+    let steps = shown["episodes"].as_array().unwrap().iter().map(|one| one["step"].as_u64().unwrap());
+    assert_eq!(Vec::from_iter(steps), Vec::from_iter((6..=25).map(|n| 100 * n)));
+}

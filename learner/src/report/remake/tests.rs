@@ -3,7 +3,7 @@
 use std::process;
 
 use clap::Parser;
-use quad_run::config::{Experiment, Preset, resolve};
+use quad_run::config::{Device, Experiment, Preset, resolve};
 use quad_run::run::RunDir;
 use toml::toml;
 
@@ -43,6 +43,19 @@ fn a_shell_that_is_given_the_command_makes_the_same_run() {
     }
     let plain = command_for(resolve("hopper-demo", &toml! { agent = { guidance = "dac" } }).unwrap()).unwrap();
     assert!(plain.contains(" --set agent.guidance=dac "), "{plain}");
+}
+
+#[test]
+fn a_run_on_a_gpu_is_made_again_on_one() {
+    let folder = tempfile::tempdir().unwrap();
+    for (device, says) in [(Device::Cuda, true), (Device::Cpu, false)] {
+        let mut config = config("r", 7);
+        config.run.device = device;
+        let path = folder.path().join(device.name());
+        RunDir::create(&path, &config).unwrap();
+        let command = command(&RunReport::read(&path).unwrap()).unwrap();
+        assert_eq!(command.contains(" --device cuda "), says, "{command}");
+    }
 }
 
 #[test]

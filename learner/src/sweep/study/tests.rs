@@ -121,6 +121,22 @@ fn the_command_line_keeps_to_some_runs_and_changes_all_of_them() {
     assert!(error.contains("seed is an axis, and --set has it, too"), "{error}");
 }
 
+#[test]
+fn a_run_of_other_data_is_never_taken_for_one_of_the_study() {
+    let study = read("axes = { task = ['hopper-demo'], seed = [0] }").unwrap();
+    let folder = tempfile::tempdir().unwrap();
+    for (dataset, is_its) in [("x.hdf5", true), ("y.hdf5", false)] {
+        let path = folder.path().join(dataset);
+        let mut config = crate::fixtures::config("run", 0);
+        config.experiment = Experiment { dataset: Some(dataset.to_owned()), ..study.runs[0].experiment.clone() };
+        RunDir::create(&path, &config).unwrap();
+        match study.runs[0].state(&path) {
+            Ok(state) => assert_eq!((state, is_its), (State::Begun(0), true)),
+            Err(error) => assert!(!is_its && error.to_string().ends_with("than the study's: dataset"), "{error}"),
+        }
+    }
+}
+
 /// How many runs studies have: Table 1 without two methods in mazes, Table 2's two on seven tasks, five values of τ, and what is
 /// compared today: seven methods with eight seeds in six mazes and with five tables of an arm.
 #[test]

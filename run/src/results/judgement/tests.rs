@@ -73,6 +73,17 @@ fn judgements_of_other_conditions_are_apart() {
 }
 
 #[test]
+fn a_judgement_takes_the_place_of_an_earlier_one_of_its_step() {
+    let folder = tempfile::tempdir().unwrap();
+    let run = RunDir::at(folder.path());
+    for (step, value) in [(40, 1.0), (20, 2.0), (40, 3.0)] {
+        Judgement { step, ..judgement("run", &[value], 10.0) }.keep(&run).unwrap();
+    }
+    let kept = Judgement::read_all(&run).unwrap();
+    assert_eq!(Vec::from_iter(kept.iter().map(|one| (one.step, one.estimate.values[0]))), [(20, 2.0), (40, 3.0)]);
+}
+
+#[test]
 fn judges_at_work_at_a_time_lose_no_judgement() {
     let folder = tempfile::tempdir().unwrap();
     let run = RunDir::at(folder.path());
