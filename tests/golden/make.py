@@ -79,13 +79,15 @@ ALGORITHMS = {variant: algorithm for algorithm in MODULES for variant in algorit
 
 
 def flatten(tree):
-    """The tensors of a file: names joined by dots, float32 unless whole numbers, scalars as [1]."""
+    """The tensors of a file: names joined by dots, float32 unless whole numbers, scalars as [1]; no fifth without a sample."""
     flat = {}
     for name, value in tree.items():
         if isinstance(value, dict):
             flat |= {f"{name}.{inner}": x for inner, x in flatten(value).items()}
         else:
             value = np.atleast_1d(np.asarray(value))
+            if name.startswith("lambda_fifth_") and np.isnan(value[0]):
+                continue
             flat[name] = value.astype(np.int64 if np.issubdtype(value.dtype, np.integer) else np.float32)
     return flat
 
