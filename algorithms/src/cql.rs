@@ -40,8 +40,6 @@ const LAST_LAYER: f64 = 0.01;
 /// log α' at the beginning, and the largest α'.
 const LOG_ALPHA_PRIME: f32 = 1.0;
 const MOST_ALPHA_PRIME: f64 = 1e6;
-/// Bounds of actions that the policy clones: at ±1 the density of a squashed Gaussian has no limit.
-const CLONED: f64 = 0.999;
 
 const METRICS: &[Metric] = &metrics! {
     q_mean held_out: "Mean over the batch of the critics' target y = r + γ·mask·min_k Q̂_k(s', a') with a' from the policy; of several a' the best.";
@@ -67,8 +65,7 @@ struct Config {
     threshold: Option<Finite>,
     /// Each state's gap counts as at least this.
     least_gap: Option<Finite>,
-    /// Uniform actions, actions of the policy and actions of the policy at s' over which the gap of a state is taken: so many of
-    /// each.
+    /// Uniform actions, actions of the policy at s and at s' over which the gap of a state is taken: so many of each.
     actions: Count,
     /// Next actions drawn per next state for the target; of several, the best counts.
     samples: Count,
@@ -199,7 +196,7 @@ impl Cql {
         let drawn = current.draw(&noise.policy)?;
         let log_density = drawn.log_density.squeeze(1)?;
         let worth = match self.config.phases.is_cloning(step, self.context.total_steps) {
-            true => current.log_density(&batch.actions.clamp(-CLONED, CLONED)?)?,
+            true => current.log_density(&self.actions(batch)?)?,
             false => smaller(&self.critics.network.detach().values(&batch.observations, &drawn.actions.squeeze(1)?)?)?,
         };
         let alpha = self.log_alpha.network.values().detach().exp()?;
@@ -217,6 +214,12 @@ impl Cql {
         Ok((Loss::new("critic_loss", loss).with("q_mean", targets.mean_all()?).with("gap", gap.clone()), gap))
     }
 
+    /// The data's actions, clipped in all steps of a run that clones: at ±1 the density of a squashed Gaussian has no limit.
+    fn actions(&self, batch: &Minibatch) -> Result<Tensor> {
+        let bound = if self.config.phases.cloning > 0 { 0.999 } else { 1.0 };
+        batch.actions.clamp(-bound, bound)
+    }
+
     /// y = r + γ·mask·max_a' min_k Q̂_k(s', a') over the actions drawn with this noise, `[B, S, a]`; `[B]`.
     fn targets(&self, batch: &Minibatch, next: &Normal, noise: &Tensor) -> Result<Tensor> {
         let actions = next.draw(noise)?.actions;
@@ -230,18 +233,15 @@ impl Cql {
         let (b, n, a) = noise.uniform.dims3()?;
         let [next, current] = [next.draw(&noise.next)?, current.draw(&noise.current)?];
         // [B, 1 + 3N, a]: one pass through the critics for all.
-        let actions = [&batch.actions.unsqueeze(1)?, &noise.uniform, &next.actions, &current.actions];
+        let actions = [&self.actions(batch)?.unsqueeze(1)?, &noise.uniform, &next.actions, &current.actions];
         let actions = Tensor::cat(&actions, 1)?.flatten(0, 1)?;
         let q = self.critics.network.values(&batch.observations, &actions)?.reshape((CRITICS, b, 1 + 3 * n))?;
         let of_data = q.narrow(2, 0, 1)?.squeeze(2)?;
         let uniform = Tensor::full(-(a as f32) * 2f32.ln(), (b, n), q.device())?;
         let densities = Tensor::cat(&[&uniform, &next.log_density, &current.log_density], 1)?;
         let corrected = q.narrow(2, 1, 3 * n)?.broadcast_sub(&densities)?;
-        let gaps = (log_sum_exp(&corrected)? - &of_data)?;
-        let gaps = match self.config.least_gap {
-            Some(least) => gaps.maximum(f64::from(*least))?,
-            None => gaps,
-        };
+        let least = self.config.least_gap.map_or(f64::NEG_INFINITY, |least| f64::from(*least));
+        let gaps = (log_sum_exp(&corrected)? - &of_data)?.maximum(least)?;
         Ok((of_data, gaps))
     }
 

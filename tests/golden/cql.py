@@ -12,7 +12,7 @@ from networks import adam_step, compiled, ensemble, fast_values, follow, near, r
 from networks import shape, single, values
 
 LOG_STD = -20.0, 2.0
-CLONED = 0.999
+CLIPPED = 0.999
 AGENT = {
     "gamma": 0.99,
     "weight": 3.0,
@@ -26,7 +26,7 @@ AGENT = {
 }
 VARIANTS = {
     "cql": {},
-    "cql-lagrange": {"samples": 5, "threshold": 0.5, "least_gap": 4.0},
+    "cql-lagrange": {"samples": 5, "threshold": 0.5, "least_gap": 4.0, "phases": {"cloning": 1, "learning": 3}},
     "cql-cloning": {"phases": {"cloning": 1, "learning": 1}},
 }
 
@@ -69,8 +69,7 @@ def actor_loss(actor, critics, batch, alpha, cloning, activation, critic_activat
     """The loss; also the policy's actions and their ln π."""
     states, actions, noise = batch
     drawn, density = (x[:, 0] for x in sampled(actor, states, noise[:, None], activation))
-    of_data = jnp.arctanh(jnp.clip(actions, -CLONED, CLONED))
-    cloned = squashed_density(of_data, *distribution(actor, states, activation))
+    cloned = squashed_density(jnp.arctanh(actions), *distribution(actor, states, activation))
     worth = jnp.where(cloning, cloned, values(critics, states, drawn, critic_activation).min(0))
     return jnp.mean(alpha * density - worth), (drawn, density)
 
@@ -116,9 +115,14 @@ def other_actions(config, state, inputs):
     return np.concatenate([uniform, following, current], 1), np.concatenate([flat, next_density, density], 1)
 
 
+def actions_of(config, inputs):
+    """The data's actions; a run that clones clips them, and not only while it clones."""
+    return np.clip(inputs["actions"], -CLIPPED, CLIPPED) if config["agent"]["phases"]["cloning"] else inputs["actions"]
+
+
 def update(config, state, inputs):
     """All that must come out."""
-    agent, step, s, a = config["agent"], config["step"], inputs["observations"], inputs["actions"]
+    agent, step, s, a = config["agent"], config["step"], inputs["observations"], actions_of(config, inputs)
     activations = agent["actor"]["activation"], agent["critic"]["activation"]
     rates = agent["actor_learning_rate"], agent["critic_learning_rate"]
     shares = agent["phases"]
@@ -176,7 +180,11 @@ def random_state(config, rng):
 def random_inputs(config, rng, size):
     agent, b, a = config["agent"], config["batch_size"], config["action_dim"]
     each = b, agent["actions"], a
-    return implicit.random_inputs(config, rng, size) | {
+    batch = implicit.random_inputs(config, rng, size)
+    # A quarter of the data's actions at the limit, so that clipping shows.
+    actions = np.where(rng.random((b, a)) < 0.25, np.copysign(0.99999, batch["actions"]), batch["actions"])
+    return batch | {
+        "actions": single(actions),
         "policy_noise": single(rng.normal(size=(b, a))),
         "target_noise": single(rng.normal(size=(b, agent["samples"], a))),
         "uniform_actions": single(rng.uniform(-1, 1, each)),

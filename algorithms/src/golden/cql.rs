@@ -43,6 +43,24 @@ fn a_run_of_any_length_is_divided_as_its_phases_are() {
     assert!(!Phases { cloning: 0, learning: Steps(1) }.is_cloning(0, 600));
 }
 
+/// young-geng's code clips them in the dataset, CORL's does not.
+#[test]
+fn a_run_that_clones_clips_the_datas_actions_for_the_critics_too() {
+    for golden in goldens("cql") {
+        let cql = start(&golden, &Device::Cpu);
+        let batch = batch(&golden, &cql.context);
+        let clipped = Minibatch { actions: batch.actions.clamp(-0.999, 0.999).unwrap(), ..batch.clone() };
+        let noise = cql.noise(0).unwrap();
+        let [next, current] =
+            [&batch.next_observations, &batch.observations].map(|s| cql.actor.constant_distribution(s).unwrap());
+        let [as_recorded, clipped] = [batch, clipped].map(|batch| {
+            let (q, _) = cql.gaps(&batch, &current, &next, &noise).unwrap();
+            q.flatten_all().unwrap().to_vec1::<f32>().unwrap()
+        });
+        assert_eq!(as_recorded == clipped, cql.config.phases.cloning > 0, "{}", golden.folder.display());
+    }
+}
+
 /// Networks begin near 0 in value and mean, whatever their hidden layers begin with; random numbers are a function of the step.
 #[test]
 fn a_run_begins_with_small_values_and_repeats_its_noise() {

@@ -23,6 +23,19 @@ fn demonstrations_are_short_whichever_algorithm_learns() {
     }
 }
 
+/// Through targets that follow at a rate, values near their fixed point as 1 − exp(−rate·(1 − γ)·steps) where episodes are long.
+#[test]
+fn critics_arrive_at_their_values_within_a_demonstration() {
+    let with_targets =
+        quad_algorithms::ALGORITHMS.iter().filter(|known| !["dtql", "sfbc", "diffuser"].contains(&known.name));
+    for algorithm in with_targets {
+        let changes = Table::from_iter([("algorithm".to_owned(), algorithm.name.into())]);
+        let demonstration = resolve("hopper-demo", &changes).unwrap();
+        let [rate, gamma] = ["ema_rate", "gamma"].map(|key| demonstration.agent[key].as_float().unwrap());
+        assert!(rate * (1.0 - gamma) * demonstration.steps as f64 > 3.0, "{}: {rate}", algorithm.name);
+    }
+}
+
 #[test]
 fn what_cannot_be_used_is_named_with_what_can() {
     for (preset, changes, words) in [
