@@ -21,6 +21,7 @@
 pub mod certificates;
 pub mod crowd;
 pub mod dashboard;
+pub mod hanging_disk;
 pub mod http;
 pub mod learner;
 pub mod link;

@@ -1,37 +1,18 @@
 //! A disk that hangs holds up neither the training nor the end.
 
 use std::fs;
-use std::path::{Path, PathBuf};
-use std::process::Command;
 use std::thread::sleep;
 use std::time::Duration;
 
 use quad_protocol::keys;
+use quad_run::run::RunDir;
 use quad_tests::PATIENCE;
-use quad_tests::learner::Learner;
+use quad_tests::hanging_disk::launcher;
 use quad_tests::made_up::{claim_eventually, client, name};
 use quad_tests::setting::ENDLESS;
 use quad_tests::system::Scratch;
 
 use crate::disk::{LISTEN, SETTING};
-
-/// Makes the disk of a learner that has ended hang at its next snapshot; gives the step of that.
-fn hang(learner: &Learner) -> u64 {
-    let kept = fs::read_dir(learner.run_dir.join("snapshots")).unwrap().count() as u64;
-    let next = (kept + 1) * SETTING.eval_interval;
-    assert!(next < SETTING.steps, "the training was over too soon");
-    make_pipe(&pipe(learner, next));
-    next
-}
-
-/// A program that opens a pipe to write into it waits for one that reads from it.
-fn make_pipe(path: &Path) {
-    assert!(Command::new("mkfifo").arg(path).status().unwrap().success());
-}
-
-fn pipe(learner: &Learner, step: u64) -> PathBuf {
-    learner.snapshot(step).with_extension("safetensors.partial")
-}
 
 #[test]
 fn a_disk_that_hangs_holds_up_neither_training_nor_the_end() {
@@ -40,12 +21,15 @@ fn a_disk_that_hangs_holds_up_neither_training_nor_the_end() {
     learner.process.wait_for_log("snapshot handed to evaluation", PATIENCE);
     learner.process.terminate(PATIENCE);
 
-    let next = hang(&learner);
+    let kept = fs::read_dir(learner.run_dir.join("snapshots")).unwrap().count() as u64;
+    let next = (kept + 1) * SETTING.eval_interval;
+    assert!(next < SETTING.steps, "the training was over too soon");
+    let launcher = launcher("fsync", &learner.snapshot(next));
     // After one signal it ends itself when its time is over, two end it at once.
     for (signals, code, reason) in
         [(1, 75, "9 s after SIGTERM something has not ended"), (2, 130, "received SIGTERM after SIGTERM")]
     {
-        let mut learner = scratch.learner_with("run", SETTING, &LISTEN);
+        let mut learner = scratch.learner_through(&launcher, "run", SETTING, &LISTEN);
         learner.process.wait_for_log("continues after step", PATIENCE);
         learner.wait_for_metric("gradient_steps_total", "", |steps| steps == SETTING.steps as f64);
         sleep(Duration::from_millis(200));
@@ -61,7 +45,6 @@ fn a_disk_that_hangs_holds_up_neither_training_nor_the_end() {
         assert!(learner.process.log().contains(reason), "after {signals} signals: {}", learner.process.log());
     }
 
-    fs::remove_file(pipe(&learner, next)).unwrap();
     let mut learner = scratch.learner_with("run", SETTING, &LISTEN);
     let _evaluator = scratch.evaluator("one", &learner.endpoint());
     learner.assert_completes(PATIENCE);
@@ -70,17 +53,17 @@ fn a_disk_that_hangs_holds_up_neither_training_nor_the_end() {
 #[tokio::test(flavor = "multi_thread")]
 async fn while_the_disk_hangs_that_is_read_from_claims_are_answered() {
     let scratch = Scratch::new();
-    let learner = scratch.learner("run", ENDLESS);
+    let (run, first) = (name("run"), ENDLESS.eval_interval);
+    let hung = RunDir::at(&scratch.path().join("run")).snapshot_path(first);
+    let listen = ["--listen", "tcp/127.0.0.1:0"];
+    let learner = scratch.learner_through(&launcher("read", &hung), "run", ENDLESS, &listen);
     // The newest snapshot comes from memory.
     learner.wait_for_metric("snapshots_published_total", "", |published| published > 1.0);
-    let (run, first) = (name("run"), ENDLESS.eval_interval);
-    fs::remove_file(learner.snapshot(first)).unwrap();
-    make_pipe(&learner.snapshot(first));
     let session = client(&learner.endpoint()).await;
     for _ in 0..20 {
         session.get(keys::weights_at(&run, first)).timeout(PATIENCE).callback(drop).await.unwrap();
     }
     sleep(Duration::from_millis(200));
-    // Nothing is written to the pipe, so the answer cannot have waited for the disk.
+    // The answer cannot have waited for the disk, which never gives that snapshot.
     assert_eq!(claim_eventually(&session, &run, "a").await.step, first);
 }

@@ -4,6 +4,7 @@ use std::fs;
 use std::path::PathBuf;
 use std::process::Command;
 
+use quad_tests::hanging_disk::launcher;
 use quad_tests::process::{Process, binary};
 use quad_tests::setting::{SHORT, Setting};
 use quad_tests::system::{Scratch, free_port};
@@ -208,19 +209,16 @@ fn a_sweep_that_is_told_to_end_says_that_it_is_not_complete_whatever_hangs() {
     assert!(!study.states()[0].starts_with("failed"), "{:?}", study.states());
 
     // A disk that hangs when the sweep reads how one of two runs has ended.
-    let mut sweep = study.sweep(&["--jobs", "2"]);
+    let mut through = Command::new("env");
+    through.args(&launcher("read", &study.dir(RUNS[1]).join("learner.log"))[1..]);
+    through.arg(binary("learner")).args(study.command(&["--jobs", "2"]).get_args());
+    let mut sweep = Process::start("sweep", study.scratch.path(), through);
     study.wait_for(RUNS[1]);
     let learner = eventually("there is a learner", PATIENCE, || learner_of(&sweep, RUNS[1]));
-    let hung = study.dir(RUNS[1]).join("learner.log");
-    let aside = hung.with_extension("aside");
-    fs::rename(&hung, &aside).unwrap();
-    assert!(Command::new("mkfifo").arg(&hung).status().unwrap().success());
     kill("-KILL", &learner);
     study.wait_for(RUNS[2]);
     sweep.signal("TERM");
     assert_eq!(sweep.wait(PATIENCE).code(), Some(75), "{}", sweep.log());
     let log = fs::read_to_string(study.dir(RUNS[2]).join("learner.log")).unwrap();
     assert!(log.contains("received SIGTERM") && log.contains("the same command continues"), "{log}");
-    fs::remove_file(&hung).unwrap();
-    fs::rename(&aside, &hung).unwrap();
 }
