@@ -62,12 +62,14 @@ fn a_stderr_that_is_never_read_holds_up_neither_the_work_nor_the_end() {
 #[test]
 fn a_learner_ends_in_order_by_every_signal_that_tells_it_to() {
     let scratch = Scratch::new();
-    let nohup = ["env", "--ignore-signal=HUP,CHLD"].map(str::to_owned);
-    for (run, launcher, signal) in [("hup", &[][..], "HUP"), ("usr1", &[], "USR1"), ("nohup", &nohup, "TERM")] {
+    // The tests themselves may run under `nohup`.
+    let [session, nohup] =
+        ["--default-signal=HUP", "--ignore-signal=HUP,CHLD"].map(|how| ["env", how].map(str::to_owned));
+    for (run, launcher, signal) in [("hup", &session, "HUP"), ("usr1", &session, "USR1"), ("nohup", &nohup, "TERM")] {
         let listen = ["--listen", "tcp/127.0.0.1:0", "--evaluators", "1"];
         let mut learner = scratch.learner_through(launcher, run, ENDLESS, &listen);
         learner.wait_for_scores(0);
-        if !launcher.is_empty() {
+        if run == "nohup" {
             learner.process.signal("HUP");
             learner.wait_for_scores(learner.scores().len());
         }
