@@ -90,14 +90,18 @@ async fn scores_are_sent_again_until_the_learner_has_saved_them() {
 
 #[tokio::test(flavor = "multi_thread")]
 async fn an_evaluator_that_leaves_hands_its_job_back_unless_its_scores_may_be_saved() {
-    for (answer, handed_back) in [(Answer::DiskFull, 0), (Answer::Nothing, 1)] {
+    for (answer, goes_back) in [(Answer::DiskFull, false), (Answer::Nothing, true)] {
         let learner = Learner::start(snapshot(file(2))).await;
         learner.answer(answer);
         learner.give(job(&learner.snapshot));
         let (evaluator, _tokens) = learner.evaluator().await;
         learner.wait_for_scores(1).await;
         assert!(evaluator.leave().success());
-        assert_eq!(learner.count(|heard| matches!(heard, Heard::HandedBack(_))), handed_back);
+        if goes_back {
+            // On a busy machine it is heard only after the evaluator has gone.
+            learner.wait_for(handed_back).await;
+        }
+        assert_eq!(learner.count(|heard| matches!(heard, Heard::HandedBack(_))), usize::from(goes_back));
         assert!(learner.count(|heard| matches!(heard, Heard::Scores(_))) > 1, "they are sent again");
     }
 }

@@ -134,10 +134,10 @@ mod tests {
     #[test]
     fn what_the_command_line_does_not_say_is_as_the_policy_has_it() {
         let own = Choice { value: Reduce::Min, ..Choice::best_of(7) };
-        let rule = Some(Rule::Softmax { temperature: 0.5 });
+        let rule = Rule::Softmax { temperature: 0.5 };
         assert!(choices(&ScoreArgs::default(), Some(own)).is_empty());
-        let asked = ScoreArgs { rule, ..ScoreArgs::default() };
-        assert_eq!(choices(&asked, Some(own)), [Choice { rule: rule.unwrap_or(own.rule), ..own }]);
+        let asked = ScoreArgs { rule: Some(rule), ..ScoreArgs::default() };
+        assert_eq!(choices(&asked, Some(own)), [Choice { rule, ..own }]);
         let asked = ScoreArgs { candidates: vec![1, 10], ..ScoreArgs::default() };
         assert_eq!(choices(&asked, Some(own)), [1, 10].map(|candidates| Choice { candidates, ..own }));
     }
