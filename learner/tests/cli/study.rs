@@ -194,9 +194,13 @@ fn runs_are_compared_with_those_of_their_own_seed() {
 
 #[test]
 fn a_robot_without_reference_returns_is_in_no_mean_with_one_that_has_them() {
-    let (report, _) = report_of(&[("a", TASKS[0], 0, 40.0), ("b", "my-robot", 0, 900.0)]);
+    let robot = "my-robot";
+    let (report, _) = report_of(&[("a", TASKS[0], 0, 40.0), ("b", robot, 0, 900.0), ("dac", robot, 0, 950.0)]);
     let means = report["study"].as_array().unwrap().iter().map(|one| one["mean"]["value"].as_f64().unwrap());
-    assert_eq!(Vec::from_iter(means), [40.0, 900.0]);
+    assert_eq!(Vec::from_iter(means), [40.0, 900.0, 950.0]);
+    // Its own methods are compared with each other.
+    let [comparison] = &report["comparisons"].as_array().unwrap()[..] else { panic!("{report}") };
+    assert_eq!((&comparison["tasks"], &comparison["mean_difference"]), (&json!([robot]), &json!(50.0)));
 }
 
 #[test]
