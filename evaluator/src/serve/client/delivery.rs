@@ -92,7 +92,9 @@ impl RunClient {
         }
         if !answered {
             self.return_job(None);
-            self.hand_back(LEAVE / 2).await.ok();
+            while self.hand_back(LEAVE / 2).await.is_err() && Instant::now() + AGAIN < until {
+                tokio::time::sleep(AGAIN).await;
+            }
         }
     }
 
@@ -104,21 +106,20 @@ impl RunClient {
         });
     }
 
-    /// Hands the job back to the learner that gave it; another one knows nothing of it.
+    /// Hands the job back to the learner that gave it.
     async fn hand_back(&mut self, timeout: Duration) -> anyhow::Result<()> {
         let Some(Owed::Job { id, incarnation, failed }) = &self.owed else { return Ok(()) };
         let (job, incarnation, failed) = (*id, *incarnation, failed.clone());
-        if incarnation == self.incarnation {
-            let fitting = move |reply: &JobReply| match reply {
-                JobReply::HandedBack { incarnation: of, .. } => is_from(incarnation, *of),
-                _ => Err("unexpected"),
-            };
-            let request = encode(&JobRequest::HandBack { evaluator: self.evaluator.clone(), job, failed })?;
-            let key = keys::jobs(&self.run);
-            let answer = ask(&self.session, key, request, timeout, &self.metrics, fitting).await?;
-            if let JobReply::HandedBack { accepted: true, .. } = answer {
-                info!(run = %self.run, "a job was handed back");
-            }
+        let fitting = move |reply: &JobReply| match reply {
+            JobReply::HandedBack { incarnation: of, .. } => is_from(incarnation, *of),
+            _ => Err("unexpected"),
+        };
+        let request = encode(&JobRequest::HandBack { evaluator: self.evaluator.clone(), job, failed })?;
+        match ask(&self.session, keys::jobs(&self.run), request, timeout, &self.metrics, fitting).await {
+            Ok(JobReply::HandedBack { accepted: true, .. }) => info!(run = %self.run, "a job was handed back"),
+            Err(error) if incarnation == self.incarnation => return Err(error.into()),
+            // Where another learner is followed by now, the one that gave the job may be gone, and is not waited for.
+            Ok(_) | Err(_) => {}
         }
         self.owed = None;
         Ok(())
