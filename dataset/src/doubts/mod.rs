@@ -43,7 +43,7 @@ pub(crate) fn of_numbers(recording: &Recording, scale: Scale, rule: RewardRule) 
     let mut doubts = Vec::from_iter(rewards::alike(recording));
     if doubts.is_empty() {
         doubts.extend(rewards::after_goal(recording));
-        // Whoever chose another rule has seen to it.
+        // A task's rule, or a scale, decides the size already.
         let is_own = rule == RewardRule::AsIs && !scale.rewards;
         doubts.extend(if is_own { rewards::size(recording) } else { None });
     }

@@ -92,7 +92,7 @@ fn a_value_that_is_not_the_tasks_own_is_named_on_every_task() {
     }
 }
 
-/// Two tasks of a user's own, in environments with reference returns: nobody knows which τ is a task's own.
+/// Two tasks of a user's own, in environments with reference returns: the report does not know which τ is a task's own.
 #[test]
 fn values_of_a_users_own_tasks_are_named() {
     let rows = |tasks: &[(&str, &str, f64)]| {
