@@ -30,7 +30,7 @@ fetch_toolkit() {
   for library in "$fetched"/lib/lib*.so.*; do
     ln -sf "${library##*/}" "${library%.so.*}.so"
   done
-  mv "$SCRATCH"/*.dist-info "$fetched" # with the licences
+  mv "$SCRATCH"/*.dist-info "$fetched" # with the licenses
   cp deploy/cuda.txt "$fetched"
   rm -rf "$TOOLKIT"
   mv "$fetched" "$TOOLKIT"

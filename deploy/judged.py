@@ -5,8 +5,8 @@
 
 A file's name begins with its environment, as for deploy/results.sh: hopper, halfcheetah, walker2d or antmaze_umaze. The runs are
 the demonstration's, but hold out a tenth of the episodes; the true score of a policy is its mean over 100 episodes. Prints for each
-file and seed how the judgement's order agrees with the true one (Spearman's rank correlation), and what is lost by taking the
-judgement's first policy instead of the truly best. Runs go to runs/judged; what is done already is skipped.
+file and seed how the judgment's order agrees with the true one (Spearman's rank correlation), and what is lost by taking the
+judgment's first policy instead of the truly best. Runs go to runs/judged; what is done already is skipped.
 """
 
 import argparse
@@ -67,7 +67,7 @@ def main():
     jobs = [(given.programs, file, seed, method) for seed in given.seeds for file in given.files for method in METHODS]
     with ThreadPoolExecutor(os.cpu_count()) as pool:
         list(pool.map(lambda job: train(*job), jobs))
-    print("| file | seed | rank correlation | best | judged best | lost | doubtful | behaviour off | range | ranks |")
+    print("| file | seed | rank correlation | best | judged best | lost | doubtful | behavior off | range | ranks |")
     print("|---|---:|---:|---:|---|---:|---:|---:|---:|---|")
     for file in given.files:
         for seed in given.seeds:

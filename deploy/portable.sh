@@ -56,8 +56,8 @@ build_portable() {
   rm -rf "$STAGE"
   mkdir -p "$STAGE/bin" "$STAGE/lib" "$STAGE/licenses"
   # First, since it fetches crates: where that fails, it does so before the long build.
-  "$TOOLS/bin/python" deploy/licences.py >"$STAGE/licenses/LICENSE-third-party" ||
-    die "the crates' licences cannot be collected" "is there a network, and does this machine reach crates.io (or its mirror)?"
+  "$TOOLS/bin/python" deploy/licenses.py >"$STAGE/licenses/LICENSE-third-party" ||
+    die "the crates' licenses cannot be collected" "is there a network, and does this machine reach crates.io (or its mirror)?"
   say "building the programs; the first time takes ten minutes on two cores"
   cargo build --release --locked -p quad-learner -p quad-evaluator --features quad-learner/static,quad-evaluator/static
   install --strip "$CARGO_TARGET_DIR/release/learner" "$CARGO_TARGET_DIR/release/evaluator" "$STAGE/bin"

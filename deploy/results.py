@@ -53,7 +53,7 @@ def main(runs):
     row("its episodes", "", *files.values())
     for method, candidates in dict.fromkeys(key[:2] for key in scores):
         row(method, candidates, *(spread(scores[method, candidates, file]) for file in files))
-    print("\nNormalised score: mean of a run's last snapshots,", " or ".join(sorted(settings)) + "; ± over the seeds.")
+    print("\nNormalized score: mean of a run's last snapshots,", " or ".join(sorted(settings)) + "; ± over the seeds.")
 
 
 main(sys.argv[1:])

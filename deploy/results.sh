@@ -7,7 +7,7 @@
 #   deploy/results.sh data/hopper-demo.hdf5          the demonstration's own file, which is recorded if it is not there
 #   deploy/results.sh --methods "bc dac quad" --candidates 1,10 walker2d*.hdf5
 #
-# A method is the name of an algorithm, or of one of QUAD's variants: bc (behaviour cloning) and dac. With --candidates policies
+# A method is the name of an algorithm, or of one of QUAD's variants: bc (behavior cloning) and dac. With --candidates policies
 # that draw several actions are scored with so many of them, else as their algorithm has it.
 # A file's name begins with its environment: hopper, halfcheetah, walker2d, antmaze_umaze or antmaze_medium. Runs go to
 # runs/results. What is done already is skipped, so it can be interrupted and run in pieces. One run per core at a time,

@@ -64,7 +64,7 @@ install_packages() {
   apt_get install --yes --no-install-recommends "${missing[@]}"
 }
 
-# The wheel's shared library, its licence, and the unversioned link that the linker looks for.
+# The wheel's shared library, its license, and the unversioned link that the linker looks for.
 fetch_mujoco() {
   local target=$DEPS/mujoco
   # By its version: an older one does not fit the programs.

@@ -19,10 +19,10 @@ QUAD $version: offline reinforcement learning, for Linux on x86-64 with glibc $G
 Nothing needs to be installed. Keep bin/ and lib/ beside each other: evaluator finds libmujoco there.
 
     export PATH="\$PWD/bin:\$PATH"
-    evaluator collect --env hopper --out hopper-demo.hdf5                   # records behaviour, a minute or two
+    evaluator collect --env hopper --out hopper-demo.hdf5                   # records behavior, a minute or two
     learner train --task hopper-demo --dataset hopper-demo.hdf5             # and the evaluators that it starts
 
-licenses/ has the licences of QUAD, of MuJoCo and of all that is compiled in.
+licenses/ has the licenses of QUAD, of MuJoCo and of all that is compiled in.
 README
 archive=dist/$folder-x86_64-linux.tar.gz
 tar --create --directory="$SCRATCH" --sort=name --owner=0 --group=0 --numeric-owner "$folder" | gzip --best --no-name >"$archive"

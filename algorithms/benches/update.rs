@@ -88,7 +88,7 @@ fn transitions(count: usize) -> Transitions {
         terminals: vec![false; count],
         timeouts: (1..=count).map(|row| row == count).collect(),
     };
-    Transitions::of(arrays).expect("numbers that can be learnt from")
+    Transitions::of(arrays).expect("numbers that can be learned from")
 }
 
 fn updates(criterion: &mut Criterion) {
@@ -197,7 +197,7 @@ fn parts_of(group: &mut BenchmarkGroup<'_, WallTime>, experiment: &Experiment, s
     bench(group, "critic step", || regress(&critics));
     let step = AdamStep { rate: 1e-9, clip: Some(1.0), count: 1 };
     let gradient = regress(&critics)?.copy()?;
-    bench(group, "critic optimiser", || critic_adam.descend(critics.weights_mut(), &gradient, step));
+    bench(group, "critic optimizer", || critic_adam.descend(critics.weights_mut(), &gradient, step));
     bench(group, "critic EMA", || target_critics.weights_mut().ema_update(critics.weights(), 0.005));
     bench(group, "Q-gradients' scale", || target_critics.values(&observations, &actions));
     bench(group, "Q-gradients", || target_critics.action_gradients(&observations, &actions));
@@ -216,7 +216,7 @@ fn parts_of(group: &mut BenchmarkGroup<'_, WallTime>, experiment: &Experiment, s
         Ok(gradient)
     });
     let gradient = clone(&actor)?.copy()?;
-    bench(group, "actor optimiser and EMA", || {
+    bench(group, "actor optimizer and EMA", || {
         actor_adam.descend(actor.weights_mut(), &gradient, step)?;
         target_actor.weights_mut().ema_update(actor.weights(), 0.005)
     });

@@ -110,13 +110,13 @@ fn bc_loss(networks: &Networks, batch: &Minibatch, noise: &Denoising) -> Result<
 }
 
 impl AlignIql {
-    /// V(s) towards an expectile of the smaller Q̂(s, a), `[B]`, IQL's Eq. 5.
+    /// V(s) toward an expectile of the smaller Q̂(s, a), `[B]`, IQL's Eq. 5.
     fn value_loss(&self, batch: &Minibatch, q: &Tensor) -> Result<Loss> {
         let u = (q - self.value.network.state_values(&batch.observations)?.squeeze(0)?)?;
         Ok(Loss::new("value_loss", expectile_loss(&u, *self.config.expectile)?))
     }
 
-    /// Q(s, a) towards r + γ·V(s'), IQL's Eq. 6. Also measures V and, with the smaller Q̂(s, a), the advantage.
+    /// Q(s, a) toward r + γ·V(s'), IQL's Eq. 6. Also measures V and, with the smaller Q̂(s, a), the advantage.
     fn critic_loss(&self, networks: &Networks, batch: &Minibatch, q: &Tensor) -> Result<Loss> {
         let value = self.value.network.detach();
         let targets = batch.target(*self.config.gamma, &value.state_values(&batch.next_observations)?.squeeze(0)?)?;

@@ -191,7 +191,7 @@ impl Cql {
         measured(&[actor_loss, critic_loss.with("alpha_prime", alpha_prime)])
     }
 
-    /// The policy towards large Q and entropy; and the mean of its log density, `[]`, a constant.
+    /// The policy toward large Q and entropy; and the mean of its log density, `[]`, a constant.
     fn actor_loss(&self, step: u64, batch: &Minibatch, current: &Normal, noise: &Noise) -> Result<(Loss, Tensor)> {
         let drawn = current.draw(&noise.policy)?;
         let log_density = drawn.log_density.squeeze(1)?;
@@ -205,7 +205,7 @@ impl Cql {
         Ok((loss.with("entropy", log_density.neg()?).with("alpha", alpha), log_density))
     }
 
-    /// The critics towards r + γ·Q̂(s', a'); and how far they also go down, the gap between all actions at s and the data's, `[]`.
+    /// The critics toward r + γ·Q̂(s', a'); and how far they also go down, the gap between all actions at s and the data's, `[]`.
     fn critic_loss(&self, batch: &Minibatch, current: &Normal, next: &Normal, noise: &Noise) -> Result<(Loss, Tensor)> {
         let targets = self.targets(batch, next, &noise.target)?;
         let (q, gaps) = self.gaps(batch, current, next, noise)?;

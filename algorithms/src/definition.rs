@@ -37,7 +37,7 @@ pub struct Metric {
     pub help: &'static str,
     /// What the progress display calls it; empty where it does not show it.
     pub label: &'static str,
-    /// Whether it is also measured on held-out episodes: it says something of data that is not learnt from.
+    /// Whether it is also measured on held-out episodes: it says something of data that is not learned from.
     pub held_out: bool,
 }
 
@@ -67,7 +67,7 @@ pub struct Reporting {
     /// What its paper draws scores over.
     pub axis: Option<Axis>,
     /// What a run's metrics say about it.
-    pub summary: Option<Summarise>,
+    pub summary: Option<Summarize>,
 }
 
 impl Reporting {
@@ -93,8 +93,8 @@ pub struct Axis {
     pub symbol: &'static str,
 }
 
-/// Summarises the metrics of a run of a variant, if there is something to say.
-pub type Summarise = fn(&[MetricsLine], &str) -> Option<Summary>;
+/// Summarizes the metrics of a run of a variant, if there is something to say.
+pub type Summarize = fn(&[MetricsLine], &str) -> Option<Summary>;
 
 /// A line of `metrics.jsonl`: means over some steps, by name.
 pub type MetricsLine = BTreeMap<String, f64>;

@@ -76,7 +76,7 @@ pub(super) trait Update: Send {
     /// They are drawn on the CPU.
     fn noise(&self, networks: &Networks, generator: &mut ChaCha8Rng) -> Result<Self::Noise>;
 
-    /// Sets the optimisers for update number `step`, from 0.
+    /// Sets the optimizers for update number `step`, from 0.
     fn begin(&mut self, networks: &mut Networks, step: u64) -> Result<()>;
 
     /// The work of an update, as [`Replay::start`] wants it.

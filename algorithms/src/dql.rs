@@ -1,5 +1,5 @@
 //! Diffusion-QL (Wang, Hunt and Zhou 2022, "Diffusion Policies as an Expressive Policy Class for Offline Reinforcement
-//! Learning"): a diffusion policy that is cloned from the data and moved towards actions of large Q, by the gradient through
+//! Learning"): a diffusion policy that is cloned from the data and moved toward actions of large Q, by the gradient through
 //! its whole reverse chain. Equations are that paper's; where its authors' code does otherwise, docs/deviations.md says so.
 
 #[cfg(test)]
@@ -83,7 +83,7 @@ struct Config {
 struct Noise {
     /// Noise of the sampled next actions, `[T, B·S, a]`.
     next: Tensor,
-    /// Noise of the actions that are moved towards large Q, `[T, B, a]`.
+    /// Noise of the actions that are moved toward large Q, `[T, B, a]`.
     policy: Tensor,
     /// i and ε of Eq. 2.
     denoising: Denoising,
@@ -120,14 +120,14 @@ impl Config {
         batch.target(*self.gamma, &smaller(&best)?)
     }
 
-    /// Q(s, a) towards r + γ·min_k Q̂_k(s', a'), Eq. 4.
+    /// Q(s, a) toward r + γ·min_k Q̂_k(s', a'), Eq. 4.
     fn critic_loss(&self, networks: &Networks, batch: &Minibatch, noise: &Noise) -> Result<Loss> {
         let targets = self.targets(networks, batch, &noise.next)?;
         let error = networks.critics.network.squared_error(&batch.observations, &batch.actions, &targets)?;
         Ok(Loss::new("critic_loss", (error * CRITICS as f64)?).with("q_mean", targets.mean_all()?))
     }
 
-    /// The policy: cloned, Eq. 2, and moved towards what the critics value, Eq. 3.
+    /// The policy: cloned, Eq. 2, and moved toward what the critics value, Eq. 3.
     fn actor_loss(&self, networks: &Networks, batch: &Minibatch, noise: &Noise) -> Result<Loss> {
         let (_, predicted) = networks.denoise(batch, &noise.denoising)?;
         let bc_loss = mse(&predicted, &noise.denoising.epsilon)?;

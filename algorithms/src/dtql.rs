@@ -1,6 +1,6 @@
 //! Diffusion Trusted Q-Learning (Chen, Wang and Zhou 2024, "Diffusion Policies creating a Trust Region for Offline
 //! Reinforcement Learning"): a diffusion policy μ_φ only clones the data. How badly it denoises the actions of a second policy
-//! π_θ, of one step, says how far these are from the data's: inside that trust region π_θ moves towards large Q, and no chain
+//! π_θ, of one step, says how far these are from the data's: inside that trust region π_θ moves toward large Q, and no chain
 //! of denoising steps is ever sampled. Where the authors' code says more than their paper, docs/deviations.md has it.
 
 #[cfg(test)]
@@ -186,7 +186,7 @@ impl Dtql {
         Ok(measured)
     }
 
-    /// V(s) towards an expectile of the smaller Q(s, a), and Q(s, a) towards r + γ·V(s'), both as they are before this step.
+    /// V(s) toward an expectile of the smaller Q(s, a), and Q(s, a) toward r + γ·V(s'), both as they are before this step.
     fn value_losses(&self, batch: &Minibatch) -> Result<[Loss; 2]> {
         let next = self.value.network.detach().state_values(&batch.next_observations)?.squeeze(0)?;
         let targets = batch.target(*self.config.gamma, &next)?;
@@ -198,13 +198,13 @@ impl Dtql {
         Ok([Loss::new("value_loss", value_loss).with("v_mean", v.mean_all()?), critic_loss])
     }
 
-    /// μ_φ towards the data's actions.
+    /// μ_φ toward the data's actions.
     fn bc_loss(&self, batch: &Minibatch, noising: &Noising) -> Result<Loss> {
         let loss = denoising_loss(&self.diffusion.network, &batch.observations, &batch.actions, noising)?;
         Ok(Loss::new("bc_loss", loss))
     }
 
-    /// π_θ towards actions that the critics value and that μ_φ, which is fixed, denoises well.
+    /// π_θ toward actions that the critics value and that μ_φ, which is fixed, denoises well.
     fn actor_loss(&self, batch: &Minibatch, noise: &Noise) -> Result<Loss> {
         let distribution = self.actor.distribution(&batch.observations)?;
         let actions = distribution.draw(&noise.policy.unsqueeze(1)?)?.actions.squeeze(1)?;

@@ -1,6 +1,6 @@
 //! Fitted Q evaluation (Le, Voloshin and Yue 2019, "Batch Policy Learning under Constraints"; with the clipped targets of Fu et
-//! al. 2021, "Benchmarks for Deep Off-Policy Evaluation"): what a policy that is given would be worth, learnt from the data
-//! alone. Q moves towards r + γ·mask·Q̂(s', a') with the action a' that the policy takes at s', drawn once for each s'.
+//! al. 2021, "Benchmarks for Deep Off-Policy Evaluation"): what a policy that is given would be worth, learned from the data
+//! alone. Q moves toward r + γ·mask·Q̂(s', a') with the action a' that the policy takes at s', drawn once for each s'.
 //!
 //! It makes no policy, so it is none of [`ALGORITHMS`](crate::ALGORITHMS): `learner judge` runs it.
 
@@ -143,7 +143,7 @@ impl Fqe {
         Ok(Self { target_critic: critic.network.copy()?, critic, config, units, context, items, next_actions })
     }
 
-    /// Begins with the networks of another evaluation, such as the behaviour's, from whose values a policy's differ little.
+    /// Begins with the networks of another evaluation, such as the behavior's, from whose values a policy's differ little.
     ///
     /// # Errors
     /// Candle fails.

@@ -1,5 +1,5 @@
 //! What IQL and its kin share: they never ask for the value of an action that is not in the data. V(s) is fitted to the target
-//! critics' smaller value, a Gaussian policy is cloned from the data with weights, and twin critics move towards r + γ·V(s').
+//! critics' smaller value, a Gaussian policy is cloned from the data with weights, and twin critics move toward r + γ·V(s').
 //! An algorithm of this kind is its [`Losses`].
 
 use super::algorithm::{AgentError, Algorithm, Loss, Measured, measured, smaller};
@@ -173,13 +173,13 @@ impl<L: Losses> InSample<L> {
         }
     }
 
-    /// V(s) towards the smaller Q̂(s, a).
+    /// V(s) toward the smaller Q̂(s, a).
     fn value_loss(&self, (states, q): &(Tensor, Tensor)) -> Result<Loss> {
         let loss = self.losses.value_loss(q, &self.value.network.state_values(states)?.squeeze(0)?)?;
         Ok(Loss::new("value_loss", loss))
     }
 
-    /// The policy towards actions of the data, the more so the better they are.
+    /// The policy toward actions of the data, the more so the better they are.
     fn actor_loss(&self, batch: &Minibatch, q: &Tensor) -> Result<Loss> {
         let v = self.value.network.detach().state_values(&batch.observations)?.squeeze(0)?;
         let advantage = (q - &v)?;
@@ -194,7 +194,7 @@ impl<L: Losses> InSample<L> {
             .with("clipped_share", clipped.mean_all()?))
     }
 
-    /// Q(s, a) towards r + γ·V(s').
+    /// Q(s, a) toward r + γ·V(s').
     fn critic_loss(&self, batch: &Minibatch) -> Result<Loss> {
         let next = self.value.network.detach().state_values(&batch.next_observations)?.squeeze(0)?;
         let targets = batch.target(*self.losses.common().gamma, &next)?;

@@ -1,5 +1,5 @@
 //! IQL (Kostrikov, Nair and Levine 2021, "Offline Reinforcement Learning with Implicit Q-Learning"): a value function
-//! learnt by expectile regression, and a Gaussian policy cloned from the data with advantages as weights. Equations are
+//! learned by expectile regression, and a Gaussian policy cloned from the data with advantages as weights. Equations are
 //! that paper's.
 
 #[cfg(test)]
@@ -55,7 +55,7 @@ impl Losses for Config {
         &self.common
     }
 
-    /// Eq. 5: V(s) towards an expectile.
+    /// Eq. 5: V(s) toward an expectile.
     fn value_loss(&self, q: &Tensor, v: &Tensor) -> Result<Tensor> {
         expectile_loss(&(q - v)?, *self.expectile)
     }

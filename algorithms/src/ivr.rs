@@ -1,5 +1,5 @@
 //! IVR (Xu et al. 2023, "Offline RL with No OOD Actions: In-Sample Learning via Implicit Value Regularization"): V and Q of a
-//! problem whose reward is less what the policy's divergence from the data's costs, learnt from actions of the data alone. The
+//! problem whose reward is less what the policy's divergence from the data's costs, learned from actions of the data alone. The
 //! divergence decides the variant: SQL, sparse Q-learning, or EQL, exponential Q-learning. Equations are that paper's; where
 //! its authors' code does something else, docs/deviations.md says what holds.
 
@@ -50,7 +50,7 @@ enum Divergence {
     Exponential,
 }
 
-/// The strength of regularisation with each.
+/// The strength of regularization with each.
 #[derive(Deserialize)]
 #[serde(deny_unknown_fields)]
 struct Alpha {

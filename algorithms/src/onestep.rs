@@ -1,5 +1,5 @@
 //! Onestep-RL (Brandfonbrener, Whitney, Ranganath and Bruna 2021, "Offline RL Without Off-Policy Evaluation"), with
-//! exponential weights, in three phases: the data's policy β is cloned, its value Q^β is learnt from the data's own next
+//! exponential weights, in three phases: the data's policy β is cloned, its value Q^β is learned from the data's own next
 //! actions, and β is improved once. No value of the improved policy is ever asked for.
 
 #[cfg(test)]
@@ -37,7 +37,7 @@ const MOST_WEIGHT: f64 = 100.0;
 const LOG_STD: (f64, f64) = (-5.0, 0.0);
 
 const METRICS: &[Metric] = &metrics! {
-    behavior_loss ["behaviour loss"] held_out: "First phase: mean over the batch of −log β(a|s).";
+    behavior_loss ["behavior loss"] held_out: "First phase: mean over the batch of −log β(a|s).";
     critic_loss ["critic loss"] held_out: "Second phase: mean over the batch of (Q(s, a) − y)².";
     q_mean held_out: "Second phase: mean over the batch of the critic's target y = r + γ·mask·Q̂(s', a') with the data's next action a'.";
     actor_loss ["actor loss"] held_out: "Third phase: mean over the batch of −weight·log π(a|s) with weight = exp(temperature·A), at most 100.";
@@ -93,7 +93,7 @@ struct Onestep {
     /// Q, and its EMA Q̂.
     critic: Trained<Ensemble>,
     target_critic: Ensemble,
-    /// π. Until its phase it is β, and its optimiser is new.
+    /// π. Until its phase it is β, and its optimizer is new.
     actor: Trained<Ensemble>,
 }
 
@@ -144,7 +144,7 @@ impl Onestep {
         AdamStep::after(steps, *self.config.learning_rate)
     }
 
-    /// First phase: β towards the data's actions, and π with it.
+    /// First phase: β toward the data's actions, and π with it.
     fn clone_behavior(&mut self, batch: &Minibatch, steps: u64) -> Result<Measured> {
         let loss = self.behavior_loss(batch)?;
         self.behavior.descend(&loss.value, self.adam(steps))?;
@@ -167,7 +167,7 @@ impl Onestep {
         measured(&[loss])
     }
 
-    /// Q(s, a) towards r + γ·Q̂(s', a'), with the action a' that the data takes next, `[B, a]`.
+    /// Q(s, a) toward r + γ·Q̂(s', a'), with the action a' that the data takes next, `[B, a]`.
     fn critic_loss(&self, batch: &Minibatch, next_actions: &Tensor) -> Result<Loss> {
         let next = self.target_critic.values(&batch.next_observations, next_actions)?.squeeze(0)?;
         let targets = batch.target(*self.config.gamma, &next)?;
@@ -182,7 +182,7 @@ impl Onestep {
         measured(&[loss])
     }
 
-    /// π towards actions of the data, the more so the better they are than β's.
+    /// π toward actions of the data, the more so the better they are than β's.
     fn actor_loss(&self, batch: &Minibatch, noise: &Tensor) -> Result<Loss> {
         let q = self.critic.network.detach().values(&batch.observations, &batch.actions)?.squeeze(0)?;
         let advantage = (q - self.value(&batch.observations, noise)?)?;

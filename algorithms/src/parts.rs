@@ -31,7 +31,7 @@ impl<'a> Parts<'a> {
         self
     }
 
-    /// The weights of a network, and its optimiser's moments.
+    /// The weights of a network, and its optimizer's moments.
     pub(super) fn trained<N: Weighted>(mut self, name: &'static str, trained: &'a mut Trained<N>) -> Self {
         let Trained { network, adam } = trained;
         self.0.push((name, Part::Adam(adam, network.weights().layout().clone())));

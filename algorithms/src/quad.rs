@@ -36,7 +36,7 @@ pub(super) const DEFINITION: Definition = Definition {
     settings: include_str!("../../presets/quad.toml"),
     metrics: METRICS,
     report: Reporting {
-        // DAC and behaviour cloning (none) have names of their own.
+        // DAC and behavior cloning (none) have names of their own.
         variant: Some(Variant { key: "guidance", called: str::to_owned }),
         counts: &["candidates"],
         axis: Some(Axis { key: "tau", symbol: "τ" }),
@@ -49,7 +49,7 @@ pub(super) const DEFINITION: Definition = Definition {
 /// QUAD beside its diffusion policy and critics.
 struct Quad {
     config: Config,
-    /// Strength η of behaviour cloning, `[]`.
+    /// Strength η of behavior cloning, `[]`.
     eta: Tensor,
     /// ν̂² (Eq. 23), `[]`; none before the first guided update.
     nu_squared: Option<Tensor>,
@@ -124,14 +124,14 @@ impl Quad {
         batch.target(*self.config.gamma, &bound)
     }
 
-    /// Lines 4–7: every critic towards the lower confidence bound (Eq. 20).
+    /// Lines 4–7: every critic toward the lower confidence bound (Eq. 20).
     fn critic_loss(&self, networks: &Networks, batch: &Minibatch, noise: &Noise) -> Result<Loss> {
         let targets = self.targets(networks, batch, &noise.next)?;
         let loss = networks.critics.network.squared_error(&batch.observations, &batch.actions, &targets)?;
         Ok(Loss::new("critic_loss", loss).with("q_mean", targets.mean_all()?))
     }
 
-    /// Lines 8–11: behaviour cloning, pulled along the gradients that the critics agree on (Eq. 5 and 19).
+    /// Lines 8–11: behavior cloning, pulled along the gradients that the critics agree on (Eq. 5 and 19).
     fn actor_loss(&self, networks: &Networks, batch: &Minibatch, noise: &Noise) -> Result<ActorLoss> {
         let Denoising { epsilon, deviation, .. } = &noise.denoising;
         let (noisy, predicted) = networks.denoise(batch, &noise.denoising)?;

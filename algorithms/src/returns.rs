@@ -1,4 +1,4 @@
-//! Returns of a dataset's episodes as a critic's targets: standardised, and planned anew with values of states.
+//! Returns of a dataset's episodes as a critic's targets: standardized, and planned anew with values of states.
 
 use super::parts::Parts;
 use candle_core::{DType, Device, Result, Tensor};
@@ -15,9 +15,9 @@ pub(super) struct Returns {
     pub episodes: Vec<Range<usize>>,
     /// V(s) as far as planning has come, `[n]`.
     values: Tensor,
-    /// Standardised returns, `[n]`.
+    /// Standardized returns, `[n]`.
     pub targets: Tensor,
-    /// What they were standardised by: mean and standard deviation, `[2]`.
+    /// What they were standardized by: mean and standard deviation, `[2]`.
     scale: Tensor,
 }
 
@@ -27,11 +27,11 @@ impl Returns {
         let zeros = |count: usize| Tensor::zeros(count, DType::F32, &Device::Cpu);
         let (values, targets, scale) = (zeros(rewards.len())?, zeros(rewards.len())?, zeros(2)?);
         let mut returns = Self { gamma: f64::from(gamma), rewards, episodes, values, targets, scale };
-        returns.standardise(&returns.planned(None))?;
+        returns.standardize(&returns.planned(None))?;
         Ok(returns)
     }
 
-    /// Standardised values `[m]` in units of the return.
+    /// Standardized values `[m]` in units of the return.
     pub fn unscaled(&self, values: &Tensor) -> Result<Tensor> {
         let scale: Vec<f32> = self.scale.to_vec1()?;
         values.affine(f64::from(scale[1]), f64::from(scale[0]))
@@ -51,7 +51,7 @@ impl Returns {
     /// Makes new returns with the values of all states.
     pub fn plan(&mut self) -> Result<()> {
         let returns = self.planned(Some(&self.values.to_vec1()?));
-        self.standardise(&returns)
+        self.standardize(&returns)
     }
 
     /// Returns backwards through each episode: R_i = r_i + γ·R_{i+1}, or the state's value if that is larger.
@@ -72,7 +72,7 @@ impl Returns {
         returns
     }
 
-    fn standardise(&mut self, returns: &[f64]) -> Result<()> {
+    fn standardize(&mut self, returns: &[f64]) -> Result<()> {
         let count = returns.len() as f64;
         let mean = returns.iter().sum::<f64>() / count;
         let deviation = (returns.iter().map(|x| (x - mean).powi(2)).sum::<f64>() / count).sqrt();

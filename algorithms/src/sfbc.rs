@@ -38,15 +38,15 @@ pub(super) const DEFINITION: Definition = Definition {
     start: |table, context| Ok(Box::new(Sfbc::new(Config::of(table)?, context)?)),
 };
 
-/// The earliest time whose noise is learnt.
+/// The earliest time whose noise is learned.
 const FIRST_TIME: f64 = 1e-5;
 /// States whose actions are drawn together.
 const TOGETHER: usize = 256;
 
 const METRICS: &[Metric] = &metrics! {
     bc_loss ["BC loss"]: "First phase: mean over the batch of the sum over dimensions of (ε − ε_θ(a_t, s, t))². A network that always outputs 0 has the number of dimensions as its loss.";
-    critic_loss ["critic loss"]: "A critic's round: mean over the batch of (Q(s, a) − target)², of standardised returns.";
-    q_mean: "A critic's round: mean over the batch of the targets, standardised returns.";
+    critic_loss ["critic loss"]: "A critic's round: mean over the batch of (Q(s, a) − target)², of standardized returns.";
+    q_mean: "A critic's round: mean over the batch of the targets, standardized returns.";
     v_mean ["V"]: "Planning: mean over the step's states of V(s) = Σ softmax(Q/planning_temperature)·Q over actions of the clone, in units of the return.";
 };
 
@@ -181,7 +181,7 @@ impl Sfbc {
         (phase, steps)
     }
 
-    /// ε_θ towards the noise in the data's actions.
+    /// ε_θ toward the noise in the data's actions.
     fn clone_behavior(&mut self, batch: &Minibatch, noise: &NoiseInTime, steps: u64) -> Result<Measured> {
         let noisy = noise.noisy(&batch.actions)?;
         let predicted = self.actor.network.predict(&batch.observations, &noisy, &noise.t)?;
@@ -190,7 +190,7 @@ impl Sfbc {
         measured(&[Loss::new("bc_loss", loss)])
     }
 
-    /// Q(s, a) towards the returns of these items, the batch. Each round has a critic of its own, which begins as the first did.
+    /// Q(s, a) toward the returns of these items, the batch. Each round has a critic of its own, which begins as the first did.
     fn learn_returns(&mut self, batch: &Minibatch, items: &[u32], round: usize, steps: u64) -> Result<Measured> {
         if round > 0 && steps == 0 {
             self.critic = first_critic(&self.shape, &self.context)?;

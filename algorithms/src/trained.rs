@@ -1,4 +1,4 @@
-//! A network with its optimiser, and how both begin.
+//! A network with its optimizer, and how both begin.
 
 use candle_core::{Result, Tensor};
 use quad_policy::{
@@ -8,7 +8,7 @@ use quad_policy::{
 use super::context::Context;
 use super::random::{Purpose, stream};
 
-/// A network with its optimiser.
+/// A network with its optimizer.
 pub(super) struct Trained<N> {
     pub network: N,
     pub adam: Adam,

@@ -42,7 +42,7 @@ pub(crate) fn problems(recording: &Recording, environment: Option<&EnvironmentSp
 }
 
 /// Rows inside an episode whose stored next observation is not the following row's, and whether they are refused: in a D4RL
-/// file, which is learnt from as if each row led to the following one, where they are too many.
+/// file, which is learned from as if each row led to the following one, where they are too many.
 pub(crate) fn strays(recording: &Recording) -> Option<(Problem, bool)> {
     let unused = recording.unused_next_observations.as_ref();
     let stored = recording.next_observations.as_ref().or(unused)?;

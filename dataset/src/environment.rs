@@ -139,8 +139,8 @@ impl EnvironmentSpec {
         self.simulation.as_deref().unwrap_or(&self.name)
     }
 
-    /// D4RL's normalised score of an undiscounted return: `100 · (R - min) / (max - min)`.
-    pub fn normalised_score(&self, episode_return: f64) -> f64 {
+    /// D4RL's normalized score of an undiscounted return: `100 · (R - min) / (max - min)`.
+    pub fn normalized_score(&self, episode_return: f64) -> f64 {
         let (min, max) = self.reference_returns;
         100.0 * (episode_return - min) / (max - min)
     }

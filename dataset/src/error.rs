@@ -7,7 +7,7 @@ use std::path::PathBuf;
 use crate::environment;
 use crate::foreign::CONVERT;
 
-/// A source that cannot be read or learnt from, or a file that cannot be written.
+/// A source that cannot be read or learned from, or a file that cannot be written.
 #[derive(Debug, thiserror::Error)]
 #[error("{}: {problem}", .path.display())]
 pub struct DatasetError {
@@ -93,7 +93,7 @@ pub enum Problem {
     NotBoolean { array: String, row: usize, value: f32 },
     #[error("array `{array}`, row {row}: the action {value} is outside [-1, 1]{}", such_rows(*.rows))]
     ActionOutside { array: String, row: usize, value: f32, rows: usize },
-    #[error("array `{array}` holds whole numbers, as if actions were discrete; only continuous ones can be learnt")]
+    #[error("array `{array}` holds whole numbers, as if actions were discrete; only continuous ones can be learned")]
     DiscreteActions { array: String },
     #[error(
         "array `next_observations`, row {row}: not the observation of the row that follows, though the episode continues there{}",

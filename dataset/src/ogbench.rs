@@ -7,7 +7,7 @@
 //! are those of `relabel_dataset` in OGBench 1.2, which judges the state before a step: the reward is 1 there and the mask 0, and
 //! else the other way round. OGBench's reward is this one less 1 ([`RewardRule::Subtract1`](crate::RewardRule::Subtract1)).
 
-use crate::catalogue::NamedDataset;
+use crate::catalog::NamedDataset;
 use crate::recording::{Recording, RowKind};
 
 const NAVIGATE: &[&str] = &["navigate", "stitch"];
@@ -51,9 +51,9 @@ const TASKS: [(&str, [(Cell, Cell); 5]); 5] = [
 ];
 /// The ball's x in an observation of soccer, after the ant's own positions.
 const BALL: usize = 15;
-/// Side of a maze's cell, metres; D4RL's mazes have the same.
+/// Side of a maze's cell, meters; D4RL's mazes have the same.
 pub const CELL: f64 = 4.0;
-/// Distance in the plane from the goal at which the ant is there, metres; D4RL's, too.
+/// Distance in the plane from the goal at which the ant is there, meters; D4RL's, too.
 pub const ANT_REACH: f64 = 0.5;
 /// And OGBench's ball.
 const POINT_REACH: f64 = 1.0;
@@ -66,11 +66,11 @@ pub fn is_ogbench(name: &str) -> bool {
 /// What a task in a maze is: to come from somewhere to somewhere else.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct MazeTask {
-    /// Where the robot begins, but for noise: x and y, metres.
+    /// Where the robot begins, but for noise: x and y, meters.
     pub start: [f64; 2],
-    /// Where it must come: x and y, metres.
+    /// Where it must come: x and y, meters.
     pub goal: [f64; 2],
-    /// Distance from there, in the plane, at which it counts as there, metres.
+    /// Distance from there, in the plane, at which it counts as there, meters.
     pub reach: f64,
     /// Which of an observation's numbers is the x of what must come there; y is the next one.
     column: usize,
@@ -83,9 +83,9 @@ pub fn maze_task(environment: &str) -> Option<MazeTask> {
     let is_soccer = place.starts_with("antsoccer");
     let default = if is_soccer { 4 } else { 1 };
     let (start, goal) = *tasks.get(number.unwrap_or(default).checked_sub(1)?)?;
-    let centre = |(row, column): Cell| [column, row].map(|cell| (f64::from(cell) - 1.0) * CELL);
+    let center = |(row, column): Cell| [column, row].map(|cell| (f64::from(cell) - 1.0) * CELL);
     let reach = if place.starts_with("pointmaze") { POINT_REACH } else { ANT_REACH };
-    Some(MazeTask { start: centre(start), goal: centre(goal), reach, column: if is_soccer { BALL } else { 0 } })
+    Some(MazeTask { start: center(start), goal: center(goal), reach, column: if is_soccer { BALL } else { 0 } })
 }
 
 /// Robot and place of an environment's name, and the number of its task, if it says one.
@@ -143,7 +143,7 @@ pub(crate) fn files() -> impl Iterator<Item = NamedDataset> {
     mazes.filter(|(environment, _)| maze_task(environment).is_some()).map(|(environment, name)| {
         let file = format!("{name}.npz");
         let addresses = vec![format!("https://rail.eecs.berkeley.edu/datasets/ogbench/{file}")];
-        NamedDataset { name, environment, file, bytes: None, sha256: None, licence: "MIT".to_owned(), addresses }
+        NamedDataset { name, environment, file, bytes: None, sha256: None, license: "MIT".to_owned(), addresses }
     })
 }
 

@@ -12,7 +12,7 @@ const SAME_OBSERVATION: f64 = 1e-6;
 pub(crate) enum RowKind {
     /// A step to learn from.
     Transition,
-    /// A step that the format's rules drop: it counts towards its episode and nothing else.
+    /// A step that the format's rules drop: it counts toward its episode and nothing else.
     Dropped,
     /// No step, but the last state of an episode, to which the row before leads.
     LastState,

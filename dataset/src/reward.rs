@@ -18,11 +18,11 @@ pub enum RewardRule {
     #[serde(rename = "subtract-1")]
     Subtract1,
     /// `4(r - 0.5)`: Diffusion-QL's rule for AntMaze. Rewards of 0 and 1 become -2 and 2.
-    #[serde(rename = "centre-times-4")]
-    CentreTimes4,
+    #[serde(rename = "center-times-4")]
+    CenterTimes4,
     /// `10(r - 0.5)`: CQL's rule for AntMaze. Rewards of 0 and 1 become -5 and 5.
-    #[serde(rename = "centre-times-10")]
-    CentreTimes10,
+    #[serde(rename = "center-times-10")]
+    CenterTimes10,
     /// `100r`: ReBRAC's rule for AntMaze.
     #[serde(rename = "times-100")]
     Times100,
@@ -42,7 +42,7 @@ impl Default for RewardScaling {
 }
 
 impl RewardScaling {
-    /// The root mean square of what is learnt from.
+    /// The root mean square of what is learned from.
     pub(crate) fn size(self, recording: &Recording) -> f64 {
         let squares = recording.transitions().map(|row| f64::from(self.apply(recording.rewards[row as usize])).powi(2));
         let (count, sum) =
@@ -69,8 +69,8 @@ impl RewardRule {
             }
             Self::AsIs => return Some(RewardScaling::default()),
             Self::Subtract1 => (1.0, 1.0),
-            Self::CentreTimes4 => (0.5, 4.0),
-            Self::CentreTimes10 => (0.5, 10.0),
+            Self::CenterTimes4 => (0.5, 4.0),
+            Self::CenterTimes10 => (0.5, 10.0),
             Self::Times100 => (0.0, 100.0),
         };
         Some(RewardScaling { subtract, times })
@@ -88,8 +88,8 @@ mod tests {
             ("locomotion", 0.0, 250.0),
             ("as-is", 0.0, 1.0),
             ("subtract-1", -1.0, 0.0),
-            ("centre-times-4", -2.0, 2.0),
-            ("centre-times-10", -5.0, 5.0),
+            ("center-times-4", -2.0, 2.0),
+            ("center-times-10", -5.0, 5.0),
             ("times-100", 0.0, 100.0),
         ] {
             let rule: RewardRule = serde_json::from_value(name.into()).unwrap();

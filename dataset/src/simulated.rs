@@ -2,7 +2,7 @@
 
 use serde::Deserialize;
 
-/// A robot in a vertical plane that is rewarded for running along x. Positions begin with its x, z (metres) and pitch (radians);
+/// A robot in a vertical plane that is rewarded for running along x. Positions begin with its x, z (meters) and pitch (radians);
 /// a policy observes all but x, then the velocities.
 #[derive(Clone, Debug, PartialEq, Deserialize)]
 #[serde(deny_unknown_fields)]
@@ -41,7 +41,7 @@ pub enum Noise {
 #[derive(Clone, Debug, PartialEq, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Healthy {
-    /// Height of the torso, metres.
+    /// Height of the torso, meters.
     pub z: (f64, f64),
     /// Pitch of the torso, radians.
     pub pitch: (f64, f64),
@@ -61,7 +61,7 @@ impl Healthy {
     }
 }
 
-/// Whether a dataset of mediocre behaviour can be recorded in an environment.
+/// Whether a dataset of mediocre behavior can be recorded in an environment.
 #[derive(Clone, Debug, PartialEq, Deserialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum Collect {
@@ -79,7 +79,7 @@ pub struct Recipe {
     pub searches: u64,
     /// Steps that the searches may take for each recorded transition.
     pub steps_per_transition: u64,
-    /// Bands of normalised score: the lower bound of each, and its share of the transitions.
+    /// Bands of normalized score: the lower bound of each, and its share of the transitions.
     ///
     /// Without shares, a search's history is mostly long, good episodes, from which offline learning can gain little. The
     /// shares make a mixture with any seed: good actions exist, among worse ones in the same states.

@@ -2,7 +2,7 @@
 
 use crate::environment::EnvironmentSpec;
 
-/// How much a dataset holds and how good its behaviour is, from the recorded rewards.
+/// How much a dataset holds and how good its behavior is, from the recorded rewards.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Statistics {
     /// Transitions to learn from.
@@ -16,7 +16,7 @@ pub struct Statistics {
     pub return_min: f64,
     /// Largest return.
     pub return_max: f64,
-    /// Mean normalised score of the episodes ([`EnvironmentSpec::normalised_score`]), where there are reference returns.
+    /// Mean normalized score of the episodes ([`EnvironmentSpec::normalized_score`]), where there are reference returns.
     pub score_mean: Option<f64>,
 }
 
@@ -30,7 +30,7 @@ impl Statistics {
             return_min: returns.min,
             return_max: returns.max,
             // The score is linear in the return, so this is the mean of the scores too.
-            score_mean: environment.map(|environment| environment.normalised_score(returns.mean)),
+            score_mean: environment.map(|environment| environment.normalized_score(returns.mean)),
         }
     }
 }

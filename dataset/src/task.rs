@@ -27,14 +27,14 @@ impl Task {
         self.spec.map(|spec| spec.max_episode_steps)
     }
 
-    /// Whether scores are D4RL's normalised ones. Without reference returns they are the returns themselves.
-    pub fn is_normalised(&self) -> bool {
+    /// Whether scores are D4RL's normalized ones. Without reference returns they are the returns themselves.
+    pub fn is_normalized(&self) -> bool {
         self.spec.is_some()
     }
 
-    /// The score of an undiscounted return: normalised where there are reference returns, else the return itself.
+    /// The score of an undiscounted return: normalized where there are reference returns, else the return itself.
     pub fn score(&self, episode_return: f64) -> f64 {
-        self.spec.map_or(episode_return, |spec| spec.normalised_score(episode_return))
+        self.spec.map_or(episode_return, |spec| spec.normalized_score(episode_return))
     }
 }
 
@@ -52,10 +52,10 @@ mod tests {
     fn scores_of_an_unknown_environment_are_its_returns() {
         let known = Task::from(environment::find("hopper").unwrap());
         assert_eq!([-20.272305, 3234.3].map(|sum| known.score(sum)), [0.0, 100.0]);
-        assert_eq!((known.max_episode_steps(), known.is_normalised()), (Some(1000), true));
+        assert_eq!((known.max_episode_steps(), known.is_normalized()), (Some(1000), true));
         let unknown = Task::new("my-robot", 5, 2);
         assert_eq!(
-            (unknown.score(3234.3), unknown.max_episode_steps(), unknown.is_normalised()),
+            (unknown.score(3234.3), unknown.max_episode_steps(), unknown.is_normalized()),
             (3234.3, None, false)
         );
     }

@@ -210,7 +210,7 @@ impl Transitions {
         &self.names
     }
 
-    /// Units in which the observations and actions that are learnt from have mean 0 and standard deviation 1, number by number;
+    /// Units in which the observations and actions that are learned from have mean 0 and standard deviation 1, number by number;
     /// one that never changes has scale 0.
     pub fn standard_units(&self) -> Scaling {
         let counts = |row: usize| self.rows.binary_search(&(row as u32)).is_ok();
@@ -226,7 +226,7 @@ impl Transitions {
         &self.statistics
     }
 
-    /// What makes it doubtful that anything good is learnt from them, one sentence each.
+    /// What makes it doubtful that anything good is learned from them, one sentence each.
     pub fn doubts(&self) -> &[String] {
         &self.doubts
     }

@@ -67,12 +67,12 @@ def parts(hidden, critics, samples, predictions):
         "sampled next actions": actor(STEPS * BATCH * samples),
         "target critics": critic(rows * samples),
         "critic step": critic(rows) + back(rows, hidden, 1) + Work(critic(rows).flop),
-        "critic optimiser": Work(),
+        "critic optimizer": Work(),
         "critic EMA": Work(),
         "Q-gradients' scale": critic(rows),
         "Q-gradients": critic(rows) + back(rows, hidden, 1) + Work(rows * 2 * hidden * ACTION),
         "actor step": actor(BATCH * (1 + predictions)) + back(BATCH, hidden, ACTION) + Work(actor(BATCH).flop),
-        "actor optimiser and EMA": Work(),
+        "actor optimizer and EMA": Work(),
     }
 
 

@@ -25,7 +25,7 @@ import jax.numpy as jnp
 import networks
 import numpy as np
 import quad
-from jax_step import single, traced  # also has JAX compute in float32 and optimise
+from jax_step import single, traced  # also has JAX compute in float32 and optimize
 
 
 def main():

@@ -42,7 +42,7 @@ enum Command {
     },
 }
 
-/// Record a dataset of mediocre behaviour to learn from, without a download
+/// Record a dataset of mediocre behavior to learn from, without a download
 ///
 /// Trains linear policies by augmented random search, from policies that fall at once to policies that move well, and mixes
 /// noisy episodes of all of them into one file in D4RL's layout (HDF5). This takes one to two minutes on two cores. The same
@@ -126,7 +126,7 @@ fn collected(args: &CollectArgs, summary: &Summary) -> String {
         summary;
     format!(
         "{}: {transitions} transitions, {episodes} episodes of {policies} policies, in {seconds:.0} s\n\
-         normalised score: mean {mean_score:.1}, median {p50:.1}, p90 {p90:.1}, p99 {p99:.1}, max {max:.1}",
+         normalized score: mean {mean_score:.1}, median {p50:.1}, p90 {p90:.1}, p99 {p99:.1}, max {max:.1}",
         args.out.display()
     )
 }

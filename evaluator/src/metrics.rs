@@ -55,7 +55,7 @@ impl Metrics {
             let options = HistogramOpts::new(name, help).buckets(buckets.to_vec());
             register(&registry, Histogram::with_opts(options)?)
         };
-        let labelled = |name: &str, help: &str, label: &str| {
+        let labeled = |name: &str, help: &str, label: &str| {
             register(&registry, IntCounterVec::new(Opts::new(name, help), &[label])?)
         };
         let metrics = Metrics {
@@ -68,7 +68,7 @@ impl Metrics {
             // A score of 100 is an expert; the fine buckets are for the start of training.
             episode_score: histogram(
                 "quad_evaluator_episode_score",
-                "Normalised score of each scored episode",
+                "Normalized score of each scored episode",
                 &[1.0, 2.0, 5.0, 10.0, 20.0, 30.0, 40.0, 50.0, 60.0, 70.0, 80.0, 90.0, 100.0, 110.0],
             )?,
             job_duration: histogram(
@@ -79,8 +79,8 @@ impl Metrics {
             select_seconds: seconds("quad_evaluator_select_seconds_total", "Time spent choosing actions")?,
             physics_seconds: seconds("quad_evaluator_physics_seconds_total", "Time spent in the physics")?,
             runs: register(&registry, IntGauge::new("quad_evaluator_runs", "Runs that are being served")?)?,
-            jobs: labelled("quad_evaluator_jobs_total", "Jobs by how they ended", "outcome")?,
-            rejected_messages: labelled(
+            jobs: labeled("quad_evaluator_jobs_total", "Jobs by how they ended", "outcome")?,
+            rejected_messages: labeled(
                 "quad_evaluator_rejected_messages_total",
                 "Messages from the wire that were not used, by reason",
                 "reason",

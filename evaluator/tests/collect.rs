@@ -50,7 +50,7 @@ fn whole_episodes_are_recorded_that_replay_and_a_change_is_noticed() {
         assert!(row.action.iter().all(|value| value.abs() <= 1.0));
     }
     let total: f64 = rows.iter().map(|row| row.reward).sum();
-    let mean_score = hopper().normalised_score(total / summary.episodes as f64);
+    let mean_score = hopper().normalized_score(total / summary.episodes as f64);
     assert!((summary.mean_score - mean_score).abs() < 1e-3, "{} {mean_score}", summary.mean_score);
 
     assert_eq!(environment_of(&path).unwrap(), hopper(), "it says so itself");

@@ -74,7 +74,7 @@ fn initial_states_lie_within_the_noise() {
 }
 
 #[test]
-fn a_hopper_is_healthy_only_below_a_hundred_metres_a_second() {
+fn a_hopper_is_healthy_only_below_a_hundred_meters_a_second() {
     let mut hopper = simulation("hopper");
     for (velocity, terminated) in [(90.0, false), (110.0, true)] {
         // In the air, with level legs.

@@ -135,7 +135,7 @@ fn the_ant_and_the_ball_in_a_maze_of_ogbench_move_as_there() {
     for (robot, maze) in
         ["antmaze", "pointmaze"].iter().flat_map(|robot| ["medium", "large", "giant"].map(|maze| (robot, maze)))
     {
-        // Their models differ in what nothing depends on: the unit of controls, a mark at the goal, where the floor's centre is.
+        // Their models differ in what nothing depends on: the unit of controls, a mark at the goal, where the floor's center is.
         assert_steps(&format!("{robot}-{maze}-singletask-v0"), 0.1..=0.9);
     }
 }

@@ -1,5 +1,5 @@
 //! Our kernels beside what a library does, at the shapes of a gradient step and on one thread. A library's line stands
-//! next to ours and is timed within the same second or two: compare neighbours, the machine may be shared.
+//! next to ours and is timed within the same second or two: compare neighbors, the machine may be shared.
 //! The rates are GFLOP/s of products (criterion calls them Gelem/s) and G elements/s of activations.
 
 #![allow(missing_docs)] // criterion's macros define public functions without any

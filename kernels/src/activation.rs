@@ -1,6 +1,6 @@
-//! Vectorised loops over activations and their derivatives, each with one exponential.
+//! Vectorized loops over activations and their derivatives, each with one exponential.
 
-use crate::vectorised::vectorised;
+use crate::vectorized::vectorized;
 use serde::{Deserialize, Serialize};
 
 /// Below this, Mish and its slope are taken to be what they are here: some -2e-14, nothing beside numbers of order 1. Followed
@@ -131,7 +131,7 @@ fn rows_with_slope(x: &mut [f32], bias: &[f32], slope: &mut [f32], f: impl Fn(f3
     }
 }
 
-vectorised! {
+vectorized! {
     /// `x = f(x + bias)`, row by row.
     pub fn activate(f: Activation, x: &mut [f32], bias: &[f32]) {
         match f {
@@ -144,7 +144,7 @@ vectorised! {
     }
 }
 
-vectorised! {
+vectorized! {
     /// `x = f(x + bias)`, `slope = f'(x + bias)`, row by row.
     pub fn activate_with_slope(f: Activation, x: &mut [f32], bias: &[f32], slope: &mut [f32]) {
         match f {
@@ -157,7 +157,7 @@ vectorised! {
     }
 }
 
-vectorised! {
+vectorized! {
     /// `x = x ⊙ y`.
     pub fn multiply(x: &mut [f32], y: &[f32]) {
         for (x, y) in x.iter_mut().zip(y) {
@@ -166,7 +166,7 @@ vectorised! {
     }
 }
 
-vectorised! {
+vectorized! {
     /// `out = Σ rows of x`, `out` is one row wide.
     pub fn column_sums(x: &[f32], out: &mut [f32]) {
         out.fill(0.0);

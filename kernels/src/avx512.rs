@@ -38,7 +38,7 @@ pub(crate) struct Strided<T> {
     pub column: usize,
 }
 
-/// Two neighbours of a sum's terms, rounded to bfloat16, in one element.
+/// Two neighbors of a sum's terms, rounded to bfloat16, in one element.
 type Pair = i32;
 
 /// Whether this CPU has AVX512-BF16.

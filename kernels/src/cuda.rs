@@ -162,8 +162,8 @@ pub fn reverse(
     Ok(out)
 }
 
-/// Adam's step, as [`crate::optimiser::adam`]; the gradient is scaled down to the norm `clip` if it is longer. Gives its norm
-/// before that. `rates` are those of [`crate::optimiser::AdamRates`], in its order: as numbers of the GPU they can differ each
+/// Adam's step, as [`crate::optimizer::adam`]; the gradient is scaled down to the norm `clip` if it is longer. Gives its norm
+/// before that. `rates` are those of [`crate::optimizer::AdamRates`], in its order: as numbers of the GPU they can differ each
 /// time that recorded work is replayed.
 pub fn adam(
     stream: &Arc<CudaStream>,

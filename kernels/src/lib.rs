@@ -7,12 +7,12 @@
 //! - `avx512`, `avx2`: the products that the libraries at hand do more slowly (kernels/benches/README.md says by how much).
 //! - [`activation`]: Mish and its derivative; [`narrow`]: the first and last layer of a network, fused with it.
 //! - [`norm`]: layer norm, forward and backward.
-//! - [`optimiser`]: Adam and EMA over whole parameter vectors.
+//! - [`optimizer`]: Adam and EMA over whole parameter vectors.
 //! - `cuda`: what of this a GPU does in one launch, and `recording`: many launches as one; both with the feature `cuda`.
 //! - [`scaling`]: between a user's units and those of networks.
 //! - [`Level`] (`level`): which of the CPU's instructions are used.
 //! - [`Buffer`] (`buffer`): memory that is used again and again, aligned to cache lines.
-//! - `vectorised`: the macro that loops are written with.
+//! - `vectorized`: the macro that loops are written with.
 //!
 //! Matrices are row-major `f32` slices; a name's shape is given as `rows × columns`. What a CPU can do is found out at
 //! run time.
@@ -28,14 +28,14 @@ pub mod cuda;
 mod level;
 pub mod narrow;
 pub mod norm;
-pub mod optimiser;
+pub mod optimizer;
 #[cfg(target_arch = "x86_64")]
 mod packed;
 pub mod product;
 #[cfg(feature = "cuda")]
 pub mod recording;
 pub mod scaling;
-mod vectorised;
+mod vectorized;
 
 pub use buffer::Buffer;
 pub use level::Level;

@@ -3,7 +3,7 @@
 //! Matrices are row-major slices; `width` is the number of columns.
 
 use crate::activation::{Activation, gelu_and_slope, mish, relu, silu_and_slope, tanh_and_slope};
-use crate::vectorised::vectorised;
+use crate::vectorized::vectorized;
 
 /// Lanes that the loops work on at a time: one AVX-512 register of f32.
 const LANES: usize = 16;
@@ -89,7 +89,7 @@ fn first_rows(layer: &FirstLayer<'_>, out: &mut [f32], f: impl Fn(f32) -> f32) {
     }
 }
 
-vectorised! {
+vectorized! {
     /// `out = f(base + shift + actions · kernel)`, `rows × width`; without f the sum itself.
     pub fn first_layer(f: Option<Activation>, layer: &FirstLayer<'_>, out: &mut [f32]) {
         match f {
@@ -103,7 +103,7 @@ vectorised! {
     }
 }
 
-vectorised! {
+vectorized! {
     /// `slope = slope ⊙ (coefficients · vectors)`: the gradient before an activation whose output feeds a narrow
     /// linear layer. `coefficients` is `rows × n`, `vectors` `n × width`.
     pub fn scale_by_combination(slope: &mut [f32], coefficients: &[f32], vectors: &[f32], width: usize) {
@@ -124,7 +124,7 @@ vectorised! {
     }
 }
 
-vectorised! {
+vectorized! {
     /// `out[row, j] = offset[j] + x[row] · vectors[j]`: a narrow linear layer. `vectors` is `n × width`.
     pub fn dots(x: &[f32], vectors: &[f32], offset: &[f32], out: &mut [f32], width: usize) {
         for (x, out) in x.chunks_exact(width).zip(out.chunks_exact_mut(offset.len())) {

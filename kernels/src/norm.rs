@@ -1,9 +1,9 @@
 //! Layer norm (Ba et al. 2016) of a tile's rows, and its backward pass.
 //!
 //! What is kept of a tile for the backward pass is one slice: the gradients of scale and shift, `width` numbers each; for each
-//! row one over its deviation; and the normalised rows, `rows × width`.
+//! row one over its deviation; and the normalized rows, `rows × width`.
 
-use crate::vectorised::vectorised;
+use crate::vectorized::vectorized;
 
 /// Partial sums that are added up side by side: one AVX-512 register of f32.
 const LANES: usize = 16;
@@ -30,9 +30,9 @@ fn mean(x: &[f32], y: &[f32], f: impl Fn(f32, f32) -> f32) -> f32 {
     sum / x.len() as f32
 }
 
-vectorised! {
+vectorized! {
     /// `x = scale ⊙ (z − mean)/√(variance + epsilon)` with z = x + bias, over each row. Fills `kept`.
-    pub fn normalise(x: &mut [f32], bias: Option<&[f32]>, scale: &[f32], epsilon: f32, kept: &mut [f32]) {
+    pub fn normalize(x: &mut [f32], bias: Option<&[f32]>, scale: &[f32], epsilon: f32, kept: &mut [f32]) {
         let width = scale.len();
         let (inverse, normed) = kept[2 * width..].split_at_mut(x.len() / width);
         let rows = x.chunks_exact_mut(width).zip(normed.chunks_exact_mut(width));
@@ -40,18 +40,18 @@ vectorised! {
             for (x, bias) in x.iter_mut().zip(bias.unwrap_or(&[])) {
                 *x += bias;
             }
-            let centre = mean(x, x, |x, _| x);
-            let variance = mean(x, x, |x, _| (x - centre) * (x - centre));
+            let center = mean(x, x, |x, _| x);
+            let variance = mean(x, x, |x, _| (x - center) * (x - center));
             *inverse = 1.0 / (variance + epsilon).sqrt();
             for ((x, normed), scale) in x.iter_mut().zip(normed).zip(scale) {
-                *normed = (*x - centre) * *inverse;
+                *normed = (*x - center) * *inverse;
                 *x = *normed * scale;
             }
         }
     }
 }
 
-vectorised! {
+vectorized! {
     /// `x = x + shift`, row by row.
     pub fn shift_rows(x: &mut [f32], shift: &[f32]) {
         for row in x.chunks_exact_mut(shift.len()) {
@@ -60,10 +60,10 @@ vectorised! {
     }
 }
 
-vectorised! {
+vectorized! {
     /// Turns gradients behind a norm, `rows × width`, into those before it, and leaves the gradients of scale and shift in what
-    /// [`normalise`] has kept.
-    pub fn normalise_backward(delta: &mut [f32], scale: &[f32], kept: &mut [f32]) {
+    /// [`normalize`] has kept.
+    pub fn normalize_backward(delta: &mut [f32], scale: &[f32], kept: &mut [f32]) {
         let width = scale.len();
         let (sums, rows) = kept.split_at_mut(2 * width);
         let (inverse, normed) = rows.split_at(delta.len() / width);
@@ -77,10 +77,10 @@ vectorised! {
                 *of_shift += *delta;
                 *delta *= scale;
             }
-            let centre = mean(delta, delta, |delta, _| delta);
+            let center = mean(delta, delta, |delta, _| delta);
             let along = mean(delta, normed, |delta, normed| delta * normed);
             for (delta, normed) in delta.iter_mut().zip(normed) {
-                *delta = (*delta - centre - normed * along) * inverse;
+                *delta = (*delta - center - normed * along) * inverse;
             }
         }
     }
@@ -105,7 +105,7 @@ mod tests {
             let (x, delta, rows) = (numbers(3 * width, 2.1), numbers(3 * width, 1.3), 3);
             let (bias, scale) = (numbers(width, 0.7), numbers(width, 0.3));
             let (mut y, mut keeps) = (x.clone(), vec![f32::NAN; kept(rows, width)]);
-            normalise(&mut y, Some(&bias), &scale, 1e-2, &mut keeps);
+            normalize(&mut y, Some(&bias), &scale, 1e-2, &mut keeps);
             let loss = |x: &[f32], scale: &[f32]| -> f64 {
                 let y = x.chunks(width).flat_map(|row| exact(row, &bias, scale, 1e-2));
                 y.zip(&delta).map(|(y, delta)| y * f64::from(*delta)).sum()
@@ -115,7 +115,7 @@ mod tests {
                 assert!(found.iter().zip(expected).all(|(y, exact)| (f64::from(*y) - exact).abs() < 1e-5), "{width}");
             }
             let mut found = delta.clone();
-            normalise_backward(&mut found, &scale, &mut keeps);
+            normalize_backward(&mut found, &scale, &mut keeps);
             let moved = |numbers: &[f32], i: usize, by: f32| {
                 let mut numbers = numbers.to_vec();
                 numbers[i] += by;

@@ -8,7 +8,7 @@
 //! - `live` is a run at work: threads, main loop, Zenoh.
 //! - `local_evaluators` are evaluators that a learner or a sweep starts itself.
 //! - `page` shows runs in a browser.
-//! - `report` summarises scores as tables and figures.
+//! - `report` summarizes scores as tables and figures.
 //! - `judge` ranks policies without a simulator.
 //! - `train` makes gradient steps.
 //! - `evaluation` tracks which episodes wait for a score, and which evaluator has which. It does no input or output.

@@ -19,9 +19,9 @@ pub(crate) fn normed_mish(x: &Tensor, scale: &Tensor, shift: &Tensor, groups: us
         return x.contiguous()?.apply_op3(&scale.contiguous()?, &shift.contiguous()?, operation);
     }
     let grouped = x.reshape((windows, length, groups, channels / groups))?;
-    let centred = grouped.broadcast_sub(&grouped.mean_keepdim((1, 3))?)?;
-    let deviation = (centred.sqr()?.mean_keepdim((1, 3))? + f64::from(EPSILON))?.sqrt()?;
-    let normed = centred.broadcast_div(&deviation)?.reshape((windows, length, channels))?;
+    let centered = grouped.broadcast_sub(&grouped.mean_keepdim((1, 3))?)?;
+    let deviation = (centered.sqr()?.mean_keepdim((1, 3))? + f64::from(EPSILON))?.sqrt()?;
+    let normed = centered.broadcast_div(&deviation)?.reshape((windows, length, channels))?;
     mish(&normed.broadcast_mul(scale)?.broadcast_add(shift)?)
 }
 

@@ -5,7 +5,7 @@ use crate::ensemble::Ensemble;
 use crate::gradient::Gradients;
 use crate::mlp_config::{Epsilon, Initial, MlpConfig};
 use crate::noise_predictor::NoisePredictor;
-use crate::optimiser::{Adam, AdamStep};
+use crate::optimizer::{Adam, AdamStep};
 use crate::precision::Precision;
 use crate::schedule::Reverse;
 use crate::shape::{EnsembleShape, NoiseShape};

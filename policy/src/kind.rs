@@ -129,10 +129,10 @@ impl PolicyConfig {
 pub struct Header<O> {
     /// What it is.
     pub policy: PolicyConfig,
-    /// The maps between the units that its networks have learnt in and those that it is asked in, unless they are the same.
+    /// The maps between the units that its networks have learned in and those that it is asked in, unless they are the same.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub scaling: Option<Scaling>,
-    /// What the data that it has learnt from calls the numbers of an observation; empty where they have no names.
+    /// What the data that it has learned from calls the numbers of an observation; empty where they have no names.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     pub observation_names: Vec<String>,
     /// Names of the numbers of an action.
@@ -155,7 +155,7 @@ struct Written {
 }
 
 impl<O> Header<O> {
-    /// The header of networks that have learnt in the user's own units, from numbers without names.
+    /// The header of networks that have learned in the user's own units, from numbers without names.
     pub fn new(policy: PolicyConfig, origin: O) -> Self {
         let (observation_names, action_names, version) = (Vec::new(), Vec::new(), VERSION.to_owned());
         Self { policy, scaling: None, observation_names, action_names, origin, about: Value::Null, version }

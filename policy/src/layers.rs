@@ -1,6 +1,6 @@
 //! Where the layers of some networks of one shape lie in one flat vector.
 //!
-//! A vector for all weights keeps an optimiser's step at one operation, and each named tensor is one contiguous run of it:
+//! A vector for all weights keeps an optimizer's step at one operation, and each named tensor is one contiguous run of it:
 //! layer after layer the kernels of all members, then their biases, then scales and shifts of the norm, if there is one.
 
 use crate::mlp_config::{Epsilon, Initial, MlpConfig};

@@ -12,7 +12,7 @@
 //! - [`ScoreNetwork`] (`score_network`): residual blocks of single layers (`dense`), the noise in continuous time, sampled by
 //!   [`DpmSolver`] (`dpm_solver`).
 //! - [`Weights`] (`weights`): a network's weights as one vector with named tensors in it; [`Gradients`] (`gradient`) of a loss
-//!   with respect to them; [`Adam`] (`optimiser`).
+//!   with respect to them; [`Adam`] (`optimizer`).
 //! - [`Policy`] (`policy`): what any policy can do; [`EpisodeState`] (`episode`): what it carries through an episode. `kind`
 //!   reads one from a file whose [`Header`] says what it is: [`DiffusionPolicy`] (`diffusion`),
 //!   [`ScorePolicy`] (`score`), and with a [`SquashedActor`] (`squashed`) or a [`OneStepActor`] (`one_step`) those of an
@@ -70,7 +70,7 @@ mod network;
 mod noise_predictor;
 mod one_step;
 mod operation;
-mod optimiser;
+mod optimizer;
 mod packed;
 mod plain;
 mod planner;
@@ -110,7 +110,7 @@ pub use kind::{Header, PolicyConfig, load_policy, read_header, read_tensors, wri
 pub use mlp_config::{Epsilon, Initial, MlpConfig};
 pub use noise_predictor::NoisePredictor;
 pub use one_step::OneStepActor;
-pub use optimiser::{Adam, AdamStep, cosine_decay};
+pub use optimizer::{Adam, AdamStep, cosine_decay};
 pub use planner::{Guidance, Planner, PlannerShape};
 pub use planning::{Planning, with_first_state};
 pub use policy::{Policy, Sampled};

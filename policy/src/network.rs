@@ -10,7 +10,7 @@ use crate::workspace::{Activations, Workspace};
 use quad_kernels::Buffer;
 use quad_kernels::activation::{activate, activate_with_slope, multiply};
 use quad_kernels::narrow::{FirstLayer, dots, first_layer, scale_by_combination};
-use quad_kernels::norm::{kept, normalise, normalise_backward, shift_rows};
+use quad_kernels::norm::{kept, normalize, normalize_backward, shift_rows};
 use quad_kernels::product::{Packed, product, product_transposed};
 
 /// Rows of a tile that are worked on together in a task whose products are rounded: these are so fast that activations must be in the nearest cache.
@@ -128,12 +128,12 @@ impl<'a> Network<'a> {
                 Some([scale, shift]) if !self.layers.norm_after => {
                     first_layer(None, &first, out_of_first);
                     let room = work.not_kept.sized(kept(count, width));
-                    normalise(out_of_first, None, scale, self.layers.epsilon(), room);
+                    normalize(out_of_first, None, scale, self.layers.epsilon(), room);
                     activate(self.layers.activation, out_of_first, shift);
                 }
                 _ => {
                     first_layer(Some(self.layers.activation), &first, out_of_first);
-                    self.normalise_after(0, out_of_first, || work.not_kept.sized(kept(count, width)));
+                    self.normalize_after(0, out_of_first, || work.not_kept.sized(kept(count, width)));
                 }
             }
             for layer in 1..last {
@@ -144,9 +144,9 @@ impl<'a> Network<'a> {
                     Some(kernels) => kernels[layer - 1].product(x, y),
                     None => product(x, self.kernel(layer), y, inputs, width),
                 }
-                let bias = self.normalise(layer, y, || work.not_kept.sized(kept(count, width)));
+                let bias = self.normalize(layer, y, || work.not_kept.sized(kept(count, width)));
                 activate(self.layers.activation, y, bias);
-                self.normalise_after(layer, y, || work.not_kept.sized(kept(count, width)));
+                self.normalize_after(layer, y, || work.not_kept.sized(kept(count, width)));
             }
             let width = self.layers.shape(last).0;
             let x = if last % 2 == 1 { &mut *x } else { &mut *y };
@@ -162,30 +162,30 @@ impl<'a> Network<'a> {
             let (before, here) = left.x.split_at_mut(layer);
             let x = before.last().map_or(input, |x| &**x);
             product(x, self.kernel(layer), here[0], inputs, width);
-            let bias = self.normalise(layer, here[0], || left.norm[layer]);
+            let bias = self.normalize(layer, here[0], || left.norm[layer]);
             activate_with_slope(self.layers.activation, here[0], bias, left.slope[layer]);
-            self.normalise_after(layer, here[0], || left.norm[layer]);
+            self.normalize_after(layer, here[0], || left.norm[layer]);
         }
         dots(left.x[last - 1], self.output_rows(&mut work.output), self.bias(last), out, self.layers.shape(last).0);
     }
 
-    /// Adds the bias of a layer that has a norm before its activation, and normalises. Gives what is to be added before the
+    /// Adds the bias of a layer that has a norm before its activation, and normalizes. Gives what is to be added before the
     /// activation.
-    fn normalise<'b>(&self, layer: usize, x: &mut [f32], keep: impl FnOnce() -> &'b mut [f32]) -> &'a [f32] {
+    fn normalize<'b>(&self, layer: usize, x: &mut [f32], keep: impl FnOnce() -> &'b mut [f32]) -> &'a [f32] {
         let bias = self.bias(layer);
         match self.norm(layer) {
             Some([scale, shift]) if !self.layers.norm_after => {
-                normalise(x, Some(bias), scale, self.layers.epsilon(), keep());
+                normalize(x, Some(bias), scale, self.layers.epsilon(), keep());
                 shift
             }
             _ => bias,
         }
     }
 
-    /// Normalises what follows the activation of a layer that has a norm there.
-    fn normalise_after<'b>(&self, layer: usize, x: &mut [f32], keep: impl FnOnce() -> &'b mut [f32]) {
+    /// Normalizes what follows the activation of a layer that has a norm there.
+    fn normalize_after<'b>(&self, layer: usize, x: &mut [f32], keep: impl FnOnce() -> &'b mut [f32]) {
         if let Some([scale, shift]) = self.norm(layer).filter(|_| self.layers.norm_after) {
-            normalise(x, None, scale, self.layers.epsilon(), keep());
+            normalize(x, None, scale, self.layers.epsilon(), keep());
             shift_rows(x, shift);
         }
     }
@@ -197,7 +197,7 @@ impl<'a> Network<'a> {
         let after = self.layers.norm_after;
         let mut through_norm = |layer: usize, here: bool, delta: &mut [f32]| {
             if let Some([scale, _]) = self.norm(layer).filter(|_| here) {
-                normalise_backward(delta, scale, norm[layer]);
+                normalize_backward(delta, scale, norm[layer]);
             }
         };
         let output = self.output_rows(&mut work.output);

@@ -29,9 +29,9 @@ pub(crate) fn activate(f: Activation, x: &Tensor) -> Result<Tensor> {
 /// Each row over its numbers: (x - mean)/√(variance + ε)·scale + shift, for `x [K, rows, width]` and `[K, 1, width]`.
 /// (candle-nn's own has no gradient, and says nothing.)
 pub(crate) fn layer_norm(x: &Tensor, scale: &Tensor, shift: &Tensor, epsilon: f64) -> Result<Tensor> {
-    let centred = x.broadcast_sub(&x.mean_keepdim(D::Minus1)?)?;
-    let deviation = (centred.sqr()?.mean_keepdim(D::Minus1)? + epsilon)?.sqrt()?;
-    centred.broadcast_div(&deviation)?.broadcast_mul(scale)?.broadcast_add(shift)
+    let centered = x.broadcast_sub(&x.mean_keepdim(D::Minus1)?)?;
+    let deviation = (centered.sqr()?.mean_keepdim(D::Minus1)? + epsilon)?.sqrt()?;
+    centered.broadcast_div(&deviation)?.broadcast_mul(scale)?.broadcast_add(shift)
 }
 
 /// Layers `{prefix}0 …`: `x [1 or K, rows, in]` → `[K, rows, out]`.

@@ -1,4 +1,4 @@
-//! The planner: it denoises windows of actions and states that begin with the state that it is in, pulls them towards large
+//! The planner: it denoises windows of actions and states that begin with the state that it is in, pulls them toward large
 //! returns on the way, and takes the first actions of the one that its value network likes best (Janner et al. 2022, Algorithm 1).
 
 use crate::choice::{Choice, Rule};
@@ -34,7 +34,7 @@ pub struct PlannerShape {
     pub network: WindowConfig,
     /// Denoising steps T.
     pub diffusion_steps: usize,
-    /// How plans are pulled towards large returns.
+    /// How plans are pulled toward large returns.
     pub guidance: Guidance,
     /// Steps of an episode that are taken by one plan, from 1 to the horizon.
     pub replan_every: usize,
@@ -42,7 +42,7 @@ pub struct PlannerShape {
     pub units: Scaling,
 }
 
-/// How plans are pulled towards large returns.
+/// How plans are pulled toward large returns.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Guidance {

@@ -1,4 +1,4 @@
-//! A policy that is asked in its user's units, though its networks have learnt in their own.
+//! A policy that is asked in its user's units, though its networks have learned in their own.
 
 use crate::choice::Choice;
 use crate::episode::EpisodeState;

@@ -54,7 +54,7 @@ impl Part {
     }
 }
 
-/// Fills a matrix with orthonormal columns, or rows if these are fewer: normal numbers, orthogonalised one after the other.
+/// Fills a matrix with orthonormal columns, or rows if these are fewer: normal numbers, orthogonalized one after the other.
 fn orthogonal(matrix: &mut [f32], (rows, columns): (usize, usize), generator: &mut impl Rng) {
     let (count, length) = (rows.min(columns), rows.max(columns));
     let mut vectors: Vec<Vec<f64>> = Vec::with_capacity(count);
@@ -243,7 +243,7 @@ impl Weights {
         }
         if has_fast_implementation(online.device()) {
             return crate::slices::read(&online, |online: &[f32]| {
-                self.change(|mine| modify(mine, |mine| quad_kernels::optimiser::ema(mine, online, rate)))
+                self.change(|mine| modify(mine, |mine| quad_kernels::optimizer::ema(mine, online, rate)))
             })?;
         }
         let (keep, take) = (1.0 - f64::from(rate), f64::from(rate));

@@ -16,7 +16,7 @@ pub struct EpisodeScore {
     pub episode_return: f64,
     /// Its environment steps.
     pub length: u32,
-    /// Its score: D4RL's normalised one, 100 · (return − random) / (expert − random), where the environment has such
+    /// Its score: D4RL's normalized one, 100 · (return − random) / (expert − random), where the environment has such
     /// references; else what the evaluator's user counts, by default the return.
     pub score: f64,
 }

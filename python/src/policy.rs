@@ -19,7 +19,7 @@ use crate::file::{HINT, all_about, read};
 
 /// A policy that `learner train` has saved: `Policy.load(path)`.
 ///
-/// It takes and gives the units of the data that it has learnt from. All calls release Python's lock and share the processor's
+/// It takes and gives the units of the data that it has learned from. All calls release Python's lock and share the processor's
 /// cores with rayon: the environment variable RAYON_NUM_THREADS says, before the first call, how many. In a process that was
 /// forked after a call, calls raise RuntimeError; with multiprocessing use "spawn".
 #[pyclass(name = "Policy", module = "quad_rl", frozen)]
@@ -255,7 +255,7 @@ impl PyPolicy {
 
     /// All that its file says of it, a dictionary: version that wrote it, environment, step, names of the numbers of observations
     /// and actions, scaling (user's = offset + scale · network's, or None); and, if `learner export` made the file, run, task,
-    /// algorithm, data with its license, score, and judgement.
+    /// algorithm, data with its license, score, and judgment.
     #[getter]
     fn about<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyAny>> {
         py.import("json")?.call_method1("loads", (&self.about,))

@@ -306,7 +306,7 @@ def test_arguments_that_cannot_be_are_refused_at_once():
     refused(ValueError, '"return", "success" or a pair', "walk", lambda seed: Walk(), score="best")
     refused(ValueError, "not .3.0, 3.0.", "walk", lambda seed: Walk(), score=(3.0, 3.0))
     refused(RuntimeError, "ZeroDivisionError", "walk", lambda seed: 1 // 0, workers=1)
-    refused(RuntimeError, "SystemExit: no licence", "walk", lambda seed: sys.exit("no licence"), workers=1)
+    refused(RuntimeError, "SystemExit: no license", "walk", lambda seed: sys.exit("no license"), workers=1)
     refused(RuntimeError, "before it had an environment .exit code 3.", "walk", lambda seed: os._exit(3), workers=1)
     refused(RuntimeError, "No module named|doesn't exist|NameNotFound", "walk", "NoSuch-v0", workers=1)
     refused(RuntimeError, "Box", "walk", "CartPole-v1", workers=1)

@@ -43,7 +43,7 @@ def test_the_programs_need_no_library_but_the_systems_and_the_wheels():
                 assert name.split("/")[-1].startswith(("linux-vdso", "ld-linux", "libc.", "libm.", "libdl.", "libpthread.", "librt."))
 
 
-def test_the_licences_come_along():
+def test_the_licenses_come_along():
     files = {file.name: file for file in importlib.metadata.files("quad_rl") if "licenses" in file.parts}
     assert {"LICENSE-MIT", "LICENSE-APACHE", "LICENSE-mujoco", "LICENSE-third-party"} <= set(files)
     text = files["LICENSE-third-party"].read_text()

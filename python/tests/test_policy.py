@@ -247,7 +247,7 @@ def test_an_exported_policy_says_all_that_is_known_of_it(hopper_runs, tmp_path):
     policy = Policy.load(out)
     about = policy.about
     assert about["step"] == policy.step and about["environment"] == "hopper" and about["version"] == version("quad-rl")
-    assert about["data"]["license"] == "CC0" and about["score"]["episodes"] == 3 and about["judgement"] is None
+    assert about["data"]["license"] == "CC0" and about["score"]["episodes"] == 3 and about["judgment"] is None
     snapshot = Policy.load(run / "snapshots" / f"step_{policy.step:09}.safetensors")
     observation = np.zeros(policy.observation_size, np.float32)
     assert np.array_equal(policy.act(observation, seed=1), snapshot.act(observation, seed=1))

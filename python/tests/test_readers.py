@@ -65,7 +65,7 @@ def test_robomimic(demonstrations):
 
 
 def test_robomimic_s_next_observations_are_the_following_rows(demonstrations):
-    """Else what was left out between two rows would be learnt as one step."""
+    """Else what was left out between two rows would be learned as one step."""
     seen = {"observations": ["eef_pos", "object"]}
     right = Dataset.from_robomimic(demonstrations, **seen)
     with h5py.File(demonstrations, "a") as file:

@@ -42,8 +42,8 @@ def test_it_trains_as_the_program_does(data, tmp_path, capsys):
         quad_rl.train(data, run_dir=run.folder, steps=400, scale="actions,states", set={"batch_size": 32}, **SMALL)
     with pytest.raises(RuntimeError, match=r"^cannot read .*nothing.hdf5(.|\n)*\nhint: "):
         quad_rl.train(tmp_path / "nothing.hdf5", run_dir=tmp_path / "other")
-    with pytest.raises(RuntimeError, match="unexpected argument '--colour'"):
-        quad_rl.train(data, run_dir=tmp_path / "other", colour=7, fresh=False)
+    with pytest.raises(RuntimeError, match="unexpected argument '--color'"):
+        quad_rl.train(data, run_dir=tmp_path / "other", color=7, fresh=False)
 
 
 SCRIPT = """

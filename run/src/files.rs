@@ -105,7 +105,7 @@ pub fn replace(target: &Path, bytes: &[u8]) -> io::Result<()> {
     file.write_all(bytes)
         .and_then(|()| file.sync_all())
         .and_then(|()| fs::rename(&partial, target))
-        .and_then(|()| synchronise_folder(target))
+        .and_then(|()| synchronize_folder(target))
         .inspect_err(|_| {
             // On a full disk the half file would keep others from being written.
             fs::remove_file(&partial).ok();
@@ -137,14 +137,14 @@ pub(crate) fn create_folder(path: &Path) -> io::Result<()> {
         create_folder(parent)?;
     }
     fs::create_dir(path)?;
-    synchronise_folder(path)
+    synchronize_folder(path)
 }
 
 /// Makes the names in the folder that `path` lies in durable.
 ///
 /// # Errors
-/// The folder cannot be opened or synchronised.
-pub fn synchronise_folder(path: &Path) -> io::Result<()> {
+/// The folder cannot be opened or synchronized.
+pub fn synchronize_folder(path: &Path) -> io::Result<()> {
     let folder = path.parent().filter(|folder| !folder.as_os_str().is_empty()).unwrap_or(Path::new("."));
     File::open(folder)?.sync_all()
 }

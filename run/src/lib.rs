@@ -3,7 +3,7 @@
 //! It has no thread; every program calls it on threads of its own. In reading order; each module may use those below it:
 //!
 //! - [`status`]: how far runs are, and a list of all runs.
-//! - [`results`]: a run's scores, summarised, and the paper's.
+//! - [`results`]: a run's scores, summarized, and the paper's.
 //! - [`run`]: a run's folder.
 //! - [`config`]: a run's settings.
 //! - [`table`]: a table as text, Markdown, LaTeX and CSV.

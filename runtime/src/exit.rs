@@ -104,7 +104,7 @@ pub fn print(text: &str) -> anyhow::Result<()> {
 /// A command's result as JSON, which is indented: people read it, too.
 ///
 /// # Errors
-/// Serialisation fails, which it does for no result.
+/// Serialization fails, which it does for no result.
 pub fn json(result: &impl Serialize) -> anyhow::Result<String> {
     Ok(serde_json::to_string_pretty(result)?)
 }

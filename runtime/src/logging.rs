@@ -31,7 +31,7 @@ pub struct Logging {
     _writer: WorkerGuard,
 }
 
-/// Sends log lines to stderr, in colour on a terminal with colours unless NO_COLOR is set. The environment variable RUST_LOG
+/// Sends log lines to stderr, in color on a terminal with colors unless NO_COLOR is set. The environment variable RUST_LOG
 /// chooses the lines. If stderr is not read, only the log's own thread waits.
 ///
 /// Call it once, first in `main`; further calls do nothing.
@@ -40,13 +40,13 @@ pub fn init_logging() -> Logging {
     let (lines, guard) = writer.finish(std::io::stderr());
     let filter = EnvFilter::try_from_default_env().unwrap_or_else(|_| EnvFilter::new(DEFAULT_FILTER));
     let variable = |name| env::var_os(name).unwrap_or_default();
-    let colours = std::io::stderr().is_terminal() && variable("NO_COLOR").is_empty() && variable("TERM") != "dumb";
-    subscriber(move || lines.clone(), filter, colours).try_init().ok();
+    let colors = std::io::stderr().is_terminal() && variable("NO_COLOR").is_empty() && variable("TERM") != "dumb";
+    subscriber(move || lines.clone(), filter, colors).try_init().ok();
     Logging { _writer: guard }
 }
 
 /// Writes lines without control characters. The formatter has escaped those that terminals' commands begin with; what has these
-/// in the end is our own, for colours.
+/// in the end is our own, for colors.
 struct Clean<W>(W);
 
 impl<W: Write> Write for Clean<W> {
@@ -65,14 +65,14 @@ impl<W: Write> Write for Clean<W> {
 fn subscriber<W: Write + 'static>(
     writer: impl Fn() -> W + Send + Sync + 'static,
     filter: EnvFilter,
-    colours: bool,
+    colors: bool,
 ) -> impl Subscriber + Send + Sync + 'static {
     let minute = Mutex::new((Instant::now(), 0));
     let bounded = dynamic_filter_fn(move |metadata, _| {
         let counts = metadata.target().starts_with("zenoh") && *metadata.level() <= Level::INFO;
         !counts || has_room(&minute, Instant::now())
     });
-    let lines = fmt::layer().with_target(false).with_writer(move || Clean(writer())).with_ansi(colours);
+    let lines = fmt::layer().with_target(false).with_writer(move || Clean(writer())).with_ansi(colors);
     let lines = lines.with_filter(bounded);
     registry().with(lines).with(filter)
 }

@@ -1,4 +1,4 @@
-//! A library to be preloaded: has [`Disk`] keep what a program synchronises. Stands in for libc's `fsync` and `fdatasync`.
+//! A library to be preloaded: has [`Disk`] keep what a program synchronizes. Stands in for libc's `fsync` and `fdatasync`.
 #![allow(clippy::expect_used)]
 
 use std::ffi::{c_int, c_long};
@@ -10,23 +10,23 @@ use std::time::Duration;
 
 use quad_tests::power::Disk;
 
-/// A slow disk: so that a program is often killed between writing and synchronising.
+/// A slow disk: so that a program is often killed between writing and synchronizing.
 const DISK: Duration = Duration::from_millis(10);
 
 /// Stands in for libc's.
 #[unsafe(no_mangle)]
 pub extern "C" fn fsync(file: c_int) -> c_int {
-    synchronise(libc::SYS_fsync, file)
+    synchronize(libc::SYS_fsync, file)
 }
 
 /// Stands in for libc's.
 #[unsafe(no_mangle)]
 pub extern "C" fn fdatasync(file: c_int) -> c_int {
-    synchronise(libc::SYS_fdatasync, file)
+    synchronize(libc::SYS_fdatasync, file)
 }
 
-fn synchronise(call: c_long, file: c_int) -> c_int {
-    // One at a time: of two threads that synchronise one folder, the later one must be kept.
+fn synchronize(call: c_long, file: c_int) -> c_int {
+    // One at a time: of two threads that synchronize one folder, the later one must be kept.
     static ONE: Mutex<()> = Mutex::new(());
     let _one = ONE.lock().unwrap_or_else(PoisonError::into_inner);
     sleep(DISK);

@@ -9,7 +9,7 @@ import numpy as np
 from networks import adam_step, compiled, configuration, follow, mish, near, random_moments, single
 
 TAPS = 5
-# Large rates, so that a mistake in an optimiser or an average is far larger than float32's rounding.
+# Large rates, so that a mistake in an optimizer or an average is far larger than float32's rounding.
 AGENT = {
     "gamma": 0.997,
     "terminal_penalty": 100.0,

@@ -24,7 +24,7 @@ from networks import (
 )
 
 CRITICS = 2
-# Large rates, so that a mistake in an optimiser or an average is far larger than float32's rounding.
+# Large rates, so that a mistake in an optimizer or an average is far larger than float32's rounding.
 AGENT = {
     "diffusion_steps": 5,
     "gamma": 0.99,

@@ -29,7 +29,7 @@ TIME_FEATURES, TIME_HIDDEN, TIME_EMBEDDING = 16, 32, 16
 LOG_STD = -5.0, 2.0
 # What PyTorch's layer norm adds to the variance.
 TORCH_EPSILON = 1e-5
-# Large rates, so that a mistake in an optimiser or an average is far larger than float32's rounding.
+# Large rates, so that a mistake in an optimizer or an average is far larger than float32's rounding.
 AGENT = {
     "gamma": 0.99,
     "expectile": 0.7,

@@ -1,4 +1,4 @@
-"""One update of fitted Q evaluation (Le et al. 2019): Q towards r + γ·mask·Q̂(s', a') with the actions a' of a policy, clipped."""
+"""One update of fitted Q evaluation (Le et al. 2019): Q toward r + γ·mask·Q̂(s', a') with the actions a' of a policy, clipped."""
 
 import implicit
 import numpy as np

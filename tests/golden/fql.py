@@ -10,7 +10,7 @@ from networks import adam_step, compiled, configuration, ensemble, fast_values, 
 from networks import random_network, shape, single, values
 
 CRITICS = 2
-VARIANTS = {"fql": 700, "fql-normalised": 701}
+VARIANTS = {"fql": 700, "fql-normalized": 701}
 SIZES = {
     "narrow": {"hidden": 5, "batch_size": 23, "select": 3},
     "small": {"hidden": 11, "batch_size": 24, "select": 6},
@@ -27,12 +27,12 @@ AGENT = {
 
 
 def make_config(variant, size):
-    hidden, normalised = SIZES[size]["hidden"], variant == "fql-normalised"
+    hidden, normalized = SIZES[size]["hidden"], variant == "fql-normalized"
     networks = {
         "actor": shape([hidden, hidden, hidden - 2], "gelu"),
         "critic": shape([hidden, hidden - 1], "gelu", True) | {"norm_after": True},
     }
-    own = {"target": "min" if normalised else "mean", "normalize_q": normalised}
+    own = {"target": "min" if normalized else "mean", "normalize_q": normalized}
     return configuration("fql", SIZES[size]["batch_size"], VARIANTS[variant], networks | AGENT | own)
 
 

@@ -1,5 +1,5 @@
 """What IQL and its kin share: V(s) from the target critics' smaller value, a Gaussian policy cloned from the data with
-weights, and twin critics towards r + γ·V(s'). V and the actor are ensembles of one.
+weights, and twin critics toward r + γ·V(s'). V and the actor are ensembles of one.
 """
 
 import math
@@ -29,7 +29,7 @@ CRITICS = 2
 LARGEST_WEIGHT = 100.0
 LOG_STD = -5.0, 2.0
 
-# Large rates, so that a mistake in an optimiser or an average is far larger than float32's rounding.
+# Large rates, so that a mistake in an optimizer or an average is far larger than float32's rounding.
 RATES = {
     "actor_learning_rate": 0.02,
     "critic_learning_rate": 0.03,
@@ -45,7 +45,7 @@ SIZES = {
 
 
 def value_networks(size):
-    """ReLU, and a V that is normalised. In wide networks some ReLU is always about to turn: those have Mish."""
+    """ReLU, and a V that is normalized. In wide networks some ReLU is always about to turn: those have Mish."""
     hidden, activation = SIZES[size]["hidden"], "mish" if size == "hopper" else "relu"
     return {
         "actor": shape([hidden, hidden], activation),
@@ -105,7 +105,7 @@ def least(critics, states, actions, config):
 
 
 def update_critics(config, state, inputs, network, gradient=critic_gradient):
-    """The critics towards r + γ·V(s') with the V given, and their targets after them."""
+    """The critics toward r + γ·V(s') with the V given, and their targets after them."""
     agent, activation = config["agent"], config["agent"]["critic"]["activation"]
     next_v = fast_value(network, inputs["next_observations"], agent["value"]["activation"])
     targets = inputs["rewards"] + agent["gamma"] * inputs["masks"] * next_v

@@ -72,7 +72,7 @@ FOLDERS = {
     "rebrac": (54, "rebrac", "small"),
     "rebrac-critic": (55, "rebrac-critic", "small"),
     "fql": (56, "fql", "small"),
-    "fql-normalised": (57, "fql-normalised", "small"),
+    "fql-normalized": (57, "fql-normalized", "small"),
 }
 MODULES = quad, iql, ivr, xql, dql, align_iql, onestep, cql, dtql, sfbc, diffuser, fqe, td3bc, fql
 ALGORITHMS = {variant: algorithm for algorithm in MODULES for variant in algorithm.VARIANTS}

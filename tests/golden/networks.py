@@ -31,7 +31,7 @@ def compiled(function):
     return lambda *arguments: jax.tree.map(np.asarray, fast(*arguments))
 
 
-# Networks. An activation goes by its name; layers, and whether they are normalised, follow from the parameters' names.
+# Networks. An activation goes by its name; layers, and whether they are normalized, follow from the parameters' names.
 
 
 def mish(x):
@@ -45,13 +45,13 @@ def gelu(x):
 ACTIVATIONS = {"mish": mish, "relu": jax.nn.relu, "silu": jax.nn.silu, "tanh": jnp.tanh, "gelu": gelu}
 
 
-def normalised(x, epsilon):
+def normalized(x, epsilon):
     """Mean 0 and variance 1 over the last axis."""
     return (x - x.mean(-1, keepdims=True)) / jnp.sqrt(x.var(-1, keepdims=True) + epsilon)
 
 
 def mlp(parameters, prefix, activation, x, epsilon=1e-6, after=False):
-    """Layers; what is normalised is before its activation, or after."""
+    """Layers; what is normalized is before its activation, or after."""
     last = sum(bool(re.fullmatch(rf"{prefix}\d+\.kernel", name)) for name in parameters) - 1
     for i in range(last + 1):
         x = x @ parameters[f"{prefix}{i}.kernel"] + parameters[f"{prefix}{i}.bias"]
@@ -59,7 +59,7 @@ def mlp(parameters, prefix, activation, x, epsilon=1e-6, after=False):
             return x
         x = ACTIVATIONS[activation](x) if after else x
         if f"{prefix}{i}.scale" in parameters:
-            x = parameters[f"{prefix}{i}.scale"] * normalised(x, epsilon) + parameters[f"{prefix}{i}.shift"]
+            x = parameters[f"{prefix}{i}.scale"] * normalized(x, epsilon) + parameters[f"{prefix}{i}.shift"]
         x = x if after else ACTIVATIONS[activation](x)
 
 
@@ -76,7 +76,7 @@ def values(critics, states, actions, activation, epsilon=1e-6, after=False):
 fast_values = compiled(values)
 
 
-# Optimisation.
+# Optimization.
 
 
 def clip_by_norm(gradients, limit):

@@ -38,7 +38,7 @@ def phase_of(config):
     return ("critic", step - critic) if step < actor else ("actor", step - actor)
 
 
-# Networks: all are ensembles of one; the actor has the behaviour's shape.
+# Networks: all are ensembles of one; the actor has the behavior's shape.
 
 
 def gaussian(policy, states, activation):

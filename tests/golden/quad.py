@@ -26,7 +26,7 @@ from networks import (
     values,
 )
 
-# Large rates, so that a mistake in an optimiser or an average is far larger than float32's rounding.
+# Large rates, so that a mistake in an optimizer or an average is far larger than float32's rounding.
 AGENT = {
     "diffusion_steps": 5,
     "gamma": 0.99,
@@ -92,7 +92,7 @@ def critic_loss(critics, states, actions, targets, activation):
 
 
 def actor_loss(actor, states, noisy_actions, t, epsilon, eta, weight, gradient, activation):
-    """Eq. 19, given weight λ·w(t) [B, 1] and the normalised gradient ḡ [B, a]; also its two terms."""
+    """Eq. 19, given weight λ·w(t) [B, 1] and the normalized gradient ḡ [B, a]; also its two terms."""
     predicted = predict_noise(actor, states, noisy_actions, t, activation)
     bc = jnp.mean((epsilon - predicted) ** 2)
     pull = jnp.mean(weight * predicted * gradient)

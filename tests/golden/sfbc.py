@@ -241,7 +241,7 @@ def random_state(config, rng):
         "actor": random_predictor(rng, o, a, agent["actor"]["hidden"]),
         "critic": random_network(rng, o + a, agent["critic"], 1, 1),
     }
-    # Actions of a network that has learnt nothing are far from 0, and the farther the more it says.
+    # Actions of a network that has learned nothing are far from 0, and the farther the more it says.
     kernel = state["critic"]["0.kernel"]
     kernel[:, o:] = single(kernel[:, o:] / 100)
     state["actor"]["last.kernel"] = single(state["actor"]["last.kernel"] / 30)

@@ -41,7 +41,7 @@ def actor_losses(actor, critics, states, actions, weight, activation):
     return -weight / jax.lax.stop_gradient(jnp.mean(jnp.abs(q))) * jnp.mean(q) + distance, distance
 
 
-def penalised_losses(actor, critics, states, actions, penalty, activation):
+def penalized_losses(actor, critics, states, actions, penalty, activation):
     """ReBRAC's."""
     taken = mean_action(actor, states, activation)
     q = jnp.min(values(critics, states, taken, activation, after=True), 0)
@@ -55,7 +55,7 @@ def normed_critic_loss(critics, states, actions, targets, activation):
 
 
 actor_gradient = compiled(jax.value_and_grad(actor_losses, has_aux=True))
-penalised_gradient = compiled(jax.value_and_grad(penalised_losses, has_aux=True))
+penalized_gradient = compiled(jax.value_and_grad(penalized_losses, has_aux=True))
 normed_critic_gradient = compiled(jax.value_and_grad(normed_critic_loss))
 
 
@@ -77,7 +77,7 @@ def update(config, state, inputs):
     out = state | adam_step(state, "critic", gradients, agent["critic_learning_rate"], step)
     out |= {"targets": targets, "q_mean": targets.mean(), "critic_loss": critic_loss}
     if step % agent["actor_every"] == (0 if rebrac else agent["actor_every"] - 1):
-        moved, weight = (penalised_gradient, "actor_penalty") if rebrac else (actor_gradient, "weight")
+        moved, weight = (penalized_gradient, "actor_penalty") if rebrac else (actor_gradient, "weight")
         (loss, distance), gradients = moved(state["actor"], out["critic"], s, a, agent[weight], activation)
         out |= adam_step(state, "actor", gradients, agent["actor_learning_rate"], step // agent["actor_every"])
         out["target_critic"] = follow(state["target_critic"], out["critic"], agent["ema_rate"])

@@ -23,7 +23,7 @@ const PAUSE: Duration = Duration::from_millis(250);
 pub struct Measured {
     /// How long each answer to a claim took.
     pub claims: Vec<Duration>,
-    /// How long each acknowledgement of scores took.
+    /// How long each acknowledgment of scores took.
     pub reports: Vec<Duration>,
     /// Questions without an answer.
     pub unanswered: usize,

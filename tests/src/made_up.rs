@@ -58,7 +58,7 @@ pub fn scores(job: &Job, evaluator: &str) -> ScoreReport {
     let hopper = environment::find("hopper").expect("hopper is known");
     let episodes = job.seeds.iter().map(|&seed| {
         let episode_return = (seed % 3000) as f64;
-        EpisodeScore { seed, episode_return, length: 300, score: hopper.normalised_score(episode_return) }
+        EpisodeScore { seed, episode_return, length: 300, score: hopper.normalized_score(episode_return) }
     });
     ScoreReport::of(job, name(evaluator), name("f32"), episodes.collect())
 }

@@ -1,7 +1,7 @@
-//! What a disk holds after a power cut, at worst: nothing but what was synchronised.
+//! What a disk holds after a power cut, at worst: nothing but what was synchronized.
 //!
 //! A file has the contents of its last fsync, a folder the entries of its own last fsync, and an entry that was never
-//! synchronised itself is empty. examples/power_cut.rs, preloaded into a program, keeps such a [`Disk`] up to date.
+//! synchronized itself is empty. examples/power_cut.rs, preloaded into a program, keeps such a [`Disk`] up to date.
 
 use std::fs::{self, File};
 use std::io;
@@ -37,7 +37,7 @@ impl Disk {
         Disk { folder: folder(FOLDER), kept: folder(KEPT) }
     }
 
-    /// The words that start a program whose synchronising is watched.
+    /// The words that start a program whose synchronizing is watched.
     pub fn launcher(&self) -> Vec<String> {
         let set = |variable: &str, path: &Path| format!("{variable}={}", path.display());
         [preload("power_cut"), vec![set(FOLDER, &self.folder), set(KEPT, &self.kept)]].concat()
@@ -84,7 +84,7 @@ impl Disk {
 
     fn restore(&self, folder: &str, target: &Path) -> io::Result<()> {
         fs::create_dir(target)?;
-        // One that was never synchronised has no entries.
+        // One that was never synchronized has no entries.
         for line in fs::read_to_string(self.kept.join(folder)).unwrap_or_default().lines() {
             let mut words = line.splitn(3, ' ');
             let mut word = || words.next().expect("a line has three words");
@@ -106,7 +106,7 @@ fn entry_line(entry: &fs::DirEntry) -> io::Result<String> {
 }
 
 /// What stays the same when a file is renamed, and is another for another file. A number alone is given again, but some
-/// filesystems know no more; there, a new file that was never synchronised may be left with the contents of a former one.
+/// filesystems know no more; there, a new file that was never synchronized may be left with the contents of a former one.
 fn identity(path: &Path) -> io::Result<String> {
     let metadata = fs::symlink_metadata(path)?;
     let born = metadata.created().ok().and_then(|time| time.duration_since(UNIX_EPOCH).ok());

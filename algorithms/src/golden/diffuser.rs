@@ -1,4 +1,4 @@
-//! Tests: an update and plans against an independent implementation (tests/golden/README.md), and what is learnt from.
+//! Tests: an update and plans against an independent implementation (tests/golden/README.md), and what is learned from.
 
 use super::*;
 use crate::golden::{Golden, check_update, golden_tests, load, table};

@@ -103,7 +103,7 @@ fn a_saved_evaluation_goes_on_bit_for_bit() {
 }
 
 #[test]
-fn the_behaviour_s_own_value_is_learnt_where_the_data_says_what_it_did() {
+fn the_behavior_s_own_value_is_learned_where_the_data_says_what_it_did() {
     // Two episodes of three steps with a reward of 1 each: one terminates, of the other nothing is known after the cut.
     let transitions = Transitions::of(Arrays {
         observation_dim: 1,

@@ -14,7 +14,7 @@ pub(super) enum Guidance {
     Quad,
     /// Unweighted Q-gradients, λ = 1 (Eq. 8).
     Dac,
-    /// No Q-gradient: behaviour cloning. The critics are trained all the same.
+    /// No Q-gradient: behavior cloning. The critics are trained all the same.
     None,
     /// A control: Q-gradients weighted by the same λ in all samples, the user's.
     Constant,
@@ -34,13 +34,13 @@ pub(super) enum TargetReduce {
     Max,
 }
 
-/// The strength η of behaviour cloning, the Lagrangian multiplier of Eq. 19.
+/// The strength η of behavior cloning, the Lagrangian multiplier of Eq. 19.
 #[derive(Clone, Copy, Debug, PartialEq, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub(super) struct Eta {
     /// Value at the first step.
     pub initial: NotNegative,
-    /// Behaviour-cloning loss b that dual ascent aims at; absent: η stays at `initial`.
+    /// Behavior-cloning loss b that dual ascent aims at; absent: η stays at `initial`.
     pub threshold: Option<Positive>,
     /// Step size α_η of dual ascent.
     pub rate: NotNegative,
@@ -70,7 +70,7 @@ pub(super) struct Quad {
     pub guidance: Guidance,
     /// Temperature τ of the uncertainty weight (Eq. 24); `inf` gives λ = ν̂²/(ν̂² + δ).
     pub tau: f32,
-    /// Stabiliser δ of Eq. 24, on the scale of squared normalised Q-gradients.
+    /// Stabilizer δ of Eq. 24, on the scale of squared normalized Q-gradients.
     pub delta: Positive,
     /// λ of guidance `constant`, and only of it.
     pub lambda: Option<Share>,
@@ -80,7 +80,7 @@ pub(super) struct Quad {
     pub target_reduce: TargetReduce,
     /// Actions that an evaluated policy draws in each state, N_a (Eq. 25).
     pub candidates: Candidates,
-    /// Behaviour-cloning strength.
+    /// Behavior-cloning strength.
     pub eta: Eta,
     /// Adam's learning rate for the actor at the first step; decays to 0 along a cosine.
     pub actor_learning_rate: Positive,

@@ -1,4 +1,4 @@
-//! What λ does in a batch, and how guidance stands to behaviour cloning, in one pass on the CPU.
+//! What λ does in a batch, and how guidance stands to behavior cloning, in one pass on the CPU.
 
 use super::guidance::Guide;
 use crate::algorithm::Measured;

@@ -5,9 +5,9 @@ use crate::definition::{Metric, metrics};
 pub(super) const METRICS: &[Metric] = &metrics! {
     q_mean held_out: "Mean over the batch of the critics' target y (Eq. 20). A value that grows without end is overestimation.";
     critic_loss ["critic loss"] held_out: "Mean over critics and batch of (y − Q_k(s, a))² with y = r + γ·mask·Q_LCB(s', a'), Q_LCB = mean_k Q̂_k − ρ·std_k Q̂_k (Eq. 20).";
-    bc_loss ["BC loss"] held_out: "Mean over batch and dimensions of (ε − ε_θ(a^t, s, t))², the behaviour-cloning term of Eq. 19 before η. A network that always outputs 0 has loss 1; a policy that knows the data lies well below.";
+    bc_loss ["BC loss"] held_out: "Mean over batch and dimensions of (ε − ε_θ(a^t, s, t))², the behavior-cloning term of Eq. 19 before η. A network that always outputs 0 has loss 1; a policy that knows the data lies well below.";
     actor_loss held_out: "Eq. 19: η·(BC loss) + mean of λ·w(t)·ε_θ·ḡ, where ḡ is the Q-gradient (Eq. 10) over the mean of |Q̂_k(s, a)| and w(t) = √(1 − ᾱ_t).";
-    eta ["η"]: "Strength η of behaviour cloning (Eq. 19). With a threshold b it rises while the BC loss is above b and falls while it is below; without one, or without guidance, it is constant.";
+    eta ["η"]: "Strength η of behavior cloning (Eq. 19). With a threshold b it rises while the BC loss is above b and falls while it is below; without one, or without guidance, it is constant.";
     nu_squared: "ν̂²: moving average of the variance over the batch of the critics' mean alignment (Eq. 21–23).";
     critic_gradient_norm: "Global norm of the critics' gradient before clipping.";
     actor_gradient_norm: "Global norm of the actor's gradient before clipping.";
@@ -24,5 +24,5 @@ pub(super) const METRICS: &[Metric] = &metrics! {
     lambda_fifth_5: "Mean of λ over the samples whose t is in the last fifth, the noisiest.";
     lambda_above_99_share: "Share of the batch, 0 to 1, whose λ is above 0.99: there QUAD is DAC to within 1 %.";
     variance_ratio: "Mean over the batch of σ²/(ν̂² + δ), which is what λ falls with: the critics' disagreement on the alignment (Eq. 22) over how much it varies between samples.";
-    guidance_cosine: "Mean over the batch of the cosine between the gradients of guidance, ḡ, and of behaviour cloning, ε_θ − ε, with respect to ε_θ: 1 where both pull in one direction, −1 where they pull against each other.";
+    guidance_cosine: "Mean over the batch of the cosine between the gradients of guidance, ḡ, and of behavior cloning, ε_θ − ε, with respect to ε_θ: 1 where both pull in one direction, −1 where they pull against each other.";
 };

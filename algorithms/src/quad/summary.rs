@@ -6,7 +6,7 @@ use serde_json::json;
 
 use crate::definition::{MetricsLine, Summary};
 
-/// The first of so many parts of a run does not count: critics that have learnt little agree by chance.
+/// The first of so many parts of a run does not count: critics that have learned little agree by chance.
 const PARTS: u64 = 10;
 /// A weight above this is taken for no weight.
 const ONE: f64 = 0.99;
@@ -45,7 +45,7 @@ fn text(means: &BTreeMap<&str, f64>, from_step: u64, to_step: u64) -> String {
         "λ in steps {from_step} to {to_step}: mean {:.3}, of a batch 10 % below {low:.3}, 50 % below {median:.3}, 90 % below \
          {high:.3}; {:.1} % above {ONE}\n\
          λ from the first to the last fifth of the denoising steps t = 1…T: {}\n\
-         σ²/ν̂² {:.3}, cosine of guidance and behaviour cloning {:.3}\n",
+         σ²/ν̂² {:.3}, cosine of guidance and behavior cloning {:.3}\n",
         mean("lambda_mean"),
         100.0 * mean("lambda_above_99_share"),
         fifths.join(" "),

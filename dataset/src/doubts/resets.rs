@@ -52,7 +52,7 @@ fn judge(name: &str, flags: &[usize], lengths: &[f64], limit: f64) -> Option<Str
     is_proof.then(|| {
         format!(
             "array `{name}`: one row {late}, out of step with the resets: states jump at the row {side} ({beside} of {}), \
-             which ends no episode, and not at their own, so that resets are learnt as steps; move them one row {up}",
+             which ends no episode, and not at their own, so that resets are learned as steps; move them one row {up}",
             flags.len()
         )
     })

@@ -1,4 +1,4 @@
-//! Numbers that are too far from ±1, or change too little, to be learnt from as they are.
+//! Numbers that are too far from ±1, or change too little, to be learned from as they are.
 
 use super::{named, short};
 use crate::recording::{Recording, RowKind};

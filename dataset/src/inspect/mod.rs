@@ -88,7 +88,7 @@ pub struct Inspection {
     pub refused: bool,
 }
 
-/// Normalised scores of the episodes.
+/// Normalized scores of the episodes.
 #[derive(Debug, Serialize)]
 pub struct Scores {
     /// Smallest.
@@ -178,9 +178,9 @@ pub fn inspect(
         mean_return: sum.mean,
         max_return: sum.max,
         scores: spec.map(|spec| Scores {
-            min_score: spec.normalised_score(sum.min),
-            mean_score: spec.normalised_score(sum.mean),
-            max_score: spec.normalised_score(sum.max),
+            min_score: spec.normalized_score(sum.min),
+            mean_score: spec.normalized_score(sum.mean),
+            max_score: spec.normalized_score(sum.max),
         }),
         constant_observations: Range::constant(&observation_ranges),
         constant_actions: Range::constant(&action_ranges),

@@ -88,7 +88,7 @@ fn windows_lie_within_episodes() {
 }
 
 #[test]
-fn standard_units_are_of_the_rows_that_are_learnt_from() {
+fn standard_units_are_of_the_rows_that_are_learned_from() {
     let units = transitions(d4rl()).standard_units();
     let affine = units.observations.unwrap();
     // 0, 1, 3, 4 and 5: the mean of the squares is 10.2, that of the numbers 2.6.

@@ -84,7 +84,7 @@ fn compare(path: &Path, environment: Option<&'static EnvironmentSpec>, reference
     for (ours, theirs) in figures.iter().zip(&theirs) {
         assert!((ours - theirs).abs() <= 1e-9 * theirs.abs(), "{figures:?} against {theirs:?}");
     }
-    assert_eq!(ours.score_mean, environment.map(|environment| environment.normalised_score(ours.return_mean)));
+    assert_eq!(ours.score_mean, environment.map(|environment| environment.normalized_score(ours.return_mean)));
 }
 
 fn assert_close(name: &str, ours: &[f32], theirs: &[f32]) {

@@ -53,7 +53,7 @@ fn observations_in_an_array() {
 }
 
 #[test]
-fn another_simulation_is_learnt_from_but_not_scored_in_ours() {
+fn another_simulation_is_learned_from_but_not_scored_in_ours() {
     for (kind, id, ours) in [("antmaze", "AntMaze_UMaze-v4", "antmaze-umaze"), ("walker2d", "Walker2d-v5", "walker2d")]
     {
         let Some(root) = Root::new(kind) else { return };

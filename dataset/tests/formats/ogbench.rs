@@ -65,7 +65,7 @@ fn a_task_in_a_maze_has_ogbenchs_start_rewards_and_masks() {
 }
 
 #[test]
-fn a_maze_of_ogbench_is_learnt_from_but_not_scored_in_one_of_ours() {
+fn a_maze_of_ogbench_is_learned_from_but_not_scored_in_one_of_ours() {
     let Some((_folder, path)) = written("maze") else { return };
     assert!(try_read(&path, None).is_ok());
     let error = try_read(&path, environment::find("antmaze-medium").ok()).err().unwrap();

@@ -82,7 +82,7 @@ fn discrete_actions() {
         let Some(result) = read_own(&["text", kind]) else { return };
         let error = result.err().unwrap();
         let expected =
-            "array `actions` holds whole numbers, as if actions were discrete; only continuous ones can be learnt";
+            "array `actions` holds whole numbers, as if actions were discrete; only continuous ones can be learned";
         assert!(error.to_string().ends_with(expected), "{error}");
         assert!(error.hint().contains("float32"), "{}", error.hint());
     }
@@ -159,7 +159,7 @@ fn arrays_that_would_be_refused_are_not_written() {
 }
 
 #[test]
-fn rows_in_any_order_are_learnt_from_with_the_next_observations_of_their_own() {
+fn rows_in_any_order_are_learned_from_with_the_next_observations_of_their_own() {
     let strange = Arrays { next_observations: vec![7.0; 18], actions: vec![0.25; 12], ..arrays() };
     assert_eq!(all(&Transitions::of(strange).unwrap()).next_observations, [7.0; 18]);
 }

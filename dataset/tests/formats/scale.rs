@@ -59,7 +59,7 @@ fn states_have_mean_0_and_deviation_1() {
 }
 
 #[test]
-fn rows_that_are_not_learnt_from_do_not_count() {
+fn rows_that_are_not_learned_from_do_not_count() {
     let folder = tempdir().unwrap();
     let path = folder.path().join("d4rl.hdf5");
     let file = hdf5::File::create(&path).unwrap();
@@ -109,7 +109,7 @@ fn rewards_have_a_mean_square_of_1() {
     assert_close("rewards", &all(&transitions).rewards, &[1.0, 2.0, 3.0, 4.0].map(|reward| reward / size));
     assert_eq!(transitions.statistics().return_mean, 10.0, "as they were recorded");
     // After the rule of the task.
-    let rule = ReadOptions { reward: RewardRule::CentreTimes4, ..options(scale) };
+    let rule = ReadOptions { reward: RewardRule::CenterTimes4, ..options(scale) };
     let ruled = Transitions::read(&path, &rule).unwrap();
     assert_close("ruled", &all(&ruled).rewards, &[2.0, 6.0, 10.0, 14.0].map(|reward| reward / 84_f32.sqrt()));
     write_own(&path, Arrays { rewards: vec![0.0; 4], ..arrays() }, Names::default()).unwrap();

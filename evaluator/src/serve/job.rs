@@ -68,7 +68,7 @@ pub fn check_memory(job: &Job, policy: &dyn Policy) -> Result<(), JobError> {
 /// The state that the thread of a job and the task that watches it share.
 #[derive(Default)]
 struct Shared {
-    cancelled: AtomicBool,
+    canceled: AtomicBool,
     episodes_done: AtomicU32,
     steps_done: AtomicU64,
 }
@@ -118,7 +118,7 @@ impl Running {
                 self.metrics.job_duration.observe(self.started.elapsed().as_secs_f64());
                 Ok(outcomes.iter().map(episode_score).collect())
             }
-            Ok(Ok(None)) => Err(anyhow::anyhow!("it was cancelled")),
+            Ok(Ok(None)) => Err(anyhow::anyhow!("it was canceled")),
             Ok(Err(error)) => Err(error),
             Err(error) => Err(error.into()),
         })
@@ -128,13 +128,13 @@ impl Running {
 impl Drop for Running {
     fn drop(&mut self) {
         if self.thread.is_some() {
-            self.shared.cancelled.store(true, Relaxed);
+            self.shared.canceled.store(true, Relaxed);
             self.metrics.job(JobOutcome::Abandoned);
         }
     }
 }
 
-/// Runs all episodes to their end; `None` if cancelled. Fails if the policy cannot act, an environment fails, or the job takes
+/// Runs all episodes to their end; `None` if canceled. Fails if the policy cannot act, an environment fails, or the job takes
 /// longer than `longest`.
 fn roll_out(
     environments: &dyn Environments,
@@ -147,7 +147,7 @@ fn roll_out(
     let started = Instant::now();
     let mut rollout = episodes(environments, job, policy)?;
     while !rollout.is_done() {
-        if shared.cancelled.load(Relaxed) {
+        if shared.canceled.load(Relaxed) {
             return Ok(None);
         }
         if started.elapsed() > longest {

@@ -42,7 +42,7 @@ fn log(message: &MjLogMessage) {
 pub(super) enum Drive {
     /// Its numbers are torques, as fractions of each motor's strongest.
     Motors,
-    /// Before a step they are added to the positions, as fractions of so many metres, and velocities become 0.
+    /// Before a step they are added to the positions, as fractions of so many meters, and velocities become 0.
     Displacement(f64),
 }
 

@@ -5,7 +5,7 @@
 //! rows:
 //!
 //! - qpos: x, z and pitch of the torso, then the joints from the hip down (HalfCheetah: the back leg first; Walker2d:
-//!   the right one); qvel: their velocities. Metres and radians, per second.
+//!   the right one); qvel: their velocities. Meters and radians, per second.
 //! - Observation: qpos without x, then qvel, clipped to ± `observed_velocity`.
 //! - Action: torques of the joints in that order, as fractions of the motors' strongest, clipped to ±1.
 //! - Reward: x's mean velocity over the control period, plus `alive_bonus`, minus `control_cost` · Σ a², with the clipped action.

@@ -51,7 +51,7 @@ pub struct EpisodeOutcome {
     pub episode_return: f64,
     /// Its number of steps.
     pub length: u32,
-    /// Its score, from the environment: D4RL-normalised in the environments of this program.
+    /// Its score, from the environment: D4RL-normalized in the environments of this program.
     pub score: f64,
 }
 

@@ -74,12 +74,12 @@ impl Simulation {
         self.start();
     }
 
-    /// Moves the goal (x and y, metres) until it is drawn again; does nothing in a task without a goal.
+    /// Moves the goal (x and y, meters) until it is drawn again; does nothing in a task without a goal.
     pub fn set_goal(&mut self, goal: &[f64]) {
         self.task.set_goal(goal);
     }
 
-    /// The position of the goal (x and y, metres), in a task that has one.
+    /// The position of the goal (x and y, meters), in a task that has one.
     pub fn goal(&self) -> Option<&[f64]> {
         self.task.goal()
     }
@@ -105,12 +105,12 @@ impl Simulation {
         &self.observation
     }
 
-    /// The current generalised positions.
+    /// The current generalized positions.
     pub fn qpos(&self) -> &[f64] {
         self.physics.qpos()
     }
 
-    /// The current generalised velocities.
+    /// The current generalized velocities.
     pub fn qvel(&self) -> &[f64] {
         self.physics.qvel()
     }
@@ -130,7 +130,7 @@ impl Simulation {
     }
 }
 
-/// With D4RL's normalised score.
+/// With D4RL's normalized score.
 impl Environment for Simulation {
     fn reset(&mut self, seed: u64) -> Result<(), EnvironmentError> {
         self.reset(seed);
@@ -146,6 +146,6 @@ impl Environment for Simulation {
     }
 
     fn score(&mut self, episode_return: f64) -> Result<f64, EnvironmentError> {
-        Ok(self.spec.normalised_score(episode_return))
+        Ok(self.spec.normalized_score(episode_return))
     }
 }

@@ -5,7 +5,7 @@
 //!
 //! # Layout
 //!
-//! - [`collect`]: trains behaviour from random to competent and records it as a dataset.
+//! - [`collect`]: trains behavior from random to competent and records it as a dataset.
 //! - [`verify`]: replays a recorded dataset and measures how far the simulation is from it.
 //! - `score`: scores saved policies.
 //! - `film`: films saved policies.

@@ -106,7 +106,7 @@ pub fn verify(path: &Path, spec: &'static EnvironmentSpec) -> anyhow::Result<Rep
             own.map(move |i| replay(environment, &rows.row(i), rows.goal(i)))
         })
         .collect();
-    let report = summarise(spec, &errors);
+    let report = summarize(spec, &errors);
     report.with_context(|| format!("{}: no rows with a next observation", path.display())).hint(OTHER_FILE)
 }
 
@@ -138,7 +138,7 @@ fn replay(environment: &mut Simulation, row: &Row<'_>, goal: Option<&[f64]>) -> 
 }
 
 /// `None` if there is no row to compare.
-fn summarise(spec: &'static EnvironmentSpec, errors: &[RowError]) -> Option<Report> {
+fn summarize(spec: &'static EnvironmentSpec, errors: &[RowError]) -> Option<Report> {
     let mut sorted: Vec<f64> = errors.iter().filter_map(|row| row.observation).collect();
     sorted.sort_by(f64::total_cmp);
     let last = sorted.len().checked_sub(1)?;

@@ -1,8 +1,8 @@
 // Charts of lines over gradient steps, with bands where points have a spread. They are kept and changed as data comes, so that
 // a view that was chosen stays.
 
-// Colours that stay apart for most colour-blind readers (Okabe and Ito); the last one suits dark and light.
-const COLOURS = ["#0072b2", "#d55e00", "#009e73", "#cc79a7", "#56b4e9", "#e69f00", "#888888"];
+// Colors that stay apart for most color-blind readers (Okabe and Ito); the last one suits dark and light.
+const COLORS = ["#0072b2", "#d55e00", "#009e73", "#cc79a7", "#56b4e9", "#e69f00", "#888888"];
 const charts = new Map();
 const dark = matchMedia("(prefers-color-scheme: dark)");
 
@@ -24,7 +24,7 @@ function short(step) {
   return step >= 1e4 ? `${number(step / 1e3)} k` : number(step);
 }
 
-// A line's colour is part of its style, which the page's policy lets scripts set.
+// A line's color is part of its style, which the page's policy lets scripts set.
 function legend({ series, x }) {
   const lines = document.createDocumentFragment();
   for (const { label, color, y } of series.filter((one) => one.isVisible)) {
@@ -39,11 +39,11 @@ function legend({ series, x }) {
   return lines;
 }
 
-function colours() {
+function colors() {
   const [axis, grid] = dark.matches ? ["#a3adb8", "#2c333b"] : ["#57606a", "#e4e7eb"];
   return { axisLineColor: axis, gridLineColor: grid };
 }
-dark.addEventListener("change", () => charts.forEach(({ graph }) => graph.updateOptions(colours())));
+dark.addEventListener("change", () => charts.forEach(({ graph }) => graph.updateOptions(colors())));
 
 // Points of several lines as rows: x, and [value, spread] of each line.
 function rows(lines) {
@@ -70,9 +70,9 @@ export function chart(parent, key, title, about, lines) {
     figure.append(caption, place, names);
     parent.append(figure);
     const graph = new Dygraph(place, file, {
-      labels, errorBars: true, sigma: 1, fillAlpha: 0.15, connectSeparatedPoints: true, strokeWidth: 2, colors: COLOURS,
+      labels, errorBars: true, sigma: 1, fillAlpha: 0.15, connectSeparatedPoints: true, strokeWidth: 2, colors: COLORS,
       legend: "always", labelsDiv: names, legendFormatter: legend, includeZero: key === "score",
-      drawPoints: file.length < 60, pointSize: 3, ...colours(),
+      drawPoints: file.length < 60, pointSize: 3, ...colors(),
       axes: { x: { drawGrid: false, axisLabelFormatter: short }, y: { axisLabelWidth: 56, axisLabelFormatter: number } },
     });
     charts.set(key, { graph, figure, place, shown: "" });

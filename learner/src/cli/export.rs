@@ -27,7 +27,7 @@ pub struct ExportArgs {
     /// The file to write
     #[arg(long, value_name = "FILE")]
     pub out: PathBuf,
-    /// Licence of the data [default: that of a dataset of `learner datasets list`]
+    /// License of the data [default: that of a dataset of `learner datasets list`]
     #[arg(long, value_name = "TEXT")]
     pub license: Option<String>,
 }

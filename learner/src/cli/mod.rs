@@ -63,7 +63,7 @@ pub enum Command {
     /// Rank policies without a simulator, by what the data alone says of them
     #[command(after_help = judge::EXAMPLES)]
     Judge(JudgeArgs),
-    /// Write a policy's file that stands alone: it says what it has learnt from and how good it is
+    /// Write a policy's file that stands alone: it says what it has learned from and how good it is
     #[command(after_help = export::EXAMPLES)]
     Export(ExportArgs),
     /// Check in a run's folder that each episode is scored once, with the weights in that folder

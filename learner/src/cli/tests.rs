@@ -31,12 +31,12 @@ fn wrong_command_lines_exit_with_2() {
     for flags in wrong {
         assert_eq!(parse(flags).unwrap_err().exit_code(), 2, "{flags:?}");
     }
-    for (flag, misspelt, answer) in [
+    for (flag, misspelled, answer) in [
         ("--task", "walker", "a similar value exists: 'walker2d-demo'"),
         ("--preset", "walker", "did you mean walker2d-demo"),
         ("--algorithm", "qad", "a similar value exists: 'quad'"),
     ] {
-        let unknown = Cli::try_parse_from(["learner", "train", flag, misspelt, "--dataset", "d"]).unwrap_err();
+        let unknown = Cli::try_parse_from(["learner", "train", flag, misspelled, "--dataset", "d"]).unwrap_err();
         assert!(unknown.to_string().contains(answer), "{unknown}");
     }
     assert!(Cli::try_parse_from(["learner", "train"]).unwrap_err().to_string().contains("--task"));

@@ -21,7 +21,7 @@ Examples:
   # Another algorithm on the same data.
   learner train --task hopper-demo --algorithm iql --dataset data/hopper-demo.hdf5
 
-  # QUAD without guidance, which is behaviour cloning.
+  # QUAD without guidance, which is behavior cloning.
   learner train --task hopper-demo --agent guidance=none --dataset data/hopper-demo.hdf5
 
   # Print all values of the run, and the time, memory and disk that it will take.

@@ -40,7 +40,7 @@ pub fn export(args: &ExportArgs) -> anyhow::Result<()> {
         warn!("the file has no score: that of step {step} is of other weights (learner verify {})", args.run.display());
         report.evaluations.retain(|evaluation| evaluation.step != step);
     }
-    report.judgements.retain(|judgement| judgement.weights == weights);
+    report.judgments.retain(|judgment| judgment.weights == weights);
     let about = about(&report, step, args.license.as_deref());
     let exported = Header { about, ..header }.to_safetensors(&tensors)?;
     let name = args.out.display();
@@ -52,10 +52,10 @@ pub fn export(args: &ExportArgs) -> anyhow::Result<()> {
 fn about(report: &RunReport, step: u64, license: Option<&str>) -> Value {
     let (data, experiment) = (&report.config.dataset, &report.config.experiment);
     let name = experiment.dataset.clone().unwrap_or_default();
-    let entry = Source::parse(&name).ok().and_then(|source| Some(source.entry()?.licence.clone()));
+    let entry = Source::parse(&name).ok().and_then(|source| Some(source.entry()?.license.clone()));
     let license = license.map(str::to_owned).or(entry);
     if license.is_none() {
-        warn!("the file does not say which licence the data has; --license says it");
+        warn!("the file does not say which license the data has; --license says it");
     }
     let score = report.evaluations.iter().find(|evaluation| evaluation.step == step);
     if let Some(part) = score.filter(|score| !score.complete) {
@@ -77,7 +77,7 @@ fn about(report: &RunReport, step: u64, license: Option<&str>) -> Value {
             "mean_return": data.mean_return,
         },
         "score": score,
-        "judgement": report.judgements.iter().find(|judgement| judgement.step == step),
+        "judgment": report.judgments.iter().find(|judgment| judgment.step == step),
     })
 }
 

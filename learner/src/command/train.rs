@@ -179,11 +179,11 @@ fn now() -> anyhow::Result<u64> {
 fn conclude(run_dir: &RunDir, config: &RunConfig, ending: Ending) -> anyhow::Result<()> {
     let folder = run_dir.path().display();
     let reported = match &ending {
-        Ending::Complete => summarise(run_dir),
+        Ending::Complete => summarize(run_dir),
         // The run may have failed because its disk hangs, and one that was told to stop has little time.
         _ => {
             let run_dir = run_dir.clone();
-            within(REPORT_PATIENCE, move || summarise(&run_dir))
+            within(REPORT_PATIENCE, move || summarize(&run_dir))
         }
     };
     let kept =
@@ -230,7 +230,7 @@ fn within<T: Send + 'static>(
     told.recv_timeout(patience).unwrap_or_else(|_| Err(anyhow!("it took longer than {patience:?}")))
 }
 
-fn summarise(run_dir: &RunDir) -> anyhow::Result<RunReport> {
+fn summarize(run_dir: &RunDir) -> anyhow::Result<RunReport> {
     let report = RunReport::read(run_dir.path())?;
     let mut text = String::new();
     if !report.evaluations.is_empty() {

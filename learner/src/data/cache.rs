@@ -4,7 +4,7 @@ use std::path::{Path, PathBuf};
 
 use anyhow::anyhow;
 use indicatif::HumanBytes;
-use quad_dataset::{NamedDataset, catalogue};
+use quad_dataset::{NamedDataset, catalog};
 use quad_runtime::Hint;
 
 use super::partial::left_of;
@@ -35,9 +35,9 @@ fn in_home(folder: &str) -> anyhow::Result<PathBuf> {
     home.map(|home| home.join(folder)).ok_or_else(|| anyhow!("there is no home folder to keep datasets in"))
 }
 
-/// The catalogue: name, environment, size, and what of it is in its folder already. Checksums are not computed for this.
+/// The catalog: name, environment, size, and what of it is in its folder already. Checksums are not computed for this.
 pub fn list() -> impl Iterator<Item = anyhow::Result<[String; 4]>> {
-    catalogue::all().iter().map(|dataset| {
+    catalog::all().iter().map(|dataset| {
         let size = dataset.bytes.map_or("unknown".to_owned(), |bytes| HumanBytes(bytes).to_string());
         let path = of(dataset)?.join(&dataset.file);
         Ok([dataset.name.clone(), dataset.environment.clone(), size, state(dataset, &path)])

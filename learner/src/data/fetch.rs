@@ -1,4 +1,4 @@
-//! A file of the catalogue: from the cache folder, or from the first address that has it.
+//! A file of the catalog: from the cache folder, or from the first address that has it.
 
 use std::fs;
 use std::io::{self, ErrorKind};
@@ -38,7 +38,7 @@ pub struct Fetcher {
 }
 
 impl Fetcher {
-    /// `mirror` is the address of a folder that is tried before the catalogue's.
+    /// `mirror` is the address of a folder that is tried before the catalog's.
     pub fn new(mirror: Option<String>) -> Self {
         Self { client: client(Duration::from_secs(30)), pause: Duration::from_secs(2), mirror }
     }

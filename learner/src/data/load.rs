@@ -10,7 +10,7 @@ use quad_runtime::Hint;
 /// Reads a file or folder of transitions for an experiment.
 ///
 /// # Errors
-/// It cannot be read or learnt from, or it has fewer transitions than a batch: a batch never holds one twice while there are
+/// It cannot be read or learned from, or it has fewer transitions than a batch: a batch never holds one twice while there are
 /// others.
 pub fn load(path: &Path, experiment: &Experiment) -> anyhow::Result<Split> {
     let options = ReadOptions {

@@ -49,7 +49,7 @@ impl Partial {
     pub fn finish(self, target: &Path) -> io::Result<()> {
         self.file.sync_all()?;
         fs::rename(&self.path, target)?;
-        files::synchronise_folder(target)
+        files::synchronize_folder(target)
     }
 }
 

@@ -1,10 +1,10 @@
-//! What `--dataset` means: a path, a name of the catalogue, or `minari:` and an ID.
+//! What `--dataset` means: a path, a name of the catalog, or `minari:` and an ID.
 
 use std::path::{Path, PathBuf};
 
 use anyhow::{Context, anyhow};
 use quad_dataset::environment::simulation_of;
-use quad_dataset::{DatasetError, NamedDataset, catalogue};
+use quad_dataset::{DatasetError, NamedDataset, catalog};
 use quad_run::config::did_you_mean;
 use quad_runtime::Hint;
 
@@ -12,7 +12,7 @@ use super::cache;
 use super::fetch::{Fetcher, LocalDataset};
 use super::verify::sha256;
 
-/// A lab's own mirror: the address of a folder that is tried before the catalogue's.
+/// A lab's own mirror: the address of a folder that is tried before the catalog's.
 const MIRROR: &str = "QUAD_DATASETS_URL";
 /// What names a dataset of Minari's begin with.
 const MINARI: &str = "minari:";
@@ -20,7 +20,7 @@ const MINARI: &str = "minari:";
 /// Where a run's data comes from.
 #[derive(Clone, Debug, PartialEq)]
 pub enum Source {
-    /// A file of the catalogue, in its benchmark's cache folder or fetched into it.
+    /// A file of the catalog, in its benchmark's cache folder or fetched into it.
     Named(&'static NamedDataset),
     /// A dataset that Minari's own client has fetched, by its ID.
     Minari(String),
@@ -29,7 +29,7 @@ pub enum Source {
 }
 
 impl Source {
-    /// Understands what was typed. A name of the catalogue comes before a file of that name; `./NAME` is the file.
+    /// Understands what was typed. A name of the catalog comes before a file of that name; `./NAME` is the file.
     pub fn parse(text: &str) -> anyhow::Result<Self> {
         if let Some(id) = text.strip_prefix(MINARI) {
             return Ok(Self::Minari(id.to_owned()));
@@ -42,25 +42,25 @@ impl Source {
         }
     }
 
-    /// The catalogue's dataset of that name.
+    /// The catalog's dataset of that name.
     pub fn named(name: &str) -> anyhow::Result<Self> {
         const LIST: &str = "`learner datasets list` prints all names; to train on a file, give its path";
-        let known = catalogue::all().iter().map(|dataset| dataset.name.as_str());
+        let known = catalog::all().iter().map(|dataset| dataset.name.as_str());
         let nearest = did_you_mean(name, known);
-        let found = catalogue::find(name).map(Self::Named);
+        let found = catalog::find(name).map(Self::Named);
         found.ok_or_else(|| anyhow!("unknown dataset `{name}`")).hint(nearest + LIST)
     }
 
-    /// The entry of the catalogue, for a path by the file's name.
+    /// The entry of the catalog, for a path by the file's name.
     pub fn entry(&self) -> Option<&'static NamedDataset> {
         match self {
             Self::Named(dataset) => Some(dataset),
             Self::Minari(_) => None,
-            Self::Path(path) => catalogue::find_file(path.file_name()?.to_str()?),
+            Self::Path(path) => catalog::find_file(path.file_name()?.to_str()?),
         }
     }
 
-    /// Refuses data that the catalogue says is from another simulation than that of `environment`.
+    /// Refuses data that the catalog says is from another simulation than that of `environment`.
     pub fn check_environment(&self, environment: &str) -> anyhow::Result<()> {
         match self.entry() {
             Some(entry) if simulation_of(&entry.environment) != simulation_of(environment) => Err(anyhow!(

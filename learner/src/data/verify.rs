@@ -1,4 +1,4 @@
-//! Whether a file is the one that the catalogue means.
+//! Whether a file is the one that the catalog means.
 
 use std::io::{self, Read};
 use std::path::Path;

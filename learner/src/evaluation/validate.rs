@@ -43,7 +43,7 @@ impl Scoreboard {
     fn is_possible(&self, score: &EpisodeScore) -> bool {
         let task = &self.rules.task;
         // In an environment that is not known here, the evaluator's user decides what counts as a score.
-        let expected = if task.is_normalised() { task.score(score.episode_return) } else { score.score };
+        let expected = if task.is_normalized() { task.score(score.episode_return) } else { score.score };
         let longest = task.max_episode_steps().unwrap_or(usize::MAX);
         let length_fits = (1..=longest).contains(&(score.length as usize));
         length_fits

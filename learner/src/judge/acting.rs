@@ -1,4 +1,4 @@
-//! What a policy does in the states that its judgement needs: asked once for each, and kept.
+//! What a policy does in the states that its judgment needs: asked once for each, and kept.
 
 use std::time::{Duration, Instant};
 

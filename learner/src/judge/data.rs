@@ -42,16 +42,16 @@ pub(super) struct Data {
 }
 
 impl Data {
-    /// The data that these policies have learnt from. They are judged in every episode that one of their runs has held out: all in
+    /// The data that these policies have learned from. They are judged in every episode that one of their runs has held out: all in
     /// the same states.
     ///
     /// # Errors
-    /// It is not on this machine, is not what they have learnt from, or they have not learnt from the same in one environment.
+    /// It is not on this machine, is not what they have learned from, or they have not learned from the same in one environment.
     pub fn of(subjects: &[Subject]) -> anyhow::Result<Self> {
         let first = subjects.first().ok_or_else(|| anyhow!("there is no policy to judge"))?;
         let of_first = &first.config.dataset;
         if let Some(other) = subjects.iter().find(|other| other.config.dataset.sha256 != of_first.sha256) {
-            return Err(anyhow!("{} and {} have not learnt from the same data", first.run, other.run))
+            return Err(anyhow!("{} and {} have not learned from the same data", first.run, other.run))
                 .hint("judge them apart: values that come from different data do not compare");
         }
         let environment = &first.config.experiment.environment;
@@ -64,7 +64,7 @@ impl Data {
         let dataset = Source::Path(of_first.path.clone()).obtain();
         let dataset = dataset.hint(format!("put the data of the run {} back", first.run))?;
         if of_first.sha256.as_ref().is_some_and(|sha256| *sha256 != dataset.sha256) {
-            return Err(anyhow!("{} is not the data that {} has learnt from", dataset.path.display(), first.run))
+            return Err(anyhow!("{} is not the data that {} has learned from", dataset.path.display(), first.run))
                 .hint("put a copy of that file in its place");
         }
         let episodes = BTreeSet::from_iter(subjects.iter().flat_map(|subject| subject.held_out.iter().copied()));
@@ -73,7 +73,7 @@ impl Data {
             false => HoldOut::Episodes(&episodes),
             true => {
                 warn!(
-                    "no run has held out episodes (--hold-out), so the policies are judged in some that they have learnt from"
+                    "no run has held out episodes (--hold-out), so the policies are judged in some that they have learned from"
                 );
                 HoldOut::Share { share: SHARE, seed: 0 }
             }
@@ -114,7 +114,7 @@ impl Data {
     }
 
     /// The mean over the judged episodes of the discounted return, where the last step of one that was cut off counts what these
-    /// evaluations of the behaviour say of it.
+    /// evaluations of the behavior say of it.
     pub fn recorded_value(&self, behavior: &[&Fqe], gamma: f32) -> anyhow::Result<f64> {
         let (mut sum, episodes) = (0.0, self.held_out.recorded_episodes());
         for episode in &episodes {

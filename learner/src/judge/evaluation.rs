@@ -43,7 +43,7 @@ pub(super) struct Trace {
 }
 
 impl Evaluation<'_> {
-    /// Evaluates the behaviour that recorded the data, once for each seed.
+    /// Evaluates the behavior that recorded the data, once for each seed.
     ///
     /// # Errors
     /// The data does not say what it did, or candle fails.
@@ -55,7 +55,7 @@ impl Evaluation<'_> {
         })
     }
 
-    /// Evaluates a policy, once for each seed, beginning with what is known of the behaviour.
+    /// Evaluates a policy, once for each seed, beginning with what is known of the behavior.
     ///
     /// # Errors
     /// Candle fails.

@@ -1,7 +1,7 @@
 //! Judges policies without a simulator: `learner judge`.
 //!
 //! It runs on its caller's thread and rayon's, owns nothing, and keeps what it finds in the runs' folders, from where reports read
-//! it. A policy's value is estimated by fitted Q evaluation ([`quad_algorithms::Fqe`]) on the episodes that its run has learnt
+//! it. A policy's value is estimated by fitted Q evaluation ([`quad_algorithms::Fqe`]) on the episodes that its run has learned
 //! from, and read off in the first states of those that were held out.
 //!
 //! In reading order: `subject` finds the policies, `data` has the states in which they are judged, `acting` asks a policy for its
@@ -17,7 +17,7 @@ use std::path::PathBuf;
 use std::time::Duration;
 
 use quad_algorithms::{FqeConfig, Units};
-use quad_run::results::{Conditions, Judgement, Ranking};
+use quad_run::results::{Conditions, Judgment, Ranking};
 use quad_runtime::Hint;
 use tracing::{info, warn};
 
@@ -40,7 +40,7 @@ pub(crate) struct Effort {
 /// Judges the last snapshots of runs, or single snapshots. What an earlier call has found out in this way is not computed again.
 ///
 /// # Errors
-/// There is nothing to judge, the policies have not learnt from the same data in one environment, or a policy cannot act.
+/// There is nothing to judge, the policies have not learned from the same data in one environment, or a policy cannot act.
 pub(crate) fn judge(paths: &[PathBuf], effort: Effort) -> anyhow::Result<Ranking> {
     let config = FqeConfig::with_discount(effort.gamma).hint("γ is between 0 and 1, 1 left out: --gamma 0.99")?;
     let subjects = subject::find(paths)?;
@@ -56,8 +56,8 @@ pub(crate) fn judge(paths: &[PathBuf], effort: Effort) -> anyhow::Result<Ranking
     };
     let (mut judged, mut left) = (Vec::new(), Vec::new());
     for subject in &subjects {
-        let known = Judgement::read_all(&subject.folder)?;
-        let is_this = |one: &Judgement| one.weights == subject.weights && one.conditions == conditions;
+        let known = Judgment::read_all(&subject.folder)?;
+        let is_this = |one: &Judgment| one.weights == subject.weights && one.conditions == conditions;
         match known.into_iter().find(is_this) {
             Some(known) => judged.push(known),
             None => left.push(subject),
@@ -76,7 +76,7 @@ fn judge_all(
     evaluation: &Evaluation<'_>,
     subjects: &[&Subject],
     conditions: &Conditions,
-    judged: &mut Vec<Judgement>,
+    judged: &mut Vec<Judgment>,
 ) -> anyhow::Result<()> {
     let data = evaluation.data;
     let behaviors = evaluation.of_behavior()?;
@@ -86,7 +86,7 @@ fn judge_all(
     for (subject, number) in subjects.iter().zip(1..) {
         let actions = Actions::of(&*subject.policy, data)?;
         let traces = evaluation.of_policy(&actions, &fqes)?;
-        let judgement = Judgement {
+        let judgment = Judgment {
             run: subject.folder.path().to_owned(),
             step: subject.step,
             weights: subject.weights.clone(),
@@ -99,9 +99,9 @@ fn judge_all(
         };
         let run = subject.folder.path().display();
         info!("{number} of {}: {run} @ {} is judged", subjects.len(), subject.step);
-        // A folder that cannot be written to, such as another user's, keeps no judgement from being told.
-        judgement.keep(&subject.folder).unwrap_or_else(|error| warn!("{error}: the judgement is not kept"));
-        judged.push(judgement);
+        // A folder that cannot be written to, such as another user's, keeps no judgment from being told.
+        judgment.keep(&subject.folder).unwrap_or_else(|error| warn!("{error}: the judgment is not kept"));
+        judged.push(judgment);
     }
     Ok(())
 }

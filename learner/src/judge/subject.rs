@@ -24,7 +24,7 @@ pub(super) struct Subject {
     /// BLAKE3 of the file.
     pub weights: String,
     pub policy: Box<dyn Policy>,
-    /// Numbers of the episodes that its run has not learnt from.
+    /// Numbers of the episodes that its run has not learned from.
     pub held_out: BTreeSet<usize>,
 }
 
@@ -66,7 +66,7 @@ fn of_file(path: &Path) -> anyhow::Result<Subject> {
     let step = name.strip_prefix("step_").and_then(|name| name.strip_suffix(".safetensors")?.parse().ok());
     let run = path.parent().and_then(Path::parent).filter(|folder| RunDir::is_occupied(folder));
     let (Some(step), Some(run)) = (step, run) else {
-        return Err(anyhow!("{} is in no run's folder, so that nothing says what it has learnt from", path.display()))
+        return Err(anyhow!("{} is in no run's folder, so that nothing says what it has learned from", path.display()))
             .hint(ONE);
     };
     Subject::read(RunDir::at(run), step)

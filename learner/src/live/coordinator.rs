@@ -205,7 +205,7 @@ impl Coordinator {
         self.lock().scoreboard.keep(report, Instant::now());
     }
 
-    /// Counts scores that are on the disk. Returns the acknowledgement of each report.
+    /// Counts scores that are on the disk. Returns the acknowledgment of each report.
     pub fn record<'a>(&self, reports: impl Iterator<Item = (&'a ScoreReport, &'a Validated)>) -> Vec<ScoreReply> {
         let mut state = self.lock();
         let replies = reports.map(|(report, validated)| self.record_one(&mut state, report, validated)).collect();

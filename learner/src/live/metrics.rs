@@ -53,7 +53,7 @@ pub(crate) struct DiskMetrics {
     trouble: IntGaugeVec,
 }
 
-/// Metrics from the evaluators' progress messages, labelled by evaluator.
+/// Metrics from the evaluators' progress messages, labeled by evaluator.
 #[derive(Clone, Debug)]
 pub(crate) struct EvaluatorMetrics {
     pub present: IntGauge,
@@ -105,7 +105,7 @@ impl EvaluationMetrics {
             episodes_pending: make.count("episodes_pending", "Episodes of evaluations that have no score yet")?,
             scores_recorded: make.counter("scores_recorded_total", "Episodes scored, each counted once")?,
             scores_duplicate: make.counter("scores_duplicate_total", "Scores delivered for episodes that had one")?,
-            score: make.gauge("evaluation_score", "Mean normalised score of the newest complete evaluation")?,
+            score: make.gauge("evaluation_score", "Mean normalized score of the newest complete evaluation")?,
             step: make.count("evaluation_step", "Gradient step of the newest complete evaluation")?,
         })
     }

@@ -1,7 +1,7 @@
 //! The thread `scores`: writes scores to the disk, then counts and acknowledges them.
 //!
-//! All reports that arrived during the last write go together, in one write and one synchronisation. A slow disk delays only
-//! acknowledgements.
+//! All reports that arrived during the last write go together, in one write and one synchronization. A slow disk delays only
+//! acknowledgments.
 
 use std::collections::BTreeSet;
 use std::sync::mpsc::{Receiver, RecvTimeoutError};

@@ -11,7 +11,7 @@ use super::seeds::GroupReport;
 /// What is published for a task.
 type Figure<'a> = (&'a str, &'a Published);
 
-/// A table, in its rows the tasks that some of these runs have learnt, with what stands behind each figure below it; nothing
+/// A table, in its rows the tasks that some of these runs have learned, with what stands behind each figure below it; nothing
 /// without such runs.
 pub fn table(name: &str, groups: &[GroupReport], select: Select) -> Vec<Part> {
     let is_in = |group: &&GroupReport| published::tables(&group.task, &group.algorithm).contains(&name);

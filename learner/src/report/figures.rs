@@ -119,7 +119,7 @@ fn profiles(report: &Report) -> Picture {
     };
     Picture {
         title: "Performance profile, with its 95 % interval".to_owned(),
-        x: "D4RL-normalised score",
+        x: "D4RL-normalized score",
         y: "share of runs that score more".to_owned(),
         is_falling: true,
         lines: with_profile.map(line).collect(),

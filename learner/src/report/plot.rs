@@ -22,8 +22,8 @@ const MOST_POINTS: usize = 40;
 /// What is farther from 0 is not drawn, nor what is no number: an axis to there would have no end.
 const FARTHEST: f64 = 1e300;
 const REFERENCE: RGBColor = RGBColor(110, 110, 110);
-/// Colours that stay apart for most colour-blind readers (Okabe and Ito).
-const COLOURS: [RGBColor; 7] = [
+/// Colors that stay apart for most color-blind readers (Okabe and Ito).
+const COLORS: [RGBColor; 7] = [
     RGBColor(0, 114, 178),
     RGBColor(213, 94, 0),
     RGBColor(0, 158, 115),
@@ -177,8 +177,8 @@ impl Picture {
                 DashedLineSeries::new([(x.start, *y), (x.end, *y)], 6 * by, 4 * by, REFERENCE.stroke_width(2 * by));
             chart.draw_series(line)?.label(name).legend(legend(REFERENCE, by));
         }
-        for (line, colour) in self.lines.iter().zip(COLOURS.iter().cycle()) {
-            draw_line(&mut chart, line, *colour, by)?;
+        for (line, color) in self.lines.iter().zip(COLORS.iter().cycle()) {
+            draw_line(&mut chart, line, *color, by)?;
         }
         chart
             .configure_series_labels()
@@ -208,25 +208,25 @@ impl Picture {
     }
 }
 
-fn draw_line<DB: DrawingBackend>(chart: &mut Chart<DB>, line: &Line, colour: RGBColor, by: u32) -> Drawn
+fn draw_line<DB: DrawingBackend>(chart: &mut Chart<DB>, line: &Line, color: RGBColor, by: u32) -> Drawn
 where
     DB::ErrorType: 'static,
 {
     let edge = |end: fn(&Estimate) -> Option<f64>| line.points.iter().filter_map(move |(x, y)| Some((*x, end(y)?)));
     let band: Vec<_> = edge(|y| y.high).chain(edge(|y| y.low).rev()).collect();
     if !band.is_empty() {
-        chart.draw_series([Polygon::new(band, colour.mix(0.15))])?;
+        chart.draw_series([Polygon::new(band, color.mix(0.15))])?;
     }
     let points: Vec<_> = line.points.iter().map(|(x, y)| (*x, y.value)).collect();
-    let series = LineSeries::new(points.clone(), colour.stroke_width(2 * by));
-    chart.draw_series(series)?.label(&line.label).legend(legend(colour, by));
+    let series = LineSeries::new(points.clone(), color.stroke_width(2 * by));
+    chart.draw_series(series)?.label(&line.label).legend(legend(color, by));
     let points = if points.len() > MOST_POINTS { Vec::new() } else { points };
-    chart.draw_series(points.into_iter().map(|point| Circle::new(point, 3 * by, colour.filled())))?;
+    chart.draw_series(points.into_iter().map(|point| Circle::new(point, 3 * by, color.filled())))?;
     Ok(())
 }
 
-fn legend(colour: RGBColor, by: u32) -> impl Fn((i32, i32)) -> PathElement<(i32, i32)> {
-    move |(x, y)| PathElement::new([(x, y), (x + 20 * by as i32, y)], colour.stroke_width(2 * by))
+fn legend(color: RGBColor, by: u32) -> impl Fn((i32, i32)) -> PathElement<(i32, i32)> {
+    move |(x, y)| PathElement::new([(x, y), (x + 20 * by as i32, y)], color.stroke_width(2 * by))
 }
 
 /// The font, which measures the text of an SVG and draws that of a PNG.

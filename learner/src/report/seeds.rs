@@ -35,8 +35,8 @@ pub struct GroupReport {
     pub reached: Option<u64>,
     /// Where they trained.
     pub device: Device,
-    /// Whether scores are D4RL-normalised; without reference returns they are returns.
-    pub normalised: bool,
+    /// Whether scores are D4RL-normalized; without reference returns they are returns.
+    pub normalized: bool,
     /// Precision that the policies were scored in; several, if evaluators differed.
     pub scored_in: String,
     /// The seeds, one for each run that is counted.
@@ -198,7 +198,7 @@ fn group(runs: &[&RunReport], method: String, differs: Vec<String>, select: Sele
         steps: first.steps,
         reached: first.reached(),
         device: first.config.run.device,
-        normalised: first.normalised,
+        normalized: first.normalized,
         seeds: counted.iter().map(|run| run.seed).collect(),
         scores: scores.filter(|_| first.is_complete()).unwrap_or_default(),
         goals: has_one_goal.then_some(counted.len()),

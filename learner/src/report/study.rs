@@ -9,12 +9,12 @@ use serde::Serialize;
 
 use super::seeds::GroupReport;
 
-/// A method over all its tasks with D4RL-normalised scores, or over one task without references.
+/// A method over all its tasks with D4RL-normalized scores, or over one task without references.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct MethodReport {
     /// Its name, as groups have it.
     pub method: String,
-    /// What its numbers are: normalised scores, scores of a user's own, or returns.
+    /// What its numbers are: normalized scores, scores of a user's own, or returns.
     pub measure: &'static str,
     /// Its tasks.
     pub tasks: Vec<String>,
@@ -52,7 +52,7 @@ pub struct Comparison {
     pub method: String,
     /// The other.
     pub against: String,
-    /// What both have learnt.
+    /// What both have learned.
     pub tasks: Vec<String>,
     /// Probability that a run of the one scores more than a run of the other.
     pub probability_of_improvement: Estimate,
@@ -69,11 +69,11 @@ pub struct Comparison {
 /// Groups of one method, each of another task.
 type Method<'a> = Vec<&'a GroupReport>;
 
-/// Summarises all groups that have scores: each method, and each but the first against the first.
+/// Summarizes all groups that have scores: each method, and each but the first against the first.
 pub fn study(groups: &[GroupReport]) -> (Vec<MethodReport>, Vec<Comparison>) {
     let mut scopes: Vec<Vec<Method>> = Vec::new();
     // Returns of different tasks have no common unit.
-    let is_comparable = |a: &GroupReport, b: &GroupReport| a.normalised && b.normalised || a.task == b.task;
+    let is_comparable = |a: &GroupReport, b: &GroupReport| a.normalized && b.normalized || a.task == b.task;
     for group in groups.iter().filter(|group| !group.scores.is_empty()) {
         let scope = scopes.iter().position(|scope| is_comparable(scope[0][0], group));
         let scope = scope.unwrap_or_else(|| {
@@ -99,7 +99,7 @@ fn of_method(method: &Method) -> MethodReport {
     let first = method[0];
     let runs: Runs = method.iter().map(|group| group.scores.clone()).collect();
     let thresholds: Vec<f64> =
-        if first.normalised { (0..=120).step_by(2).map(f64::from).collect() } else { Vec::new() };
+        if first.normalized { (0..=120).step_by(2).map(f64::from).collect() } else { Vec::new() };
     let statistics = |drawn: &[Runs]| {
         use statistics::{interquartile_mean, mean_of_means, median_of_means, optimality_gap, share_above};
         let aggregates = [interquartile_mean, mean_of_means, median_of_means, optimality_gap].map(|of| of(&drawn[0]));
@@ -116,7 +116,7 @@ fn of_method(method: &Method) -> MethodReport {
         iqm: estimates[0],
         mean: estimates[1],
         median: estimates[2],
-        optimality_gap: first.normalised.then_some(estimates[3]),
+        optimality_gap: first.normalized.then_some(estimates[3]),
         profile: shares.map(|(threshold, share)| Share { threshold: *threshold, share: *share }).collect(),
         seeds_of_a_task: [seeds().min(), seeds().max()].map(Option::unwrap_or_default),
     }

@@ -22,7 +22,7 @@ pub struct Report {
     pub select: Select,
     /// Each folder.
     pub runs: Vec<RunReport>,
-    /// The folders summarised over seeds.
+    /// The folders summarized over seeds.
     pub groups: Vec<GroupReport>,
     /// Each method over its tasks and seeds.
     pub study: Vec<MethodReport>,
@@ -91,8 +91,8 @@ impl Report {
         }
         let unreadable = self.unreadable.iter().map(|error| format!("Not in this report: {error}.\n"));
         parts.extend((!self.unreadable.is_empty()).then(|| Part::Words(unreadable.collect())));
-        let judgements = self.runs.iter().flat_map(|run| run.judgements.iter().cloned());
-        parts.extend(Ranking::of(judgements).iter().flat_map(Ranking::parts));
+        let judgments = self.runs.iter().flat_map(|run| run.judgments.iter().cloned());
+        parts.extend(Ranking::of(judgments).iter().flat_map(Ranking::parts));
         parts.extend(
             published::all_tables().into_iter().flat_map(|name| beside::table(name, &self.groups, self.select)),
         );
@@ -122,7 +122,7 @@ impl Report {
         let mut table = Table::new(&header);
         let cell = |value: Option<Spread>| value.map_or_else(|| "-".to_owned(), Spread::text_of_both);
         for g in &self.groups {
-            let measure = if g.normalised { "" } else { " (returns)" };
+            let measure = if g.normalized { "" } else { " (returns)" };
             let mut row = vec![
                 g.task.clone(),
                 g.agent.clone(),

@@ -5,7 +5,7 @@ use std::path::Path;
 
 use quad_policy::Header;
 use quad_protocol::{Hash, Origin};
-use quad_run::results::{Conditions, Estimate, Judgement};
+use quad_run::results::{Conditions, Estimate, Judgment};
 use quad_run::run::RunDir;
 use serde_json::{Value, json};
 
@@ -40,7 +40,7 @@ fn score(run: &RunDir, episodes: &[(u64, u64, f64, &str)]) {
 
 fn judge(run: &RunDir, step: u64, distance: f64, weights: &str) {
     let estimate = Estimate { values: vec![1.0, 1.0], doubts: Vec::new() };
-    let judgement = Judgement {
+    let judgment = Judgment {
         run: run.path().to_owned(),
         step,
         weights: weights.to_owned(),
@@ -58,10 +58,10 @@ fn judge(run: &RunDir, step: u64, distance: f64, weights: &str) {
         behavior: estimate,
         recorded: 1.0,
     };
-    judgement.keep(run).unwrap();
+    judgment.keep(run).unwrap();
 }
 
-/// What the file says of its score and judgement, and what is said to the user.
+/// What the file says of its score and judgment, and what is said to the user.
 fn export(run: &RunDir, step: &str) -> (Value, Value, String) {
     let out = run.path().join("policy.safetensors");
     let [path, file] = [run.path(), &out].map(|path| path.to_str().unwrap());
@@ -69,29 +69,29 @@ fn export(run: &RunDir, step: &str) -> (Value, Value, String) {
     let said = String::from_utf8(output.stderr).unwrap();
     assert!(output.status.success(), "{said}");
     let about = Header::<Origin>::read(&fs::read(&out).unwrap()).unwrap().about;
-    (about["score"].clone(), about["judgement"].clone(), said)
+    (about["score"].clone(), about["judgment"].clone(), said)
 }
 
 #[test]
-fn a_file_has_the_score_and_judgement_of_its_own_step_and_weights() {
+fn a_file_has_the_score_and_judgment_of_its_own_step_and_weights() {
     let folder = tempfile::tempdir().unwrap();
     let (run, weights) = train(folder.path());
     let episode = |step, seed| (step, seed, if step == 5 { 30.0 } else { 20.0 }, &*weights);
     score(&run, &[episode(5, 0), episode(5, 1), episode(10, 0), episode(10, 1)]);
     STEPS.iter().for_each(|step| judge(&run, *step, *step as f64, &weights));
     for (asked, step, expected) in [("5", 5, 30.0), ("10", 10, 20.0), ("last", 10, 20.0), ("best", 5, 30.0)] {
-        let (score, judgement, said) = export(&run, asked);
+        let (score, judgment, said) = export(&run, asked);
         assert_eq!((&score["step"], &score["score"]["mean"]), (&json!(step), &json!(expected)), "{asked}");
-        assert_eq!((&score["complete"], &judgement["distance"]), (&json!(true), &json!(step as f64)), "{asked}");
+        assert_eq!((&score["complete"], &judgment["distance"]), (&json!(true), &json!(step as f64)), "{asked}");
         assert!(!said.contains("WARN"), "{said}");
     }
 
     score(&run, &[episode(5, 0), episode(10, 0), (10, 1, 20.0, "00")]);
     judge(&run, 10, 1.0, "00");
-    let (part, judgement, said) = export(&run, "5");
+    let (part, judgment, said) = export(&run, "5");
     assert_eq!((&part["episodes"], &part["complete"]), (&json!(1), &json!(false)));
-    assert!(said.contains("the score is of 1 of 2 episodes") && !judgement.is_null(), "{said}");
-    let (none, judgement, said) = export(&run, "10");
-    assert!(none.is_null() && judgement.is_null(), "of other weights: {none} {judgement}");
+    assert!(said.contains("the score is of 1 of 2 episodes") && !judgment.is_null(), "{said}");
+    let (none, judgment, said) = export(&run, "10");
+    assert!(none.is_null() && judgment.is_null(), "of other weights: {none} {judgment}");
     assert!(said.contains("that of step 10 is of other weights"), "{said}");
 }

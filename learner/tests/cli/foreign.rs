@@ -60,7 +60,7 @@ fn what_a_run_calls_itself_leads_to_no_other_folder() {
 fn what_is_no_file_holds_up_nobody_who_looks_at_the_run() {
     let folder = tempfile::tempdir().unwrap();
     let snapshot = "snapshots/step_000000010.safetensors";
-    for name in ["config.toml", "scores.jsonl", "metrics.jsonl", "film.gif", "judgements.json", snapshot] {
+    for name in ["config.toml", "scores.jsonl", "metrics.jsonl", "film.gif", "judgments.json", snapshot] {
         for is_pipe in [true, false] {
             let run = folder.path().join(format!("{}-{is_pipe}", name.replace('/', "-")));
             let mut begun = Run::new("hopper-demo", 0).set(&[("experiment.eval_interval", 10.into())]);

@@ -96,7 +96,7 @@ fn what_is_not_the_papers_protocol_is_called_so() {
     assert_eq!(departures(&mixed), ["scored in bf16, not in f32"]);
 }
 
-/// DAC and IQL have rows of their own in the paper's tables; behaviour cloning has none.
+/// DAC and IQL have rows of their own in the paper's tables; behavior cloning has none.
 #[test]
 fn another_algorithm_is_compared_with_its_own_authors_values() {
     let guided = |guidance: &str| {

@@ -98,7 +98,7 @@ pub(super) fn paper(task: &str, last: u64, score: impl Fn(u64) -> f64) -> Vec<Ru
 pub(super) const HOPPER: &str = "hopper-medium-replay-v2";
 
 #[test]
-fn a_run_is_summarised_by_its_complete_evaluations_and_says_how_many_there_are() {
+fn a_run_is_summarized_by_its_complete_evaluations_and_says_how_many_there_are() {
     let reported = report(&[small(3, 0.0)]);
     let run = &reported.json["runs"][0];
     assert_eq!((&run["variant"], &run["seed"], &run["dataset_score"]), (&json!("quad"), &json!(3), &json!(10.7)));
@@ -198,7 +198,7 @@ fn scores_without_references_are_called_returns_unless_they_are_something_else()
     let reported = report(&[run]);
     let text = &reported.text;
     assert!(text.contains("mean return of the dataset") && !text.contains("score "), "{text}");
-    assert!(!reported.svg("curve-hopper-demo.svg").contains("normalised"));
+    assert!(!reported.svg("curve-hopper-demo.svg").contains("normalized"));
 }
 
 #[test]

@@ -58,7 +58,7 @@ def rows_of(
     next_observations: ArrayLike | None,
 ) -> Rows:
     if np.asarray(actions).dtype.kind in "iub":
-        raise ValueError(f"{where}actions are whole numbers, as if they were discrete; only continuous ones can be learnt\n{_AMOUNTS}")
+        raise ValueError(f"{where}actions are whole numbers, as if they were discrete; only continuous ones can be learned\n{_AMOUNTS}")
     r = _array(where, "rewards", rewards, None, 1)
     n = len(r)
     o = _array(where, "observations", observations, n, 2)
@@ -114,7 +114,7 @@ def followed(rows: Rows) -> Rows:
     """The same steps with what follows them, without those of which that is not known."""
     o, terminals, timeouts = rows.observations, rows.terminals, rows.timeouts
     after = np.concatenate([o[1:], o[-1:]])
-    after[terminals] = o[terminals]  # Not learnt from.
+    after[terminals] = o[terminals]  # Not learned from.
     dropped = timeouts & ~terminals
     dropped[-1:] |= ~terminals[-1:]
     # An episode of which the last step is dropped ends with the one before.

@@ -21,7 +21,7 @@ def runs(folders: str | PathLike[str] | Iterable[str | PathLike[str]] = "runs/*"
 
     Each dictionary has, from `learner report --json`: of its evaluation `step`, `episodes`, `complete`, `score` (mean over the
     episodes), `score_std`, `return` and `length`; of its run `run`, `dir`, `task`, `algorithm`, `variant`, `agent`, `seed`,
-    `steps`, `normalised`, `scored_in`, `dataset_score`, `mean_last_3`, `mean_last_5` and `mean_last_50000_steps`, the same in
+    `steps`, `normalized`, `scored_in`, `dataset_score`, `mean_last_3`, `mean_last_5` and `mean_last_50000_steps`, the same in
     all its rows; and each setting of its `config.toml` under its name there, like `experiment.batch_size`. A run that has
     no evaluation yet has one row, in which these are None.
 

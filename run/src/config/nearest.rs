@@ -1,4 +1,4 @@
-//! What a user probably meant by a misspelt name.
+//! What a user probably meant by a misspelled name.
 
 /// `did you mean a, b? ` with up to three of the known names, the most similar first; nothing if none is similar. A name is
 /// similar if few letters differ, or if the word is part of it.

@@ -53,7 +53,7 @@ pub struct DatasetInfo {
     /// SHA-256 of the file in hexadecimal, of a folder of Minari's that of its `main_data.hdf5`; older runs do not say.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub sha256: Option<String>,
-    /// Transitions that are learnt from.
+    /// Transitions that are learned from.
     pub transitions: u64,
     /// Trajectories in the file.
     pub episodes: u64,
@@ -66,7 +66,7 @@ pub struct DatasetInfo {
     pub mean_return: f64,
     /// The largest of them.
     pub max_return: f64,
-    /// Mean D4RL-normalised score of the trajectories, where the environment has reference returns.
+    /// Mean D4RL-normalized score of the trajectories, where the environment has reference returns.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub mean_score: Option<f64>,
 }

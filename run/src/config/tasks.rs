@@ -10,7 +10,7 @@ use toml::Table;
 
 use super::nearest::did_you_mean;
 
-/// What is to be learnt, whichever algorithm learns it.
+/// What is to be learned, whichever algorithm learns it.
 #[derive(Debug, Deserialize)]
 pub struct Task {
     /// What it is called on the command line and in files.

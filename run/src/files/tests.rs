@@ -24,7 +24,7 @@ const ALLOWED: [(&str, &str, &str); 13] = [
     ("run/src/run/lock.rs", "fs::read_to_string(HOST)", "the system's own"),
     ("runtime/src/metrics_server.rs", "fs::read_to_string(path)", "the system's own, by their names"),
     ("run/src/files.rs", "OpenOptions", "the one way"),
-    ("run/src/files.rs", "File::open(folder)", "a folder, to synchronise it"),
+    ("run/src/files.rs", "File::open(folder)", "a folder, to synchronize it"),
     ("run/src/config/presets.rs", "fs::read_to_string(preset)", "the user names it; it may be a pipe of a shell"),
     ("learner/src/sweep/study.rs", "fs::read_to_string(path)", "the user names it; it may be a pipe of a shell"),
     ("dataset/src/hdf5_file.rs", "File::open(path)", "data that the user names"),

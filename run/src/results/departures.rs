@@ -3,7 +3,7 @@
 use std::collections::BTreeSet;
 
 use quad_algorithms::Variant;
-use quad_dataset::catalogue;
+use quad_dataset::catalog;
 
 use super::published;
 use super::run::RunReport;
@@ -69,9 +69,9 @@ fn without_seed(experiment: &Experiment) -> Settings {
     settings
 }
 
-/// Whether a run learnt from the dataset of that name, whatever it was called on the command line.
+/// Whether a run learned from the dataset of that name, whatever it was called on the command line.
 fn is_trained_on(run: &RunReport, dataset: &str) -> bool {
-    let known = catalogue::find(dataset).and_then(|known| known.sha256.as_ref());
+    let known = catalog::find(dataset).and_then(|known| known.sha256.as_ref());
     let same_file = known.is_some() && run.config.dataset.sha256.as_ref() == known;
     same_file || run.config.experiment.dataset.as_deref() == Some(dataset)
 }

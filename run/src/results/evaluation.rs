@@ -1,4 +1,4 @@
-//! One evaluation: the scores of one snapshot's episodes, summarised.
+//! One evaluation: the scores of one snapshot's episodes, summarized.
 
 use serde::Serialize;
 
@@ -14,7 +14,7 @@ pub struct EvaluationReport {
     pub episodes: usize,
     /// Whether these are all of them.
     pub complete: bool,
-    /// Score over the episodes: D4RL-normalised, or the return where the environment has no reference returns.
+    /// Score over the episodes: D4RL-normalized, or the return where the environment has no reference returns.
     pub score: Spread,
     /// Mean undiscounted return.
     pub mean_return: f64,

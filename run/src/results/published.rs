@@ -11,7 +11,7 @@ use serde::{Deserialize, Serialize};
 pub struct Published {
     /// The method, as its source calls it.
     pub method: &'static str,
-    /// Its D4RL-normalised score, or its rate of success in percent.
+    /// Its D4RL-normalized score, or its rate of success in percent.
     pub score: Printed,
     /// Where it stands.
     pub source: &'static str,

@@ -1,4 +1,4 @@
-//! One run: its folder, read and summarised.
+//! One run: its folder, read and summarized.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::fmt::Alignment::Right;
@@ -11,7 +11,7 @@ use quad_dataset::environment;
 use serde::Serialize;
 
 use super::evaluation::EvaluationReport;
-use super::judgement::Judgement;
+use super::judgment::Judgment;
 use super::published;
 use super::spread::Spread;
 use crate::config::RunConfig;
@@ -40,8 +40,8 @@ pub struct RunReport {
     pub seed: u64,
     /// Gradient steps.
     pub steps: u64,
-    /// Whether scores are D4RL-normalised; without reference returns they are returns.
-    pub normalised: bool,
+    /// Whether scores are D4RL-normalized; without reference returns they are returns.
+    pub normalized: bool,
     /// Precision that the policies were scored in; several, if evaluators differed.
     pub scored_in: String,
     /// Mean score of the dataset's trajectories, of the same kind.
@@ -70,7 +70,7 @@ pub struct RunReport {
     pub precisions: BTreeSet<String>,
     /// What `learner judge` found out about its snapshots.
     #[serde(skip_serializing_if = "Vec::is_empty")]
-    pub judgements: Vec<Judgement>,
+    pub judgments: Vec<Judgment>,
     /// Its configuration.
     #[serde(skip)]
     pub config: RunConfig,
@@ -107,8 +107,8 @@ impl RunReport {
         let agent = config.experiment.method();
         let agent = agent.with_context(|| format!("config.toml in {} cannot be used", path.display()))?;
         let names = [agent, config.experiment.variant()?.to_owned(), config.experiment.called()?];
-        let (scores, judgements) = (dir.read_scores()?, Judgement::read_all(&dir)?);
-        Ok((Self { judgements, ..Self::new(path, config, names, &scores) }, scores))
+        let (scores, judgments) = (dir.read_scores()?, Judgment::read_all(&dir)?);
+        Ok((Self { judgments, ..Self::new(path, config, names, &scores) }, scores))
     }
 
     fn new(path: &Path, config: RunConfig, names: [String; 3], lines: &[ScoreLine]) -> Self {
@@ -136,7 +136,7 @@ impl RunReport {
         let last = |count: usize| mean(&complete[complete.len().checked_sub(count)?..]);
         let final_steps = experiment.steps.checked_sub(FINAL_STEPS).filter(|start| *start > 0);
         let in_final_steps = |start| mean(&complete[complete.partition_point(|(step, _)| *step <= start)..]);
-        let normalised = environment::find(&experiment.environment).is_ok();
+        let normalized = environment::find(&experiment.environment).is_ok();
         let precisions: BTreeSet<String> = lines.iter().map(precision).collect();
         Self {
             dir: path.to_owned(),
@@ -147,8 +147,8 @@ impl RunReport {
             agent,
             seed: experiment.seed,
             steps: experiment.steps,
-            normalised,
-            own_score: !normalised && lines.iter().any(|line| line.score != line.episode_return),
+            normalized,
+            own_score: !normalized && lines.iter().any(|line| line.score != line.episode_return),
             scored_in: joined(&precisions),
             dataset_score: config.dataset.mean_score.unwrap_or(config.dataset.mean_return),
             mean_last_3: last(3),
@@ -157,7 +157,7 @@ impl RunReport {
             evaluations,
             episodes_missing,
             summary: None,
-            judgements: Vec::new(),
+            judgments: Vec::new(),
             called,
             precisions,
             config,
@@ -217,14 +217,14 @@ impl RunReport {
 
     /// What its scores are: scores of a kind, or returns.
     pub fn measure(&self) -> &'static str {
-        if self.normalised || self.own_score { "score" } else { "return" }
+        if self.normalized || self.own_score { "score" } else { "return" }
     }
 
     /// [`Self::measure`] with its unit: in a maze, the share of episodes that reach the goal.
     pub fn measure_with_unit(&self) -> &'static str {
         match environment::find(&self.config.experiment.environment) {
             Ok(known) if known.goal.is_some() => "success rate in %",
-            Ok(_) => "D4RL-normalised score",
+            Ok(_) => "D4RL-normalized score",
             Err(_) => self.measure(),
         }
     }

@@ -4,11 +4,11 @@
 //! config.toml                        the resolved configuration
 //! endpoints.json                     where this learner can be reached; written as soon as it listens
 //! metrics.jsonl                      training metrics, a line every hundred gradient steps
-//! scores.jsonl                       a line per scored episode, written before the evaluator gets its acknowledgement
+//! scores.jsonl                       a line per scored episode, written before the evaluator gets its acknowledgment
 //! snapshots/step_000003000.safetensors   target actor and target critics; written before the evaluation of it begins
 //! checkpoints/step_000003000_….safetensors   the newest three states of the training, to continue from
 //! report.json, learning_curve.svg    written at the end
-//! judgements.json                    what `learner judge` found out about its snapshots
+//! judgments.json                    what `learner judge` found out about its snapshots
 //! ```
 
 use std::fs;
@@ -63,7 +63,7 @@ impl RunDir {
         let target = path.join("config.toml");
         let text = toml::to_string(config).map_err(|error| content(&target, None, &error))?;
         files::replace(&target, text.as_bytes()).map_err(io_error("write", &target))?;
-        files::synchronise_folder(path).map_err(io_error("write", path))?;
+        files::synchronize_folder(path).map_err(io_error("write", path))?;
         Ok((run, scores))
     }
 
@@ -184,7 +184,7 @@ impl RunDir {
         let folder = self.path.join(name);
         match fs::create_dir(&folder) {
             // Else a power cut could take what will be in it.
-            Ok(()) => files::synchronise_folder(&folder).map_err(io_error("write", &folder)),
+            Ok(()) => files::synchronize_folder(&folder).map_err(io_error("write", &folder)),
             Err(error) if error.kind() == io::ErrorKind::NotFound => Err(RunDirError::Gone(self.path.clone())),
             // It would be written to through the link.
             Err(_) if folder.is_symlink() => Err(io_error("write", &folder)(files::no_file())),
@@ -239,7 +239,7 @@ impl RunDir {
         Checkpoints::of_run(&self.path).newest()
     }
 
-    /// `scores.jsonl`, opened for appending and locked. Each append is synchronised, so acknowledged scores survive a crash.
+    /// `scores.jsonl`, opened for appending and locked. Each append is synchronized, so acknowledged scores survive a crash.
     ///
     /// # Errors
     /// [`RunDirError::InUse`] if another learner works in this folder.

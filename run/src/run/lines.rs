@@ -34,7 +34,7 @@ pub struct ScoreLine {
     pub episode_return: f64,
     /// Environment steps.
     pub length: u32,
-    /// D4RL-normalised score.
+    /// D4RL-normalized score.
     pub score: f64,
     /// BLAKE3 of the snapshot's file.
     pub weights: String,

@@ -19,12 +19,12 @@ pub struct Log {
     length: u64,
     /// Whether half a line may follow them.
     torn: bool,
-    /// Lock of a file that is synchronised after each write; the run's other file has the same writer and needs none.
+    /// Lock of a file that is synchronized after each write; the run's other file has the same writer and needs none.
     lock: Option<Lock>,
 }
 
 impl Log {
-    /// Opens or makes the file. With its lock, it is synchronised after each write. Half a line at its end, which a crash left,
+    /// Opens or makes the file. With its lock, it is synchronized after each write. Half a line at its end, which a crash left,
     /// is cut off.
     ///
     /// # Errors
@@ -33,8 +33,8 @@ impl Log {
         let file = files::append(&path).map_err(io_error("open", &path))?;
         let mut log = Self { path, file, length: 0, torn: true, lock };
         log.length = whole_lines(&log.bytes()?) as u64;
-        // Lines that a killed process did not synchronise count from now on.
-        let durable = log.mend().and_then(|()| log.synchronise()).and_then(|()| files::synchronise_folder(&log.path));
+        // Lines that a killed process did not synchronize count from now on.
+        let durable = log.mend().and_then(|()| log.synchronize()).and_then(|()| files::synchronize_folder(&log.path));
         durable.map_err(io_error("open", &log.path))?;
         Ok(log)
     }
@@ -57,7 +57,7 @@ impl Log {
     fn write(&mut self, text: &[u8]) -> io::Result<()> {
         self.mend()?;
         self.torn = true;
-        let written = self.file.write_all(text).and_then(|()| self.synchronise());
+        let written = self.file.write_all(text).and_then(|()| self.synchronize());
         match written {
             Ok(()) => {
                 self.torn = false;
@@ -69,7 +69,7 @@ impl Log {
         written
     }
 
-    fn synchronise(&self) -> io::Result<()> {
+    fn synchronize(&self) -> io::Result<()> {
         if self.lock.is_some() { self.file.sync_data() } else { Ok(()) }
     }
 
@@ -84,7 +84,7 @@ impl Log {
 
     /// Cuts off every line from the first one on that is not to be kept.
     pub(super) fn keep_while(&mut self, mut keep: impl FnMut(&str) -> bool) -> Result<(), RunDirError> {
-        // A power cut may leave anything in a file that was not synchronised; what is no text is not kept either.
+        // A power cut may leave anything in a file that was not synchronized; what is no text is not kept either.
         let bytes = self.bytes()?;
         let lines = bytes.split_inclusive(|&byte| byte == b'\n');
         let kept = lines.take_while(|line| std::str::from_utf8(line).is_ok_and(&mut keep));

@@ -127,17 +127,17 @@ fn no_link_is_written_through() {
     std::fs::write(&precious, "no line of a log").unwrap();
     let (run, log) = RunDir::create(&path, &config("a", 0)).unwrap();
     drop(log);
-    for name in ["endpoints.json.partial", "metrics.jsonl", "scores.jsonl", "failed", "judgements.json"] {
+    for name in ["endpoints.json.partial", "metrics.jsonl", "scores.jsonl", "failed", "judgments.json"] {
         std::fs::remove_file(path.join(name)).ok();
         symlink(&precious, path.join(name)).unwrap();
     }
     assert!(run.score_log().is_err() && run.metrics_log(0).is_err());
     run.write_json("endpoints.json", &1).unwrap();
-    run.write_json("judgements.json", &1).unwrap();
+    run.write_json("judgments.json", &1).unwrap();
     run.mark_failed(true).unwrap();
     run.remove_partial_files();
     assert_eq!(std::fs::read_to_string(precious).unwrap(), "no line of a log");
-    assert_eq!(run.read_json::<u8>("judgements.json").unwrap(), 1);
+    assert_eq!(run.read_json::<u8>("judgments.json").unwrap(), 1);
 
     std::fs::remove_file(path.join("scores.jsonl")).unwrap();
     symlink(&missing, path.join("scores.jsonl")).unwrap();

@@ -14,7 +14,7 @@ use super::findings::Findings;
 const THREADS: &str = "RAYON_NUM_THREADS";
 /// Size of the trial file, bytes: more than a file system keeps aside for small files.
 const TRIAL: usize = 1 << 20;
-/// A disk that takes longer than this for the trial delays scores: the learner synchronises each score before it counts.
+/// A disk that takes longer than this for the trial delays scores: the learner synchronizes each score before it counts.
 const SLOW: Duration = Duration::from_millis(500);
 /// Less free space than this is not enough for a checkpoint and some snapshots of the paper's networks, bytes.
 const TOO_LITTLE: u64 = 100 << 20;
@@ -66,7 +66,7 @@ pub fn folder(findings: &mut Findings, check: &str, path: &Path, elsewhere: &str
     }
 }
 
-/// Writes a file, synchronises it to the disk and removes it. Returns the free bytes, and how long the trial took.
+/// Writes a file, synchronizes it to the disk and removes it. Returns the free bytes, and how long the trial took.
 fn write_trial(folder: &Path) -> io::Result<(u64, Duration)> {
     let path = folder.join(format!(".doctor-{}", std::process::id()));
     let begin = Instant::now();

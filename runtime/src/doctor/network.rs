@@ -76,7 +76,7 @@ async fn connect(findings: &mut Findings, endpoints: &Endpoints) -> Option<Sessi
                  it listen for other machines, as at tcp/0.0.0.0:7447, or only at 127.0.0.1?"
             }
             ErrorKind::TimedOut => "does a firewall drop what goes to this port, or is the address of another network?",
-            _ => "is the name spelt right, and is there a network?",
+            _ => "is the name spelled right, and is there a network?",
         };
         findings.fail("connection", format!("{address}: {error}"), hint);
         return None;

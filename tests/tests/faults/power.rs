@@ -26,7 +26,7 @@ const EPISODE: Duration = Duration::from_millis(10);
 /// A score: step, seed, weights.
 type Key = (u64, u64, String);
 
-/// A learner on a disk that forgets what was not synchronised, evaluators, and a router that outlives it.
+/// A learner on a disk that forgets what was not synchronized, evaluators, and a router that outlives it.
 struct System {
     setting: Setting,
     scratch: Scratch,

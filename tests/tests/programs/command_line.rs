@@ -85,19 +85,19 @@ fn bash_completes_commands_and_arguments() {
 }
 
 #[test]
-fn a_terminal_is_coloured_unless_its_user_does_not_want_it() {
+fn a_terminal_is_colored_unless_its_user_does_not_want_it() {
     let scratch = Scratch::new();
     let [data, run] = [scratch.dataset(), scratch.path().join("run")];
     let flags = "--task hopper-demo --set batch_size=8 --dry-run";
     let train = format!("learner train {flags} --dataset {} --run-dir {}", data.display(), run.display());
-    for (setting, coloured) in
+    for (setting, colored) in
         [("NO_COLOR= TERM=xterm", true), ("NO_COLOR=1 TERM=xterm", false), ("NO_COLOR= TERM=dumb", false)]
     {
         let text = shell(&["script", "--quiet", "--command", &format!("{setting} {train}"), "/dev/null"]);
         assert!(text.contains(" INFO"), "{text}");
-        assert_eq!(text.contains("\u{1b}["), coloured, "{setting}: {text:?}");
+        assert_eq!(text.contains("\u{1b}["), colored, "{setting}: {text:?}");
     }
-    assert!(!shell(&["sh", "-c", &format!("{train} 2>&1")]).contains('\u{1b}'), "a pipe has no colours");
+    assert!(!shell(&["sh", "-c", &format!("{train} 2>&1")]).contains('\u{1b}'), "a pipe has no colors");
 }
 
 #[test]

@@ -80,7 +80,7 @@ numpy.savez(sys.argv[1], observations=observations, actions=actions, terminals=t
 ";
 
 #[test]
-fn a_task_of_ogbench_is_learnt_by_its_name_and_evaluated_here() {
+fn a_task_of_ogbench_is_learned_by_its_name_and_evaluated_here() {
     let scratch = Scratch::new();
     let Some(python) = peers::python(&["numpy", "http.server"]) else { return };
     let (mirror, port) = (scratch.path().join("mirror"), free_port());

@@ -35,7 +35,7 @@ fn run(scratch: &Scratch) -> Learner {
     learner
 }
 
-/// The colours of each frame of an animation: width × height × 4 bytes.
+/// The colors of each frame of an animation: width × height × 4 bytes.
 fn frames(path: &Path) -> ((u16, u16), Vec<Vec<u8>>) {
     let mut options = gif::DecodeOptions::new();
     options.set_color_output(gif::ColorOutput::RGBA);
@@ -65,8 +65,8 @@ fn a_film_shows_the_episode_that_is_scored() {
     let (size, frames) = frames(&folder.join("film.gif"));
     assert_eq!(size, (320, 240));
     assert_eq!(frames.len() as u64, length.div_ceil(5) + 1, "25 a second, of steps of 0.008 s, and the last");
-    let colours = |frame: &[u8]| frame.chunks(4).map(<[u8]>::to_vec).collect::<std::collections::BTreeSet<_>>().len();
-    assert!(frames.iter().all(|frame| colours(frame) > 10), "each shows something");
+    let colors = |frame: &[u8]| frame.chunks(4).map(<[u8]>::to_vec).collect::<std::collections::BTreeSet<_>>().len();
+    assert!(frames.iter().all(|frame| colors(frame) > 10), "each shows something");
     assert_ne!(frames.first(), frames.last());
 
     let run = first.split_once("/snapshots").unwrap().0;

@@ -75,7 +75,7 @@ fn policies_are_judged_by_the_data_alone() {
     let report = learner("report", &[&all], &["--html", html.to_str().unwrap()]);
     said(&report, 0);
     for text in [String::from_utf8(report.stdout).unwrap(), fs::read_to_string(html).unwrap()] {
-        assert!(text.contains("a ranking, not a score") && text.contains("behaviour, as recorded"), "{text}");
+        assert!(text.contains("a ranking, not a score") && text.contains("behavior, as recorded"), "{text}");
     }
 }
 
@@ -96,12 +96,12 @@ fn what_cannot_be_judged_is_said_in_a_sentence() {
     refused(&[&quad, &iql], "quad is of the environment my-robot, iql of another", "judge them apart");
     let sha256 = text.split("sha256 = \"").nth(1).unwrap().split('"').next().unwrap().to_owned();
     fs::write(&config, text.replace(&sha256, &"0".repeat(64))).unwrap();
-    refused(&[&quad, &iql], "have not learnt from the same data", "judge them apart");
-    refused(&[&iql], "is not the data that iql has learnt from", "put a copy");
+    refused(&[&quad, &iql], "have not learned from the same data", "judge them apart");
+    refused(&[&iql], "is not the data that iql has learned from", "put a copy");
 }
 
 #[test]
-fn an_exported_policy_says_what_it_has_learnt_from_and_acts_alike() {
+fn an_exported_policy_says_what_it_has_learned_from_and_acts_alike() {
     let scratch = tempfile::tempdir().unwrap();
     let [quad, _] = runs(scratch.path());
     let out = scratch.path().join("policy.safetensors");

@@ -43,7 +43,7 @@ pub(super) fn said(output: &Output, code: i32) -> String {
 }
 
 #[test]
-fn a_robot_that_we_do_not_know_is_learnt_from() {
+fn a_robot_that_we_do_not_know_is_learned_from() {
     let folder = tempfile::tempdir().unwrap();
     let (dataset, run_dir) = (folder.path().join("robot.hdf5"), folder.path().join("robot"));
     write_log(&dataset, 1.0);
@@ -59,13 +59,13 @@ fn a_robot_that_we_do_not_know_is_learnt_from() {
     let metrics = std::fs::read_to_string(run_dir.join("metrics.jsonl")).unwrap();
     let last: BTreeMap<String, f64> = serde_json::from_str(metrics.lines().last().unwrap()).unwrap();
     let ratio = last["held_out_bc_loss"] / last["bc_loss"];
-    assert!((0.5..2.0).contains(&ratio), "alike episodes, hardly learnt: {last:?}");
+    assert!((0.5..2.0).contains(&ratio), "alike episodes, hardly learned: {last:?}");
     let snapshots = std::fs::read_dir(run_dir.join("snapshots")).unwrap().count();
     assert_eq!(snapshots, 1, "the last step's");
 }
 
 #[test]
-fn a_robot_whose_actions_are_large_is_learnt_from_in_its_own_units() {
+fn a_robot_whose_actions_are_large_is_learned_from_in_its_own_units() {
     let folder = tempfile::tempdir().unwrap();
     let (dataset, run_dir) = (folder.path().join("robot.hdf5"), folder.path().join("robot"));
     write_log(&dataset, 30.0);

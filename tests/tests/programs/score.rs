@@ -41,7 +41,7 @@ fn episodes(scored: &Value) -> Vec<(u64, u64, u64, u64)> {
     episodes.map(|of| (whole(&of["seed"]), whole(&of["length"]), bits(&of["return"]), bits(&of["score"]))).collect()
 }
 
-/// Whether or not the policy learnt from scaled data: the simulator's units go in and come out.
+/// Whether or not the policy learned from scaled data: the simulator's units go in and come out.
 #[test]
 fn a_snapshot_gets_the_scores_that_its_run_has() {
     let scratch = Scratch::new();

@@ -29,13 +29,13 @@ fn a_run_whose_lambda_stays_near_one_is_called_dac() {
 }
 
 #[test]
-fn lambda_is_summarised_after_the_first_tenth() {
+fn lambda_is_summarized_after_the_first_tenth() {
     let Summary { text, json, .. } = of(&lines(|number| if number % 2 == 0 { 0.5 } else { 0.75 }), "quad").unwrap();
     for words in [
         "steps 201 to 2000: mean 0.625, of a batch 10 % below 0.125",
         "50.0 % above 0.99",
         "t = 1…T: – 0.250 – – –\n",
-        "σ²/ν̂² 2.000, cosine of guidance and behaviour cloning -0.500",
+        "σ²/ν̂² 2.000, cosine of guidance and behavior cloning -0.500",
     ] {
         assert!(text.contains(words), "{words} is missing in\n{text}");
     }

@@ -1,24 +1,24 @@
-//! Linear policies over normalised observations.
+//! Linear policies over normalized observations.
 
 /// a = M · (s - mean) / deviation. The environment clips it.
 #[derive(Clone, Debug)]
 pub struct LinearPolicy {
     /// M, action_dim × observation_dim.
     pub weights: Vec<f64>,
-    /// Normalises observations.
-    pub normaliser: Normaliser,
+    /// Normalizes observations.
+    pub normalizer: Normalizer,
 }
 
 impl LinearPolicy {
     /// The policy that never moves.
     pub fn zero(observation_dim: usize, action_dim: usize) -> Self {
-        let normaliser = Normaliser { mean: vec![0.0; observation_dim], inverse_deviation: vec![1.0; observation_dim] };
-        Self { weights: vec![0.0; action_dim * observation_dim], normaliser }
+        let normalizer = Normalizer { mean: vec![0.0; observation_dim], inverse_deviation: vec![1.0; observation_dim] };
+        Self { weights: vec![0.0; action_dim * observation_dim], normalizer }
     }
 
     /// Fills in `action` for `observation`.
     pub fn act(&self, observation: &[f64], action: &mut [f32]) {
-        let Normaliser { mean, inverse_deviation } = &self.normaliser;
+        let Normalizer { mean, inverse_deviation } = &self.normalizer;
         for (value, row) in action.iter_mut().zip(self.weights.chunks_exact(observation.len())) {
             let mut sum = 0.0;
             for (i, &observed) in observation.iter().enumerate() {
@@ -31,7 +31,7 @@ impl LinearPolicy {
 
 /// Mean and inverse standard deviation of each observed value.
 #[derive(Clone, Debug)]
-pub struct Normaliser {
+pub struct Normalizer {
     mean: Vec<f64>,
     inverse_deviation: Vec<f64>,
 }
@@ -82,13 +82,13 @@ impl Moments {
         self.count = count;
     }
 
-    /// The normalisation of these observations. A value that never changes is only centred.
-    pub fn normaliser(&self) -> Normaliser {
+    /// The normalization of these observations. A value that never changes is only centered.
+    pub fn normalizer(&self) -> Normalizer {
         let inverse = |squares: &f64| {
             let deviation = (squares / (self.count - 1.0).max(1.0)).sqrt();
             if deviation > 1e-7 { 1.0 / deviation } else { 1.0 }
         };
-        Normaliser { mean: self.mean.clone(), inverse_deviation: self.squares.iter().map(inverse).collect() }
+        Normalizer { mean: self.mean.clone(), inverse_deviation: self.squares.iter().map(inverse).collect() }
     }
 }
 
@@ -106,7 +106,7 @@ mod tests {
             half.iter().for_each(|value| moments.push(value));
             merged.merge(&moments);
         }
-        for Normaliser { mean, inverse_deviation } in [all.normaliser(), merged.normaliser()] {
+        for Normalizer { mean, inverse_deviation } in [all.normalizer(), merged.normalizer()] {
             assert_eq!(mean, [4.0, 5.0]);
             // Variance 38 / 3; the second value never changed.
             assert!((inverse_deviation[0] - (3.0_f64 / 38.0).sqrt()).abs() < 1e-12);

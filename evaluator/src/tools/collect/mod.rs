@@ -1,4 +1,4 @@
-//! Records a dataset of mediocre behaviour, so that a new machine needs no download.
+//! Records a dataset of mediocre behavior, so that a new machine needs no download.
 //!
 //! Following the recipe in an environment's row, `search` trains `linear` policies, and `record` mixes episodes of all of them, from
 //! the first to the last, into one file in D4RL's layout. The result resembles D4RL's "medium-replay", the replay buffer of a
@@ -32,9 +32,9 @@ pub struct Summary {
     pub transitions: usize,
     /// Episodes in the file.
     pub episodes: usize,
-    /// Mean over the episodes of D4RL's normalised score.
+    /// Mean over the episodes of D4RL's normalized score.
     pub mean_score: f64,
-    /// The 50th, 90th and 99th percentile, and the maximum, of the normalised scores.
+    /// The 50th, 90th and 99th percentile, and the maximum, of the normalized scores.
     pub score_percentiles: [f64; 4],
     /// Policies that act in the episodes.
     pub policies: usize,

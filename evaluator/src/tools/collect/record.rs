@@ -26,7 +26,7 @@ const PATIENCE: usize = 4;
 const NOISE_STREAM: u64 = 3;
 
 /// Records whole episodes, each of a policy drawn from `policies`, until there are `transitions` rows. Returns each episode's
-/// normalised score.
+/// normalized score.
 pub fn record(
     spec: &'static EnvironmentSpec,
     recipe: &Recipe,
@@ -57,7 +57,7 @@ pub fn record(
             .for_each(|(recorder, (policy, seed))| recorder.run(policy, seed, ceiling));
         for recorder in &recorders {
             simulated += recorder.steps.len();
-            let score = spec.normalised_score(recorder.episode_return);
+            let score = spec.normalized_score(recorder.episode_return);
             let band = mixture.iter().rposition(|&(from, _)| score >= from).unwrap_or(0);
             if recorder.ended() && (room[band] > 0.0 || !patient) {
                 room[band] -= recorder.steps.len() as f64;
@@ -124,7 +124,7 @@ impl Recorder {
             self.steps.push(step);
             self.episode_return += step.reward;
             self.keep_state();
-            if step.terminated || step.truncated || self.spec.normalised_score(self.episode_return) > ceiling {
+            if step.terminated || step.truncated || self.spec.normalized_score(self.episode_return) > ceiling {
                 return;
             }
         }

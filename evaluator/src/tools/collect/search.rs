@@ -1,8 +1,8 @@
-//! Augmented random search: learns behaviour in seconds, without a gradient.
+//! Augmented random search: learns behavior in seconds, without a gradient.
 //!
 //! ARS V2-t of Mania, Guy and Recht, "Simple random search of static linear policies is competitive for reinforcement
 //! learning" (2018). It perturbs the weights of a linear policy in random directions, forwards and backwards, and moves along
-//! the better directions by how much better they are. It normalises observations by all that it has seen, and leaves the bonus
+//! the better directions by how much better they are. It normalizes observations by all that it has seen, and leaves the bonus
 //! for being alive out of the objective, in which standing still would be a local optimum.
 
 use quad_dataset::{EnvironmentSpec, Recipe};
@@ -45,10 +45,10 @@ pub fn train(
     for index in 0..recipe.searches {
         let mut search = Search::new(spec, random(index))?;
         search.run(of_each, |steps| progress.advance(index * of_each + steps));
-        let score = spec.normalised_score(search.recent_return());
+        let score = spec.normalized_score(search.recent_return());
         let steps = search.environment_steps;
         let number = format!("search {} of {}", index + 1, recipe.searches);
-        progress.say(&format!("training, {number}: normalised score {score:.1} after {steps} steps"));
+        progress.say(&format!("training, {number}: normalized score {score:.1} after {steps} steps"));
         policies.extend(search.policies);
     }
     Ok(policies)
@@ -134,9 +134,9 @@ impl Search {
         for (trial, (direction, sign)) in
             self.trials.iter_mut().zip(directions.iter().flat_map(|direction| [(direction, 1.0), (direction, -1.0)]))
         {
-            trial.policy.normaliser = self.policy.normaliser.clone();
-            for ((weight, centre), delta) in trial.policy.weights.iter_mut().zip(&self.policy.weights).zip(direction) {
-                *weight = centre + sign * PERTURBATION * delta;
+            trial.policy.normalizer = self.policy.normalizer.clone();
+            for ((weight, center), delta) in trial.policy.weights.iter_mut().zip(&self.policy.weights).zip(direction) {
+                *weight = center + sign * PERTURBATION * delta;
             }
         }
         self.trials.par_iter_mut().zip(&seeds).with_max_len(1).for_each(|(trial, &seed)| trial.run(seed));
@@ -162,7 +162,7 @@ impl Search {
                 *weight += rate * (forwards - backwards) * delta;
             }
         }
-        self.policy.normaliser = self.moments.normaliser();
+        self.policy.normalizer = self.moments.normalizer();
         self.policies.push(self.policy.clone());
         self.returns.push(self.trials.iter().map(|trial| trial.episode_return).sum::<f64>() / self.trials.len() as f64);
     }

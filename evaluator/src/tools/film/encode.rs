@@ -14,9 +14,9 @@ use quad_runtime::Hint;
 use super::output::{Format, Output};
 use super::picture::Picture;
 
-/// Colours of an animation; fewer colours make a smaller file.
-const COLOURS: usize = 64;
-/// Sampling of the first picture to choose colours: 1 is all of it, 10 a tenth.
+/// Colors of an animation; fewer colors make a smaller file.
+const COLORS: usize = 64;
+/// Sampling of the first picture to choose colors: 1 is all of it, 10 a tenth.
 const SAMPLE: i32 = 10;
 
 /// Writes pictures, each shown for `seconds`. The file has its name when it is whole.
@@ -57,14 +57,14 @@ fn strip(pictures: impl Iterator<Item = Picture>) -> anyhow::Result<Vec<u8>> {
     Ok(file)
 }
 
-/// All pictures have the colours of the first: with a palette for each picture, the floor would flicker.
+/// All pictures have the colors of the first: with a palette for each picture, the floor would flicker.
 fn animation(seconds: f64, mut pictures: impl Iterator<Item = Picture>) -> anyhow::Result<Vec<u8>> {
     let first = pictures.next().context("there is no picture")?;
     let (width, height) = (first.width as u16, first.height() as u16);
     let rgba: Vec<u8> = first.rgb.chunks_exact(3).flat_map(|rgb| [rgb[0], rgb[1], rgb[2], 255]).collect();
-    let colours = NeuQuant::new(SAMPLE, COLOURS, &rgba);
-    let nearest = |rgb: &[u8]| colours.index_of(&[rgb[0], rgb[1], rgb[2], 255]) as u8;
-    let mut encoder = Encoder::new(Vec::new(), width, height, &colours.color_map_rgb())?;
+    let colors = NeuQuant::new(SAMPLE, COLORS, &rgba);
+    let nearest = |rgb: &[u8]| colors.index_of(&[rgb[0], rgb[1], rgb[2], 255]) as u8;
+    let mut encoder = Encoder::new(Vec::new(), width, height, &colors.color_map_rgb())?;
     encoder.set_repeat(Repeat::Infinite)?;
     for picture in once(first).chain(pictures) {
         let pixels: Vec<u8> = picture.rgb.chunks_exact(3).map(nearest).collect();
@@ -110,9 +110,9 @@ mod tests {
 
     use super::*;
 
-    /// Pictures of one colour each, of which the one with number `broken` cannot be drawn.
+    /// Pictures of one color each, of which the one with number `broken` cannot be drawn.
     fn pictures(broken: u8) -> impl Iterator<Item = anyhow::Result<Picture>> {
-        let picture = |colour| Picture { width: 64, rgb: vec![colour; 3 * 64 * 48] };
+        let picture = |color| Picture { width: 64, rgb: vec![color; 3 * 64 * 48] };
         (0..9).map(move |number| if number == broken { bail!("no light") } else { Ok(picture(20 * number)) })
     }
 

@@ -10,9 +10,9 @@ use crate::tools::score::Subject;
 /// What one picture shows.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Pose {
-    /// Generalised positions, as many as the model has.
+    /// Generalized positions, as many as the model has.
     pub qpos: Vec<f64>,
-    /// The position of the goal (x and y, metres), in a task that has one.
+    /// The position of the goal (x and y, meters), in a task that has one.
     pub goal: Option<[f64; 2]>,
     /// Undiscounted sum of the rewards so far.
     pub episode_return: f64,

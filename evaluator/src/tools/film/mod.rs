@@ -3,7 +3,7 @@
 //! `args`: the arguments; `run_folder`: chooses a snapshot of a run; `episode`: plays it and keeps its poses; `stage`: draws
 //! them, with the OpenGL of `gl`; `output`: the file and the layout of its pictures; `encode`: writes `picture`s to the file.
 //!
-//! A second model with colours draws the pictures after the episode, so the simulation does not depend on them.
+//! A second model with colors draws the pictures after the episode, so the simulation does not depend on them.
 
 mod args;
 mod encode;

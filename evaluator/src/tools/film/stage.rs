@@ -1,4 +1,4 @@
-//! Draws poses: the model with colours, a floor and a light, seen by a camera.
+//! Draws poses: the model with colors, a floor and a light, seen by a camera.
 
 use mujoco_rs::wrappers::mj_data::MjData;
 use mujoco_rs::wrappers::mj_model::{MjModel, MjtGeom, MjtGeomBase, MjtObjBase};
@@ -28,13 +28,13 @@ const LOOKS: &str = r#"
   </asset>
   <worldbody>
     <light directional="true" mode="trackcom" pos="0 -1 4" dir="0.2 0.3 -1" diffuse="0.5 0.5 0.5" specular="0 0 0"/>"#;
-/// A robot's first body has the first colour, its last the second, so that crossing legs differ.
+/// A robot's first body has the first color, its last the second, so that crossing legs differ.
 const ROBOT: [[f32; 3]; 2] = [[0.93, 0.49, 0.15], [0.16, 0.38, 0.66]];
 const WALL: [f32; 4] = [0.8, 0.7, 0.55, 1.0];
 const GOAL: [f32; 4] = [0.85, 0.15, 0.2, 0.6];
-/// Radius of the ball at a goal, metres.
+/// Radius of the ball at a goal, meters.
 const GOAL_RADIUS: f64 = 0.5;
-/// Side of a wall, metres.
+/// Side of a wall, meters.
 const CELL: f64 = 4.0;
 /// Space in a scene for geometries beyond the model's: the goal, and what MuJoCo adds.
 const MORE: usize = 100;
@@ -115,7 +115,7 @@ fn model(spec: &EnvironmentSpec, (width, height): (usize, usize)) -> anyhow::Res
     Ok(model)
 }
 
-/// Colours robot and walls, and draws the floor without end, as it is in the simulation.
+/// Colors robot and walls, and draws the floor without end, as it is in the simulation.
 fn paint(model: &mut MjModel) {
     let bodies = model.geom_bodyid().to_vec();
     let last = bodies.iter().copied().max().unwrap_or(1);
@@ -143,10 +143,10 @@ fn camera(model: &MjModel, aspect: f64) -> MjvCamera {
         fold(f64::min).zip(fold(f64::max))
     };
     let (Some((west, east)), Some((south, north))) = (bounds(0), bounds(1)) else { return beside };
-    let centre = [(west + east) / 2.0, (south + north) / 2.0];
+    let center = [(west + east) / 2.0, (south + north) / 2.0];
     let [width, height] = [east - west, north - south].map(|between| between + CELL);
     let seen = (height / (1.0 - CAPTION)).max(width / aspect);
-    let lookat = [centre[0], centre[1] + seen * CAPTION / 2.0, 0.0];
+    let lookat = [center[0], center[1] + seen * CAPTION / 2.0, 0.0];
     MjvCamera { lookat, azimuth: 90.0, elevation: -80.0, distance: WHOLE * seen, ..MjvCamera::default() }
 }
 

@@ -38,7 +38,7 @@ impl Scored {
         self.choice.map_or_else(|| "no candidates".to_owned(), |choice| choice.to_string())
     }
 
-    /// The normalised scores of the episodes, of which there is at least one.
+    /// The normalized scores of the episodes, of which there is at least one.
     pub fn spread(&self) -> Option<Spread> {
         Spread::of(&Vec::from_iter(self.episodes.iter().map(|episode| episode.score)))
     }
@@ -69,7 +69,7 @@ pub fn table(scored: &[Scored]) -> String {
     }
     let precisions: BTreeSet<&str> = scored.iter().map(|scored| scored.precision.as_str()).collect();
     let precisions = Vec::from_iter(precisions).join(" and ");
-    let mut note = format!("normalised score in {precisions}, mean ± standard deviation over the episodes");
+    let mut note = format!("normalized score in {precisions}, mean ± standard deviation over the episodes");
     if snapshots.len() > 1 && scored.iter().all(|other| other.environment == scored[0].environment) {
         let head = [format!("mean of {} snapshots", snapshots.len()), String::new(), String::new(), String::new()];
         let mean = |title: &String| {

@@ -43,7 +43,7 @@ fn dataset(addresses: &[&Server]) -> NamedDataset {
         bytes: Some(200_008),
         // From Python: hashlib.sha256(content).
         sha256: Some("c7c73dfee4b7d79f660f604ecb6967b5ba390f12727b02bb1c336c8277056b1b".to_owned()),
-        licence: "none".to_owned(),
+        license: "none".to_owned(),
         addresses: addresses.iter().map(|server| server.url.clone()).collect(),
     }
 }

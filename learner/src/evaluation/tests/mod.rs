@@ -111,7 +111,7 @@ fn name(text: &str) -> Name {
 /// An episode of Hopper.
 fn score(seed: u64, episode_return: f64) -> EpisodeScore {
     let hopper = quad_dataset::environment::find("hopper").unwrap();
-    EpisodeScore { seed, episode_return, length: 100, score: hopper.normalised_score(episode_return) }
+    EpisodeScore { seed, episode_return, length: 100, score: hopper.normalized_score(episode_return) }
 }
 
 /// Some of a job's scores.

@@ -2,7 +2,7 @@
 
 use super::*;
 
-/// An agent of this algorithm, of such batches, over 30 other transitions than those that are learnt from, whose first reward is
+/// An agent of this algorithm, of such batches, over 30 other transitions than those that are learned from, whose first reward is
 /// as given.
 fn beside(algorithm: &str, batch_size: usize, reward: f32) -> Agent {
     let (n, context) = (30, context(250));
@@ -24,7 +24,7 @@ fn beside(algorithm: &str, batch_size: usize, reward: f32) -> Agent {
 
 /// By the weights of the moment, in whatever order batches are taken, and without a trace in what is trained.
 #[test]
-fn held_out_episodes_are_measured_and_not_learnt_from() {
+fn held_out_episodes_are_measured_and_not_learned_from() {
     for algorithm in ["quad", "iql"] {
         let agent = || Agent::new(definition(algorithm).unwrap(), &small(algorithm), context(20)).unwrap();
         let ([mut alone, mut measured], mut held_out) =

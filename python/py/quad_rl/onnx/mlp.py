@@ -30,9 +30,9 @@ def mish(x: Array) -> Array:
 
 
 def layer_norm(x: Value, scale: Array, shift: Array, epsilon: float, axis: int = -1) -> Value:
-    centred = x - x.mean(axis)
-    deviation = x.graph("Sqrt", (centred * centred).mean(axis) + epsilon)
-    return centred / deviation * scale + shift
+    centered = x - x.mean(axis)
+    deviation = x.graph("Sqrt", (centered * centered).mean(axis) + epsilon)
+    return centered / deviation * scale + shift
 
 
 def layers(file: File, prefix: str, config: dict[str, Any], x: Value) -> Value:

@@ -53,9 +53,9 @@ class Layers:
         scale, shift = (array[:, None] for array in self.tensors(name, ("scale", "shift")))
         channels, grouped = len(scale), (0, self.config["groups"], -1)
         x = x.reshape(*grouped)
-        centred = x - x.mean(2)
-        deviation = x.graph("Sqrt", (centred * centred).mean(2) + 1e-5)
-        normed = centred / deviation
+        centered = x - x.mean(2)
+        deviation = x.graph("Sqrt", (centered * centered).mean(2) + 1e-5)
+        normed = centered / deviation
         linear = normed.reshape(0, channels, length) * scale + shift
 
         def gradient(g: Value) -> Value:

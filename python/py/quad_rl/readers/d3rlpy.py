@@ -16,7 +16,7 @@ def from_d3rlpy(dataset: Any) -> _dataset.Dataset:
     episodes = []
     for episode in dataset.episodes:
         if isinstance(episode.observations, (tuple, list)):
-            raise ValueError("observations are tuples, but only rows of numbers are learnt from")
+            raise ValueError("observations are tuples, but only rows of numbers are learned from")
         arrays = {name: getattr(episode, name) for name in ("observations", "actions", "rewards")}
         episodes.append({**arrays, "terminated": bool(episode.terminated), "truncated": False})
     return _dataset.Dataset.from_episodes(episodes)

@@ -63,7 +63,7 @@ def from_lerobot(
         raise ValueError(f"{root}: a LeRobot dataset of {version}, but v2.x and v3.x are read\nhint: LeRobot converts it")
     images = [name for name, feature in features.items() if feature["dtype"] in ("image", "video")]
     for name in {*observations, action} & {*images}:
-        raise ValueError(f"{root}: {name} is {features[name]['dtype']}, but only rows of numbers are learnt from")
+        raise ValueError(f"{root}: {name} is {features[name]['dtype']}, but only rows of numbers are learned from")
     notes = [f"left out: {len(images)} streams of images ({', '.join(images)})"] if images else []
     words = columns_of(observations, action, reward, success, terminate)
     plain = [name for name in features if name not in images and features[name]["dtype"] not in ("string", "language")]

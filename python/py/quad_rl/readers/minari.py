@@ -62,5 +62,5 @@ def _parts(name: str, space: Any, values: Any) -> dict[str, NDArray[Any]]:
         return {full: array for key, part in parts for full, array in _parts(f"{name}.{key}", part, values[key]).items()}
     array = np.asarray(values)
     if array.ndim > 2 and array.dtype == np.uint8:
-        raise ValueError(f"{name} holds images, but only rows of numbers are learnt from")
+        raise ValueError(f"{name} holds images, but only rows of numbers are learned from")
     return {name: array}

@@ -63,7 +63,7 @@ def from_robomimic(
             low, images = _sort(group)
             there = list(low)
             for key in {*observations} & {*images}:
-                raise ValueError(f"{file}: {key} holds images, but only rows of numbers are learnt from")
+                raise ValueError(f"{file}: {key} holds images, but only rows of numbers are learned from")
             if images and not episodes:
                 notes.append(f"left out: {len(images)} streams of images ({', '.join(images)})")
             columns = {key: low[key][()] for key in low if words is None or key in {*words, _REWARDS, _DONE}}
@@ -97,7 +97,7 @@ def _sort(group: Any) -> tuple[dict[str, Any], list[str]]:
 
 
 def _check_following(where: str, key: str, seen: NDArray[Any], after: NDArray[Any]) -> None:
-    """Raises ValueError where a row of `next_obs` is not the following row of `obs`, as that is what is learnt from."""
+    """Raises ValueError where a row of `next_obs` is not the following row of `obs`, as that is what is learned from."""
     if len(seen) != len(after):
         raise ValueError(f"{where}: next_obs has {len(after)} rows of {key!r}, but obs has {len(seen)}")
     coarse = min(seen.dtype, after.dtype, key=lambda dtype: dtype.itemsize)  # One of them may have been rounded.

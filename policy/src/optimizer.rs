@@ -5,7 +5,7 @@ use crate::recording::overwrite;
 use crate::slices::{has_fast_implementation, modify, read};
 use crate::weights::{Layout, Tensors, Weights};
 use candle_core::{DType, Device, Result, Tensor};
-use quad_kernels::optimiser::{AdamRates, BETA1, BETA2, EPSILON, adam, norm};
+use quad_kernels::optimizer::{AdamRates, BETA1, BETA2, EPSILON, adam, norm};
 
 /// Adam (Kingma and Ba 2015), with β = (0.9, 0.999) and ε = 1e-8, for the weights of one network; with a weight decay it is
 /// AdamW (Loshchilov and Hutter 2019).

@@ -1,5 +1,5 @@
-"""Prints the licences of all that is compiled into the programs and the Python module, each text once; to be run in the
-repository's folder. Where a package carries no text, it prints which licence its manifest names."""
+"""Prints the licenses of all that is compiled into the programs and the Python module, each text once; to be run in the
+repository's folder. Where a package carries no text, it prints which license its manifest names."""
 
 import json
 import pathlib
@@ -9,7 +9,7 @@ import subprocess
 COMMAND = "metadata --format-version 1 --locked --filter-platform x86_64-unknown-linux-gnu --features"
 FEATURES = "quad-learner/static,quad-evaluator/static,quad-python/static"
 PROGRAMS = {"quad-learner", "quad-evaluator", "quad-python"}
-# C that a crate compiles, with the licence of its own.
+# C that a crate compiles, with the license of its own.
 WITHIN = {"hdf5-metno-src": ["ext/hdf5/LICENSE"], "libz-sys": ["src/zlib/LICENSE"]}
 
 
@@ -29,7 +29,7 @@ def linked(metadata):
 
 
 def texts(package):
-    """The files of its folder that are licences by their names."""
+    """The files of its folder that are licenses by their names."""
     folder = pathlib.Path(package["manifest_path"]).parent
     files = {file for file in folder.iterdir() if file.name.upper().startswith(("LICEN", "COPYING", "NOTICE", "UNLICENSE"))}
     files |= {folder / name for name in WITHIN.get(package["name"], [])}
@@ -46,6 +46,6 @@ for package in linked(metadata):
     said = f"{package['license']}, says its manifest, without a text. Authors: {', '.join(package['authors']) or 'not named'}"
     for text in texts(package) or [said]:
         owners.setdefault(text, []).append(name)
-print("What is compiled into the programs, and under which licences.\n")
+print("What is compiled into the programs, and under which licenses.\n")
 for text, names in owners.items():
     print("=" * 80, ", ".join(names), "-" * 80, text, sep="\n", end="\n\n")

@@ -20,9 +20,9 @@ pub struct NamedDataset {
     pub bytes: Option<u64>,
     /// SHA-256 in lower-case hexadecimal, if it is known.
     pub sha256: Option<String>,
-    /// Licence of the data, which a collection shares.
+    /// License of the data, which a collection shares.
     #[serde(skip)]
-    pub licence: String,
+    pub license: String,
     /// Where it can be had, best first: the file in each folder of its collection.
     #[serde(skip)]
     pub addresses: Vec<String>,
@@ -49,17 +49,17 @@ struct Table {
 #[derive(Deserialize)]
 #[serde(deny_unknown_fields)]
 struct Collection {
-    licence: String,
+    license: String,
     folders: Vec<String>,
     dataset: Vec<NamedDataset>,
 }
 
 impl Collection {
     fn into_datasets(self) -> impl Iterator<Item = NamedDataset> {
-        let Self { licence, folders, dataset } = self;
+        let Self { license, folders, dataset } = self;
         dataset.into_iter().map(move |dataset| {
             let addresses = folders.iter().map(|folder| format!("{folder}{}", dataset.file)).collect();
-            NamedDataset { addresses, licence: licence.clone(), ..dataset }
+            NamedDataset { addresses, license: license.clone(), ..dataset }
         })
     }
 }
@@ -98,7 +98,7 @@ mod tests {
             let environment = environment::find(&dataset.environment).unwrap();
             assert!(name.starts_with(environment.simulation()), "{name}");
             assert!(addresses.iter().all(|address| address.starts_with("http") && address.ends_with(file)), "{name}");
-            assert!(!addresses.is_empty() && dataset.licence == "CC BY 4.0", "{name}");
+            assert!(!addresses.is_empty() && dataset.license == "CC BY 4.0", "{name}");
             let is_digest =
                 |text: &String| text.len() == 64 && text.chars().all(|digit| matches!(digit, '0'..='9' | 'a'..='f'));
             assert!(sha256.as_ref().is_none_or(is_digest), "{name}: {sha256:?}");

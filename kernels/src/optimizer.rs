@@ -2,7 +2,7 @@
 
 use rayon::prelude::*;
 
-use crate::vectorised::vectorised;
+use crate::vectorized::vectorized;
 
 /// Numbers per task: a few arrays of them fit into a core's own cache.
 const CHUNK: usize = 1 << 14;
@@ -14,7 +14,7 @@ pub const BETA2: f64 = 0.999;
 /// What Adam adds to the root of the second moment, ε.
 pub const EPSILON: f32 = 1e-8;
 
-vectorised! {
+vectorized! {
     fn sum_of_squares(x: &[f32]) -> f32 {
         let mut lanes = [0.0_f32; 16];
         let chunks = x.chunks_exact(16);
@@ -51,7 +51,7 @@ impl AdamRates {
     }
 }
 
-vectorised! {
+vectorized! {
     fn adam_chunk(scale: f32, rates: AdamRates, parameters: &mut [f32], first: &mut [f32], second: &mut [f32], gradient: &[f32]) {
         // Of the new gradient: rounded from f64, since 1 - 0.999 in f32 would be off by a part in 20,000.
         const NEW: [f32; 2] = [(1.0 - BETA1) as f32, (1.0 - BETA2) as f32];
@@ -66,7 +66,7 @@ vectorised! {
     }
 }
 
-vectorised! {
+vectorized! {
     fn ema_chunk(target: &mut [f32], online: &[f32], rate: f32) {
         for (target, online) in target.iter_mut().zip(online) {
             *target += rate * (online - *target);

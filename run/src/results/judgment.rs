@@ -9,10 +9,10 @@ use super::spread::Spread;
 use crate::run::{Lock, RunDir, RunDirError};
 use crate::table::{Part, Table};
 
-const FILE: &str = "judgements.json";
-const LOCK: &str = "judgements.lock";
+const FILE: &str = "judgments.json";
+const LOCK: &str = "judgments.lock";
 
-/// How judgements were made: those that were made alike can be compared.
+/// How judgments were made: those that were made alike can be compared.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct Conditions {
     /// SHA-256 of the data.
@@ -48,7 +48,7 @@ impl Estimate {
 
 /// What is known of one policy.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
-pub struct Judgement {
+pub struct Judgment {
     /// The folder of its run, as the reader calls it.
     #[serde(default)]
     pub run: PathBuf,
@@ -62,17 +62,17 @@ pub struct Judgement {
     pub estimate: Estimate,
     /// How far its actions lie from the data's in the judged episodes: root mean square, in standard deviations of the data's.
     pub distance: f64,
-    /// Whether it has learnt from none of the judged episodes.
+    /// Whether it has learned from none of the judged episodes.
     pub unseen: bool,
-    /// The value of the behaviour that recorded the data, estimated likewise.
+    /// The value of the behavior that recorded the data, estimated likewise.
     pub behavior: Estimate,
-    /// The behaviour's value as the judged episodes have it: the mean of their discounted returns. What comes after an episode that was cut off
+    /// The behavior's value as the judged episodes have it: the mean of their discounted returns. What comes after an episode that was cut off
     /// is taken from the estimate.
     pub recorded: f64,
 }
 
-impl Judgement {
-    /// The judgements of a run's snapshots that its folder has, but for those that may be of another task's rewards.
+impl Judgment {
+    /// The judgments of a run's snapshots that its folder has, but for those that may be of another task's rewards.
     ///
     /// # Errors
     /// The file cannot be read, or is not what `learner judge` writes.
@@ -80,10 +80,10 @@ impl Judgement {
         if !folder.path().join(FILE).exists() {
             return Ok(Vec::new());
         }
-        let mut judgements: Vec<Self> = folder.read_json(FILE)?;
-        judgements.retain(|judgement| !judgement.conditions.environment.is_empty());
-        judgements.iter_mut().for_each(|judgement| judgement.run = folder.path().to_owned());
-        Ok(judgements)
+        let mut judgments: Vec<Self> = folder.read_json(FILE)?;
+        judgments.retain(|judgment| !judgment.conditions.environment.is_empty());
+        judgments.iter_mut().for_each(|judgment| judgment.run = folder.path().to_owned());
+        Ok(judgments)
     }
 
     /// Keeps it in the folder, in the place of an earlier one of the same step. Waits for another process that is doing so.
@@ -98,11 +98,11 @@ impl Judgement {
                 taken => break taken?,
             }
         };
-        let mut judgements = Self::read_all(folder)?;
-        judgements.retain(|earlier| earlier.step != self.step);
-        judgements.push(self.clone());
-        judgements.sort_by_key(|judgement| judgement.step);
-        folder.write_json(FILE, &judgements)
+        let mut judgments = Self::read_all(folder)?;
+        judgments.retain(|earlier| earlier.step != self.step);
+        judgments.push(self.clone());
+        judgments.sort_by_key(|judgment| judgment.step);
+        folder.write_json(FILE, &judgments)
     }
 }
 
@@ -111,36 +111,36 @@ impl Judgement {
 pub struct Ranking {
     /// How they were judged.
     pub conditions: Conditions,
-    /// The behaviour's value, estimated.
+    /// The behavior's value, estimated.
     pub behavior: Estimate,
-    /// The behaviour's value, recorded.
+    /// The behavior's value, recorded.
     pub recorded: f64,
-    /// Whether the policies' values differ by more than the estimate of the behaviour is off, and than other seeds would change them.
+    /// Whether the policies' values differ by more than the estimate of the behavior is off, and than other seeds would change them.
     pub can_rank: bool,
     /// What follows from this, in words.
     pub verdict: String,
     /// The policies.
-    pub policies: Vec<Judgement>,
+    pub policies: Vec<Judgment>,
 }
 
 impl Ranking {
     /// A ranking of each kind of conditions, in the order in which they come.
-    pub fn of(judgements: impl IntoIterator<Item = Judgement>) -> Vec<Self> {
-        let mut groups: Vec<Vec<Judgement>> = Vec::new();
-        for judgement in judgements {
-            match groups.iter_mut().find(|group| group[0].conditions == judgement.conditions) {
-                Some(group) => group.push(judgement),
-                None => groups.push(vec![judgement]),
+    pub fn of(judgments: impl IntoIterator<Item = Judgment>) -> Vec<Self> {
+        let mut groups: Vec<Vec<Judgment>> = Vec::new();
+        for judgment in judgments {
+            match groups.iter_mut().find(|group| group[0].conditions == judgment.conditions) {
+                Some(group) => group.push(judgment),
+                None => groups.push(vec![judgment]),
             }
         }
         groups.into_iter().map(Self::of_group).collect()
     }
 
-    fn of_group(mut policies: Vec<Judgement>) -> Self {
-        let value = |judgement: &Judgement| judgement.estimate.spread().map_or(f64::NEG_INFINITY, |spread| spread.mean);
+    fn of_group(mut policies: Vec<Judgment>) -> Self {
+        let value = |judgment: &Judgment| judgment.estimate.spread().map_or(f64::NEG_INFINITY, |spread| spread.mean);
         policies.sort_by(|one, other| value(other).total_cmp(&value(one)));
-        let Judgement { conditions, behavior, recorded, .. } = policies[0].clone();
-        let sure = Vec::from_iter(policies.iter().filter_map(|judgement| judgement.estimate.spread()));
+        let Judgment { conditions, behavior, recorded, .. } = policies[0].clone();
+        let sure = Vec::from_iter(policies.iter().filter_map(|judgment| judgment.estimate.spread()));
         let (can_rank, verdict) = verdict(&sure, conditions.seeds, &behavior, recorded);
         Self { conditions, behavior, recorded, can_rank, verdict, policies }
     }
@@ -151,10 +151,10 @@ impl Ranking {
         let columns = [("rank", Right), ("policy", Left), ("value", Right), ("distance", Right), ("doubts", Left)];
         let mut table = Table::new(&columns);
         let value = |of: &Estimate| of.spread().map_or_else(|| "-".to_owned(), Spread::text);
-        for (judgement, rank) in policies.iter().zip(1..) {
-            let Judgement { run, step, estimate, distance, unseen, .. } = judgement;
+        for (judgment, rank) in policies.iter().zip(1..) {
+            let Judgment { run, step, estimate, distance, unseen, .. } = judgment;
             let mut doubts = estimate.doubts.clone();
-            doubts.extend((!unseen).then(|| "has learnt from some of these episodes".to_owned()));
+            doubts.extend((!unseen).then(|| "has learned from some of these episodes".to_owned()));
             let rank = if estimate.doubts.is_empty() && self.can_rank { format!("{rank}") } else { "-".to_owned() };
             table.push([
                 rank,
@@ -164,9 +164,9 @@ impl Ranking {
                 doubts.join("; "),
             ]);
         }
-        let behavior = ["-".to_owned(), "behaviour, estimated".to_owned(), value(&self.behavior)];
+        let behavior = ["-".to_owned(), "behavior, estimated".to_owned(), value(&self.behavior)];
         table.push([&behavior[..], &["".to_owned(), self.behavior.doubts.join("; ")]].concat());
-        let recorded = ["-", "behaviour, as recorded", &format!("{:.2}", self.recorded), "", ""];
+        let recorded = ["-", "behavior, as recorded", &format!("{:.2}", self.recorded), "", ""];
         table.push(recorded.map(str::to_owned));
         let words = format!(
             "Judged without a simulator: a ranking, not a score.\n{}\nValues are discounted returns (γ = {gamma}) in {environment} \
@@ -185,18 +185,18 @@ fn verdict(values: &[Spread], seeds: u64, behavior: &Estimate, recorded: f64) ->
         return (false, "It cannot rank them: no estimate can be relied on.".to_owned());
     };
     let Some(estimated) = behavior.spread() else {
-        return (false, "It cannot rank them: the estimate of the behaviour's own value is doubtful.".to_owned());
+        return (false, "It cannot rank them: the estimate of the behavior's own value is doubtful.".to_owned());
     };
     let (off, range) = ((estimated.mean - recorded).abs(), most.mean - least.mean);
     // Twice the standard error of a difference of two means over the seeds.
     let variance = values.iter().map(|value| value.std.unwrap_or(0.0).powi(2)).sum::<f64>() / values.len() as f64;
     let noise = 2.0 * (2.0 * variance / seeds as f64).sqrt();
     let behind = format!(
-        "the behaviour's own value is estimated {off:.2} off, and by other seeds two policies differ by {noise:.2}"
+        "the behavior's own value is estimated {off:.2} off, and by other seeds two policies differ by {noise:.2}"
     );
     let margin = off.max(noise);
     match values.len() {
-        1 => (false, format!("One value is no ranking; the behaviour's own value is estimated {off:.2} off.")),
+        1 => (false, format!("One value is no ranking; the behavior's own value is estimated {off:.2} off.")),
         _ if margin >= range => (false, format!("It cannot rank them: {behind}, these by no more than {range:.2}.")),
         _ => (true, format!("Policies whose values differ by less than {margin:.2} are not told apart: {behind}.")),
     }
